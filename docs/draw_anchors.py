@@ -24,13 +24,13 @@ from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import LandmarkTracker
-from ufmstar_torch.eval.report.outputs import field_of_view
+from ufmstar_torch.eval.run.pictures import field_of_view
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 
@@ -70,7 +70,7 @@ class Shot:
 
 def last_shot(sequence: FrameSequence, network: DepthNetwork) -> Shot:
     """What is said of the last frame, after all those before it; frames that cannot be read are left out."""
-    plain, anchored, tracker = UfMStar(), UfMStar(UfMStarConfig(anchored=True)), LandmarkTracker()
+    plain, anchored, tracker = UfMStar(), UfMStar(UfMStarConfig(anchors=AnchorConfig())), LandmarkTracker()
     for frame in readable(sequence):
         image, intrinsics = image_tensor(frame), torch.from_numpy(frame.intrinsics)
         with torch.no_grad():

@@ -16,21 +16,21 @@ import numpy as np
 import torch
 from clips import Clip, add_sources, clips, judge, line, shown
 
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Landmarks, LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.sequences.frame import Frame
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 
 STRIDE = 4  # judged are every fourth pixel of every fourth row
-ANCHORED: Mapping[str, Any] = {"anchored": True}
+ANCHORED: Mapping[str, Any] = {"anchors": AnchorConfig()}
 # What is tried: of UfM*, and of the tracker.
 OF_UFM: tuple[Mapping[str, Any], ...] = (
     {},
     {"disagreement": "overlap"},
     ANCHORED,
     {**ANCHORED, "disagreement": "overlap"},
-    *({**ANCHORED, "anchor_shrinkage": kappa} for kappa in (1.0, 5.0, 20.0)),
-    *({**ANCHORED, "anchor_half_life": frames} for frames in (5.0, 10.0, 100.0)),
+    *({"anchors": AnchorConfig(shrinkage=kappa)} for kappa in (1.0, 5.0, 20.0)),
+    *({"anchors": AnchorConfig(half_life=frames)} for frames in (5.0, 10.0, 100.0)),
 )
 OF_TRACKER: tuple[Mapping[str, Any], ...] = (
     *({"max_relative_sigma": share} for share in (0.1, 0.2, 0.3, 0.5)),
@@ -70,7 +70,7 @@ def figures(tour: Tour, landmarks: list[Landmarks], config: UfMStarConfig) -> li
     clip, ufm, maps = tour.clip, UfMStar(config), []
     K = torch.from_numpy(clip.K)[None]
     for depth, pose, frame, result in zip(clip.depth, clip.pose, tour.frames, landmarks, strict=True):
-        anchors = result.anchors(frame.intrinsics, K) if config.anchored else None
+        anchors = result.anchors(frame.intrinsics, K) if config.anchors is not None else None
         maps.append(ufm(torch.from_numpy(depth)[None], torch.from_numpy(pose)[None], K, anchors=anchors).variance[0])
     judged = judge(clip, torch.stack(maps).numpy(), STRIDE)
     return [judged[name] for name in ("ece_delta", "ece_q", "ause_rmse", "spearman")]
@@ -93,7 +93,7 @@ def main() -> None:
         told(", ".join(f"{k} {v}" for k, v in values.items()) or "UfM\\*", own, UfMStarConfig(**values))
     for values in OF_TRACKER:
         changed = [tracked(tour, TrackerConfig(**values)) for tour in every]
-        told(", ".join(f"{k} {v}" for k, v in values.items()), changed, UfMStarConfig(anchored=True))
+        told(", ".join(f"{k} {v}" for k, v in values.items()), changed, UfMStarConfig(anchors=AnchorConfig()))
 
 
 if __name__ == "__main__":

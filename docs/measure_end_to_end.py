@@ -18,7 +18,7 @@ from ufmstar_torch import UncertainDepth
 from ufmstar_torch.eval.commands.run import job_from, run
 from ufmstar_torch.eval.commands.run_command import read
 from ufmstar_torch.eval.engine.progress import Progress
-from ufmstar_torch.eval.results.run_job import RunJob
+from ufmstar_torch.eval.run.run_job import RunJob
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models import Preprocess
 

@@ -27,7 +27,7 @@ from ufmstar_torch.anchors.tracker import Landmarks
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 
 GRID = 28
 # The median of |z| of a standard normal variable.

@@ -31,7 +31,7 @@ from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.frame import FrameInput, check_frame
 from ufmstar_torch.kernels import posterior_cpu
 from ufmstar_torch.models.load import load_network

@@ -30,8 +30,8 @@ from active_learning_report import draw, report, summarise
 from torch import Tensor
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.eval.results.files import write_json_atomic
-from ufmstar_torch.eval.results.machine import hardware
+from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.run.machine import hardware
 from ufmstar_torch.models import DepthNetwork, load_trained, read_info
 from ufmstar_torch.regress import sample_pixels
 from ufmstar_torch.train.losses import loss_of

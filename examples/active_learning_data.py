@@ -17,9 +17,9 @@ from torch import Tensor
 from ufmstar_torch.eval.sequences import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.tour import Tour, make_tour, render, tour_path
 from ufmstar_torch.eval.tour.box_room import intrinsics
-from ufmstar_torch.eval.tour.open import open_sequence
 from ufmstar_torch.models import Preprocess
 
 TOUR = "tour:"

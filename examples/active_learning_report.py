@@ -8,7 +8,7 @@ from pathlib import Path
 from statistics import fmean, median, stdev
 from typing import Any
 
-from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.eval.run.files import write_atomic
 
 BEFORE = "before"
 _INK, _FAINT = "#22272e", "#6b6b6b"

@@ -21,7 +21,7 @@ from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
-from ufmstar_torch.eval.tour import open_sequence
+from ufmstar_torch.eval.sequences import open_sequence
 
 
 class ShareOfDepth(Alone):

@@ -20,7 +20,7 @@ import torch
 
 from ufmstar_torch import UfMStarConfig, UncertainDepth
 from ufmstar_torch.eval.report.table import csv_text
-from ufmstar_torch.eval.tour import open_sequence
+from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models.load import load_network
 
 COLUMNS = ("rank", "sequence", "frame", "mean_variance_m2", "standard_error_m2", "measured", "pixels")

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import torch
 
-from ufmstar_torch import UfMStar, UfMStarConfig, kernels
+from ufmstar_torch import AnchorConfig, MergeConfig, PosteriorConfig, UfMStar, UfMStarConfig, kernels
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.eval.engine.warm_up import dense_anchors, preprocessing
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.kernels.select import compile_triangulation
 
 NEAR = UfMStarConfig(backend="numba", regression="neighbourhood")
-EXACT = UfMStarConfig(backend="numba", merge=1.0, merge_every=1)
+EXACT = UfMStarConfig(backend="numba", merge=MergeConfig(every=1))
 
 
 def two_frames(config: UfMStarConfig, dtype: torch.dtype) -> None:
@@ -24,7 +24,9 @@ def two_frames(config: UfMStarConfig, dtype: torch.dtype) -> None:
     K = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
     row = depth[:, 0].double()
     anchors = (
-        Anchors(torch.arange(32.0)[None, :, None].expand(1, 32, 2) / 2, row, row / 100) if config.anchored else None
+        Anchors(torch.arange(32.0)[None, :, None].expand(1, 32, 2) / 2, row, row / 100)
+        if config.anchors is not None
+        else None
     )
     ufm = UfMStar(config, dtype=dtype)
     for _ in range(2):
@@ -43,7 +45,7 @@ if __name__ == "__main__":
         compile_triangulation()
         dense_anchors()
     else:  # anchors first: what does not depend on the dtype is compiled by one of the two processes
-        two_frames(EXACT.replace(anchored=True, posterior=True), torch.float64)
+        two_frames(EXACT.replace(anchors=AnchorConfig(), posterior=PosteriorConfig()), torch.float64)
         two_frames(NEAR, torch.float64)
     folder = Path(kernels.__file__).with_name("__pycache__")
     folder.mkdir(exist_ok=True)

@@ -310,8 +310,6 @@ class Oracle:
         )
         mixture_cam = self.mixture_cam = [transform(g, *to_cam) for g in self.mixture]
         self.seen = mixture_cam, depth, valid, K
-        if self.unmeasured == "prior":
-            mixture_cam = [g if g["count"] > 1 else {**g, "m": self.prior["prior_mean"]} for g in mixture_cam]
         M = dense(mixture_cam, depth, valid, K, **self.prior)
         if self.unmeasured == "relative":
             M = M + (1 - self.share()) * (self.unmeasured_relative * depth) ** 2

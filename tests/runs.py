@@ -11,7 +11,7 @@ from torch import nn
 from ufmstar_torch import DepthPrediction, UfMStarConfig
 from ufmstar_torch.eval.engine.maps import own_depth
 from ufmstar_torch.eval.engine.networks import NetworkSource
-from ufmstar_torch.eval.results.run_job import RunJob
+from ufmstar_torch.eval.run.run_job import RunJob
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
 from ufmstar_torch.pipeline import NetworksInTurn

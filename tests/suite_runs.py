@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 from layouts import write_generic
 
-from ufmstar_torch.eval.engine.evaluate import BROKEN, RowResult, evaluate_sequences
+from ufmstar_torch.eval.engine.evaluate import RowResult
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.stream import Stopped
@@ -78,27 +78,13 @@ def _drawn(sequence, row):
     return RowResult(row, counts, metrics.compute(), metrics.curves(), {}, {}, {"metrics": metrics.state_dict()})
 
 
-def one_by_one(judge):
-    """``evaluate_sequences`` by a judge of one sequence, as :class:`Stub` is."""
-
-    def evaluate(tasks, how, done, *, stop):
-        for task in tasks:
-            try:
-                outcome = judge(task.sequence, task.rows, how.networks, stop=stop, progress=task.progress)
-            except BROKEN as error:
-                outcome = error
-            done(task, outcome)
-
-    return judge if judge is evaluate_sequences else evaluate
-
-
 def go(job, evaluate=None, *, resume=False, overwrite=False, stop=lambda: False, progress=lambda *_: None, **part):
     """Open the folder and go through the sequences: (came to the end, lines that were reported). ``part``: of the
     ``WorkerTask``."""
     lines: list[str] = []
     networks = job.load(torch.device("cpu"))
     folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=overwrite)
-    how = {"stop": stop, "report": lines.append, "progress": progress, "evaluate": one_by_one(evaluate or Stub())}
+    how = {"stop": stop, "report": lines.append, "progress": progress, "evaluate": evaluate or Stub()}
     return Worker(WorkerTask(job, **part), folder, networks, **how).run(), lines
 
 

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from oracle_anchors import weight
 
 import scenes
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.evidence import Evidence, inliers, means, observe
 from ufmstar_torch.anchors.given import AnchorInput, Anchors
 from ufmstar_torch.anchors.hook import anchored_term
 
 HEIGHT, WIDTH = 48, 64
-ON = UfMStarConfig(anchored=True)
+ON = UfMStarConfig(anchors=AnchorConfig())
 
 
 def anchors_of(truth, count, rng, *, noise=0.0, variance=None, outliers=0.0):
@@ -56,7 +56,7 @@ def test_anchored_without_anchors_is_plain():
         assert a.anchored is None
         assert bool((b.anchored[b.valid] == 0).all())
         assert b.statistics.anchors.tolist() == [0]
-    with pytest.raises(ValueError, match="anchored=True"):
+    with pytest.raises(ValueError, match="AnchorConfig"):
         plain(*arguments, anchors=anchors_of(depth, 5, np.random.default_rng(0)))
     with pytest.raises(ValueError, match="needs anchors"):
         a.corrected()
@@ -133,7 +133,7 @@ def test_what_is_claimed_is_the_larger_of_disagreement_and_lesson():
     expected = float((once.depth[0] - torch.tensor(depths[0])).square()[once.valid[0]].mean())
     assert 0.8 < float(once.variance[once.valid].mean()) / expected < 1.1  # a little is shrunk away
     assert 0.05 < float((often.anchored[often.valid] == 0).double().mean()) < 0.95, "M is the larger in some places"
-    torch.testing.assert_close(often.variance, often.disagreement + often.anchored, rtol=0, atol=0, equal_nan=True)
+    torch.testing.assert_close(often.variance, often.disagreement + often.anchored, rtol=1e-14, atol=0, equal_nan=True)
     d2, m = torch.tensor([[4.0, 4.0, 1.0]]), torch.tensor([[0.1, 0.9, 0.2]])
     term, both = anchored_term(d2.sqrt(), torch.tensor([[0.2, 0.2, -0.3]]), m)
     torch.testing.assert_close(both, torch.tensor([[0.8, 0.9, 0.2]]))

@@ -8,14 +8,12 @@ import torch
 from torch import nn
 
 import scenes
-from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.anchors.given import Anchors, check_anchors
-from ufmstar_torch.anchors.tracker import Landmarks
+from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.frame import check_frame
 
 H, W = 48, 64
-ON = UfMStarConfig(anchored=True)
+ON = UfMStarConfig(anchors=AnchorConfig())
 K = torch.tensor([[60.0, 0.5, 31.5], [0, 58.0, 23.5], [0, 0, 1]], dtype=torch.float64)
 NAN, INF = float("nan"), float("inf")
 
@@ -157,7 +155,7 @@ def test_the_pipeline_takes_anchors_in_the_images_pixels(preprocess):
         assert 38 <= given <= 40, "but for those that a pixel without depth takes at half the size"
         assert 23 <= fewer <= 25
     assert float(out.ufm.anchored[out.ufm.valid].mean()) > 0.05
-    with pytest.raises(ValueError, match="anchored=True"):
+    with pytest.raises(ValueError, match="AnchorConfig"):
         UncertainDepth(Biased())(image, pose, intrinsics, anchors=anchors)
 
 
@@ -166,7 +164,7 @@ def test_the_pipeline_takes_anchors_in_the_images_pixels(preprocess):
 
 def test_a_standing_camera_has_no_anchors_and_says_so():
     from ufmstar_torch.anchors.tracker import LandmarkTracker
-    from ufmstar_torch.eval.tour.open import open_sequence
+    from ufmstar_torch.eval.sequences.open import open_sequence
 
     frame = open_sequence("tour:5?frames=2&size=180x240")[0]
     tracker, plain, anchored = LandmarkTracker(), UfMStar(), UfMStar(ON)
@@ -199,7 +197,7 @@ def test_kept_evidence_makes_the_first_frame_see():
     assert not ufm.evidence.any()
     out = ufm(*frame)
     relative = (out.anchored / out.depth.square())[out.valid]
-    expected = (overall[:, 2] / (overall[:, 0] + ON.anchor_shrinkage)).clamp_min(0)
+    expected = (overall[:, 2] / (overall[:, 0] + ON.anchors.shrinkage)).clamp_min(0)
     torch.testing.assert_close(relative.min(), expected.min(), rtol=1e-4, atol=0)
     assert 0.5 < float(relative.mean()) / (1 / 1.2 - 1) ** 2 < 1.2
     ufm.reset()
@@ -237,40 +235,3 @@ def test_kept_evidence_survives_saving_and_needs_anchors():
     model.ufm.load_state_dict(ufm.state_dict())
     model.reset(keep_evidence=True)
     assert torch.equal(model.ufm.overall_evidence, ufm.overall_evidence)
-
-
-# ---- confirmations ----
-
-
-def with_confirmed(confirmed):
-    one = torch.ones(1, 3)
-    return Anchors(torch.tensor([[[10.0, 10.0], [20.0, 20.0], [30.0, 30.0]]]), 2 * one, 0.01 * one, None, confirmed)
-
-
-def test_confirmations_accompany_the_anchors():
-    depth, count = torch.full((1, H, W), 2.0), torch.tensor([[0, 1, 3]], dtype=torch.int32)
-    options = {"feature_count": 0, "rotation_tolerance": 1e-4}
-    frame = check_frame(depth, torch.eye(4)[None], K[None], None, None, None, None, **options)
-    other = resize_intrinsics(K, (H, W), (2 * H, 2 * W))
-    given = with_confirmed(count).moved(other, K).to("cpu")
-    assert check_anchors(given, frame).confirmed.tolist() == [[0, 1, 3]]
-    assert check_anchors(with_confirmed(None), frame).confirmed is None
-    landmarks = Landmarks(np.zeros((2, 2)), np.ones(2), np.ones(2), 2, np.array([4, 7]))
-    assert landmarks.anchors(K.numpy(), K, capacity=3).confirmed.tolist() == [[4, 7, 0]]
-
-
-@pytest.mark.parametrize(
-    ("confirmed", "error", "told"),
-    [
-        (torch.zeros(1, 3), TypeError, "anchors.confirmed must be a torch.int32 or torch.int64 tensor, got"),
-        (
-            np.zeros((1, 3), int),
-            TypeError,
-            "anchors.confirmed must be a torch.int32 or torch.int64 tensor, got ndarray",
-        ),
-        (torch.zeros(1, 2).long(), ValueError, r"anchors.confirmed must have shape \(1, 3\), got \(1, 2\)"),
-    ],
-)
-def test_confirmations_of_another_kind_are_named(confirmed, error, told):
-    with pytest.raises(error, match=told):
-        UfMStar(ON)(torch.full((1, H, W), 2.0), torch.eye(4)[None], K[None], anchors=with_confirmed(confirmed))

@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import scenes
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.evidence import Evidence, inliers, observe
 from ufmstar_torch.anchors.given import AnchorInput, Anchors
 
 H, W = 48, 64
-ON = UfMStarConfig(anchored=True)
+ON = UfMStarConfig(anchors=AnchorConfig())
 
 
 def taught(spoilt=None, at=5, frames=8):

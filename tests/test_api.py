@@ -13,6 +13,9 @@ from ufmstar_torch.segment import spgf
 PUBLIC = {
     "DepthPrediction",
     "GaussianMixture",
+    "AnchorConfig",
+    "MergeConfig",
+    "PosteriorConfig",
     "Recalibration",
     "SPGFConfig",
     "UfMStar",

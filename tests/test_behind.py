@@ -13,11 +13,11 @@ from layouts import write_generic
 from runs import Brightness, networks
 
 from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.eval.engine.ahead import FramesAhead
-from ufmstar_torch.eval.engine.behind import Behind
 from ufmstar_torch.eval.engine.estimators import Gaussians
+from ufmstar_torch.eval.engine.prefetch import Prefetch
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream
+from ufmstar_torch.eval.engine.writer_thread import WriterThread
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 
 FRAMES = 9
@@ -62,7 +62,7 @@ def test_every_frame_comes_in_order_with_the_state_after_it(sequence):
     plain = stream_of(sequence)
     plain.drive([States()])
     first, second = Slow(), Slow(stage="saving")
-    with Behind([first, second]) as behind:
+    with WriterThread([first, second]) as behind:
         stream_of(sequence).drive([behind])
     assert [r.number for r in first.results] == [r.number for r in second.results] == list(range(FRAMES))
     assert len(first.threads | second.threads) == 1
@@ -79,7 +79,7 @@ def test_every_frame_comes_in_order_with_the_state_after_it(sequence):
 @pytest.mark.parametrize("error", [OSError("full"), ValueError("a mistake")], ids=["disk", "program"])
 def test_an_error_of_a_sink_ends_the_loop_and_no_later_frame_is_taken(sequence, error):
     sink, after = Slow(at=2, error=error), Slow()
-    with pytest.raises(type(error), match=str(error)), Behind([sink, after]) as behind:
+    with pytest.raises(type(error), match=str(error)), WriterThread([sink, after]) as behind:
         stream_of(sequence).drive([behind])
     assert [result.number for result in after.results] == [0, 1]
     assert not sink.ended
@@ -91,7 +91,7 @@ def test_whatever_ends_the_loop_all_frames_that_were_computed_are_through(sequen
         raise error
 
     sink = Slow()
-    with pytest.raises(error), Behind([sink]) as behind:
+    with pytest.raises(error), WriterThread([sink]) as behind:
         stream_of(sequence, Brightness(at=6, then=fail)).drive([behind])
     assert [result.number for result in sink.results] == list(range(6))
     assert not sink.ended
@@ -106,7 +106,7 @@ def test_only_a_few_frames_wait(sequence):
             behind_by.append(result.number + 1 - len(slow.results))
 
     slow = Slow()
-    with Behind([slow]) as behind:
+    with WriterThread([slow]) as behind:
         stream_of(sequence).drive([behind, Count()])
     assert max(behind_by) <= 6  # 5 that wait, and one in hand
 
@@ -121,7 +121,7 @@ def test_frames_are_read_ahead_in_order_by_one_thread(sequence):
         return entry.load_image()
 
     entries = [replace(e, load_image=lambda i=i, e=e: load(i, e)) for i, e in enumerate(sequence.entries)]
-    with FramesAhead(replace(sequence, entries=tuple(entries)), [1, 3, 4, 6]) as frames:
+    with Prefetch(replace(sequence, entries=tuple(entries)), [1, 3, 4, 6]) as frames:
         assert frames.next().index == 1
         with pytest.raises(FrameError, match="cannot be decoded"):
             frames.next()

@@ -14,7 +14,7 @@ from modules import CONFIG, DEPTHS, K_, POSES, H, K, W, frame
 from walks import SPGF, oracle_settings
 
 import oracle
-from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.networks import NetworkSource
@@ -40,7 +40,9 @@ def test_no_single_value_spoils_the_state_or_a_map(max_depth, data):
     segment = SPGFConfig(
         **{**SPGF.to_dict(), "max_depth": max_depth, "min_gaussian_length": max(0.5, max_depth / 9000)}
     )
-    ufm = UfMStar(CONFIG.replace(segment=segment, anchored=True, aleatoric_in_moments=data.draw(st.booleans())))
+    ufm = UfMStar(
+        CONFIG.replace(segment=segment, anchors=AnchorConfig(), aleatoric_in_moments=data.draw(st.booleans()))
+    )
     for i in range(3):
         depth, pose, intrinsics = frame(i)
         a, e = torch.full_like(depth, 1e-3), torch.full_like(depth, 1e-3)
@@ -152,7 +154,6 @@ def test_intrinsics_that_cannot_be_the_depth_maps_are_refused(changes, text):
 
 CHOICES = {
     "paper": {},
-    "prior": {"prior_mean": 0.3},
     "relative": {"unmeasured_relative": 0.2},
     "nan": {},
 }
@@ -183,16 +184,13 @@ def test_a_first_frame_reads_as_chosen(backend):
         assert int(out.statistics.unmeasured[0]) == int(out.statistics.valid_pixels[0]) == int(out.valid.sum())
         read[choice] = out.variance[out.valid]
     assert bool((read["paper"] == 0).all())
-    np.testing.assert_allclose(read["prior"].numpy(), 0.3, rtol=1e-5)
     np.testing.assert_allclose(read["relative"].numpy(), (0.2 * depth[out.valid].numpy()) ** 2, rtol=1e-5)
     assert bool(read["nan"].isnan().all())
-    with pytest.raises(ValueError, match="needs a prior_mean above 0"):
-        UfMStarConfig(unmeasured="prior")
 
 
 def test_a_point_far_from_everything_reads_as_chosen():
     far = torch.full((1, 1, 3), 500.0)
-    for choice, expected in (("paper", 0.0), ("prior", 0.3), ("nan", float("nan"))):
+    for choice, expected in (("paper", 0.0), ("nan", float("nan"))):
         ufm = UfMStar(CONFIG.replace(unmeasured=choice, **CHOICES[choice]))
         for i in range(2):
             ufm(*frame(i))
@@ -211,7 +209,7 @@ def test_a_large_noisy_image_without_a_segment_reads_as_chosen(choice):
         out = ufm(depth, torch.eye(4), camera)
         assert int(out.statistics.segments[0]) == 0
         assert int(out.statistics.unmeasured[0]) == depth.numel()
-    expected = {"paper": 0.0, "prior": 0.3, "nan": float("nan")}
+    expected = {"paper": 0.0, "nan": float("nan")}
     mean = (0.2 * noisy).square().mean(0) if choice == "relative" else torch.full((1, *size), expected[choice])
     np.testing.assert_allclose(out.variance.numpy(), mean.numpy(), rtol=1e-5)
 
@@ -240,12 +238,11 @@ def test_what_was_not_measured_does_not_make_the_next_frame_certain(choice):
 def test_depth_alone_through_the_pipeline_is_never_certain_unasked():
     """First frame, a point far from every Gaussian, and a later frame: a choice other than the paper's leaves no 0."""
     network = wrap_network(lambda x: DEPTHS_OF[int(x[0, 0, 0, 0] * 255)])
-    for choice in ("relative", "prior"):
-        model = UncertainDepth(network, CONFIG.replace(unmeasured=choice, **CHOICES[choice]))
-        for i in range(3):
-            image = torch.zeros(1, 3, H, W) + i / 255
-            out = model(image, torch.tensor(POSES[i]), K)
-            assert float(out.variance[out.ufm.valid].min()) > 1e-5
+    model = UncertainDepth(network, CONFIG.replace(unmeasured="relative"))
+    for i in range(3):
+        image = torch.zeros(1, 3, H, W) + i / 255
+        out = model(image, torch.tensor(POSES[i]), K)
+        assert float(out.variance[out.ufm.valid].min()) > 1e-5
     paper = UncertainDepth(network, CONFIG)
     out = paper(torch.zeros(1, 3, H, W), torch.tensor(POSES[0]), K)
     assert float(out.variance[out.ufm.valid].max()) == 0

@@ -18,11 +18,12 @@ from layouts import truncate, write_generic, write_tartanair, write_tum
 from runs import Brightness, outputs, read_summary
 from shared_data import require_shared
 
-from ufmstar_torch import SPGFConfig, UfMStarConfig, cli
+from ufmstar_torch import MergeConfig, SPGFConfig, UfMStarConfig, cli
 from ufmstar_torch.eval.commands.run_command import read
 from ufmstar_torch.eval.engine import load as sources
-from ufmstar_torch.eval.results import writers
+from ufmstar_torch.eval.run import writers
 from ufmstar_torch.models import Preprocess
+from ufmstar_torch.stateful import flat
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +74,9 @@ def test_help_of_run_names_every_setting(ufmstar, capfd):
         cli.main(["run", "--help"])
     assert ended.value.code == 0
     text = capfd.readouterr().out
-    for name in [f"--ufm.{n}" for n in UfMStarConfig().to_dict() if n != "segment"]:
+    for name in [
+        f"--ufm.{n}" for n in flat(UfMStarConfig(merge=MergeConfig()).to_dict()) if n not in ("anchors", "posterior")
+    ]:
         assert name in text
     for name in SPGFConfig().to_dict():
         assert f"--ufm.segment.{name}" in text

@@ -16,9 +16,10 @@ from shared_data import require_shared
 from ufmstar_torch.cli import main
 from ufmstar_torch.eval.check.data_check import check_data
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS
 from ufmstar_torch.eval.tour import export_tour
-from ufmstar_torch.eval.tour.open import open_sequence, open_tour
+from ufmstar_torch.eval.tour.sequence import open_tour
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data.md"
 SIZE = (120, 160)

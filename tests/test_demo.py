@@ -24,11 +24,11 @@ from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.colours import colour_table
 from ufmstar_torch.eval.report.figures_curves import write_curves
 from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, POSTERIOR
 from ufmstar_torch.eval.report.text import demo_explanation, demo_table
-from ufmstar_torch.eval.results.folder import FolderError, OutputFolder
+from ufmstar_torch.eval.run.colours import colour_table
+from ufmstar_torch.eval.run.folder import FolderError, OutputFolder
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import make_tour, render, tour_sequence
 from ufmstar_torch.models import NetworkSpec, save_trained

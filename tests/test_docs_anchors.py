@@ -30,7 +30,7 @@ def seen_points(truth, K, v, u):
 
 def video():
     """Images of a rendered room, and depth at half their size that is a quarter too far."""
-    from ufmstar_torch.eval.tour.open import open_sequence
+    from ufmstar_torch.eval.sequences.open import open_sequence
 
     for frame in open_sequence("tour:5?frames=6&size=120x160"):
         K_map = resize_intrinsics(torch.from_numpy(frame.intrinsics), (120, 160), (60, 80))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from ufmstar_torch.eval.tour.open import open_tour
+from ufmstar_torch.eval.tour.sequence import open_tour
 from ufmstar_torch.prediction import DepthPrediction
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

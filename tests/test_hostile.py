@@ -14,7 +14,7 @@ import torch
 from modules import same
 
 import scenes
-from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, MergeConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.state import UfMStarState
 
@@ -121,15 +121,15 @@ def configuration(rng):
         aleatoric_in_moments=bool(rng.integers(2)),
         disagreement=str(rng.choice(["w2", "overlap"])),
         overlap_weighted=bool(rng.integers(2)),
-        unmeasured=str(rng.choice(["paper", "prior", "relative", "nan"])), prior_mean=0.25,
+        unmeasured=str(rng.choice(["paper", "relative", "nan"])), prior_mean=0.25,
         regression=str(rng.choice(["exact", "neighbourhood"])),
         variance_floor=float(rng.choice([0.0, 1e-4])),
         ema_alpha=float(rng.choice([0.5, 1.0])),
-        anchored=bool(rng.integers(2)),
+        anchors=AnchorConfig() if rng.integers(2) else None,
         features=int(rng.integers(2)),
         max_components=[None, 1, 30][rng.integers(3)],
         initial_capacity=int(rng.choice([1, 64])),
-        merge=float(rng.choice([0.0, 1.0])), merge_every=3,
+        merge=MergeConfig(every=3) if rng.integers(2) else None,
         on_bad_frame=str(rng.choice(["skip", "skip", "raise"])),
         backend="torch" if rng.integers(10) == 0 else "auto",
     )  # fmt: skip
@@ -172,7 +172,7 @@ def run_session(session):
     for i in range(LENGTH):
         hostile, watched, other = (one_stream(rng, i, config, dtype) for _ in range(3))
         names = [n for n in ("aleatoric", "epistemic", "valid", "anchors") if rng.integers(2)]
-        names = [n for n in names if n != "anchors" or config.anchored] + ["features"] * config.features
+        names = [n for n in names if n != "anchors" or config.anchors is not None] + ["features"] * config.features
         given, spoilt = batch([hostile, watched], names), rng.integers(6) == 0
         before = {name: value.clone() for name, value in ufm.state_dict().items()}
         try:
@@ -211,7 +211,7 @@ def test_thousands_of_hostile_frames(part):
 def test_covariances_are_positive_definite_after_3000_fusions(aleatoric_in_moments):
     """A camera that moves to and fro before noisy boxes, whose network is sure at some pixels and lost at others."""
     segment = SPGFConfig(min_pixels=10, min_rows=1, prune="none")
-    ufm = UfMStar(UfMStarConfig(segment=segment, aleatoric_in_moments=aleatoric_in_moments, merge=1.0))
+    ufm = UfMStar(UfMStarConfig(segment=segment, aleatoric_in_moments=aleatoric_in_moments, merge=MergeConfig()))
     rng, fusions = np.random.default_rng(0), 0
     for i in range(400):
         T = scenes.look([0.3 * np.sin(0.2 * i), 0.02 * np.cos(0.3 * i), 0], 0.1 * np.sin(0.11 * i))

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.engine.load import NetworkChoice, network_source
-from ufmstar_torch.eval.results import machine
-from ufmstar_torch.eval.results.folder import FolderError
+from ufmstar_torch.eval.run import machine
+from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.models import (

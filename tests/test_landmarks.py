@@ -10,7 +10,7 @@ import torch
 from runs import Brightness, job_of, outputs, read_summary
 from tiny_suite import Biased, evaluate, in_memory, row
 
-from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth, cli
+from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig, UncertainDepth, cli
 from ufmstar_torch.anchors import Anchors, LandmarkMap, LandmarkTracker, landmark_source
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.eval.commands.run import run
@@ -18,11 +18,11 @@ from ufmstar_torch.eval.engine.anchors import landmark_digests, landmarks_of
 from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
 from ufmstar_torch.eval.methods.setting import setting_from
 from ufmstar_torch.eval.report.text import run_table
-from ufmstar_torch.eval.tour.open import open_tour
+from ufmstar_torch.eval.tour.sequence import open_tour
 from ufmstar_torch.models import Preprocess
 
 TOUR = "tour:5?frames=6&size=96x128&sensor=0"
-ON = UfMStarConfig(on_bad_frame="skip", anchored=True)
+ON = UfMStarConfig(on_bad_frame="skip", anchors=AnchorConfig())
 
 
 @pytest.fixture(scope="module")
@@ -288,7 +288,7 @@ def test_a_skipped_frame_is_forgotten_by_its_source(tour):
 
 
 def test_a_source_needs_the_anchored_configuration():
-    with pytest.raises(ValueError, match="anchored=True"):
+    with pytest.raises(ValueError, match="AnchorConfig"):
         UncertainDepth(Brightness(), anchors="corners")
     with pytest.raises(ValueError, match="neither 'corners', 'dense' nor a file"):
         wrapped("lidar")

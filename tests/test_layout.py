@@ -76,6 +76,7 @@ EVAL_ORDER = (
     ("sequences", "metrics"),
     ("tour", "methods"),
     ("engine",),
+    ("run",),
     ("results",),
     ("bench", "check", "report"),
     ("commands",),

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from random_gaussians import as_lists, covariances, mixture
 
 import scenes
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, MergeConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.kernels.select import select_merge
 from ufmstar_torch.merge import merge, merged
 from ufmstar_torch.mixture import GaussianMixture
@@ -22,7 +22,7 @@ from ufmstar_torch.regress import regress
 pytestmark = pytest.mark.numerics
 
 BACKENDS = ["torch", "numba"]
-CONFIG = UfMStarConfig(merge=1.0, merge_share=0.2, features=2, anchored=True)
+CONFIG = UfMStarConfig(merge=MergeConfig(share=0.2), features=2, anchors=AnchorConfig())
 ALL = torch.tensor([True, True])
 
 
@@ -54,7 +54,7 @@ def one(mean: list[list[float]], spread: list[float], weight: list[float], m: li
 
 
 def merge_one(m: GaussianMixture, backend: str = "torch", **changes: float) -> GaussianMixture:
-    config = UfMStarConfig(merge=1.0).replace(**changes)
+    config = UfMStarConfig(merge=MergeConfig(**changes))
     kernels = select_merge(backend, "cpu")
     return merge(m, m.mean.new_zeros(1, 0, 3), torch.tensor([True]), config, kernels)[0]
 
@@ -67,7 +67,7 @@ def test_agrees_with_the_oracle(backend, seed):
     after, left = merge(before, sums, ALL, CONFIG, select_merge(backend, "cpu"))
     for b in range(2):
         given_ = as_dicts(before, sums, b)
-        expected = oracle_merge.merge(given_, CONFIG.merge, CONFIG.merge_share, CONFIG.prior_weight)
+        expected = oracle_merge.merge(given_, CONFIG.merge.loss, CONFIG.merge.share, CONFIG.prior_weight)
         ours = as_dicts(after, left, b)
         assert len(ours) == len(expected)
         for mine, theirs in zip(ours, expected, strict=True):
@@ -95,7 +95,7 @@ def test_sums_over_the_mixture_stay(seed):
     kernels = select_merge("torch", "cpu")
     after, left = merge(before, sums, ALL, CONFIG, kernels)
     assert int(after.components.sum()) < int(before.components.sum())
-    joined, _ = merge(before, sums, ALL, CONFIG.replace(merge_share=0.0), kernels)
+    joined, _ = merge(before, sums, ALL, CONFIG.with_values({"merge.share": 0.0}), kernels)
 
     def zeroth(m: GaussianMixture) -> torch.Tensor:
         w = m.weight[..., None]
@@ -116,7 +116,7 @@ def test_the_limit_is_the_divergence_of_the_lighter_from_the_heavier(backend, st
     """A vanishing weight at distance d of an equal shape: l -> d^2 / (2 sigma^2), 1 nat at sqrt(2) sigma."""
     d = (math.sqrt(2) + step) * 0.1
     two = one([[0.0, 0.0, 2.0], [d, 0.0, 2.0]], [0.01, 0.01], [1e9, 1.0], [0.5, 0.5], [3, 3])
-    assert int(merge_one(two, backend, merge_share=0.0).components) == (1 if step < 0 else 2)
+    assert int(merge_one(two, backend, share=0.0).components) == (1 if step < 0 else 2)
 
 
 def test_equal_weights_have_a_closed_form():
@@ -124,7 +124,7 @@ def test_equal_weights_have_a_closed_form():
     for factor, left in ((0.999, 1), (1.001, 2)):
         d = factor * 0.1 * 2 * math.sqrt(math.e - 1)
         two = one([[0.0, 0.0, 2.0], [d, 0.0, 2.0]], [0.01, 0.01], [50.0, 50.0], [0.1, 0.3], [2, 3])
-        after = merge_one(two, merge_share=0.0)
+        after = merge_one(two, share=0.0)
         assert int(after.components) == left
         if left == 1:
             assert after.count[0, 0] == 4
@@ -163,7 +163,7 @@ def test_a_superseded_component_is_dissolved_and_a_lonely_one_is_not(backend):
 def test_the_map_stays_within_the_stated_bound_where_components_are_dissolved(seed):
     """At a dissolved component's own point a feature in [0, 1] moves by little more than its share; joining is off."""
     before, _ = crowd(seed)
-    config = UfMStarConfig(merge=1e-9, merge_share=0.05, features=2)
+    config = UfMStarConfig(merge=MergeConfig(loss=1e-9, share=0.05), features=2)
     after, _ = merge(before, before.mean.new_zeros(2, 0, 3), ALL, config, select_merge("torch", "cpu"))
     for b in range(2):
         gone = [k for k in range(12) if not (after.mean[b] == before.mean[b, k]).all(1).any()]
@@ -213,7 +213,7 @@ def walk(config: UfMStarConfig, first: int = 0, last: int = 24, state: dict | No
 
 
 def test_a_walk_merges_when_due_and_goes_on_from_a_saved_state():
-    config = UfMStarConfig(merge=1.0, merge_every=8)
+    config = UfMStarConfig(merge=MergeConfig(every=8))
     plain, merging = walk(UfMStarConfig()), walk(config)
     assert int(merging.mixture.components) < int(plain.mixture.components)
     again = walk(config, 12, 24, walk(config, 0, 12).state_dict())
@@ -225,13 +225,13 @@ def test_off_is_off():
     """Off by default and in the paper's settings, and then the very same state comes back."""
     state = walk(UfMStarConfig(), 0, 3).state
     for config in (UfMStarConfig(), UfMStarConfig.paper()):
-        assert config.merge == 0
+        assert config.merge is None
         assert merged(state, torch.tensor([True]), config, select_merge("torch", "cpu")) is state
 
 
 def test_a_skipped_frame_merges_nothing():
     state = walk(UfMStarConfig(), 0, 4).state
-    config = UfMStarConfig(merge=1.0, merge_every=4)
+    config = UfMStarConfig(merge=MergeConfig(every=4))
     kernels = select_merge("torch", "cpu")
     assert merged(state, torch.tensor([False]), config, kernels) is state
     assert merged(state, torch.tensor([True]), config, kernels) is not state

@@ -18,7 +18,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from walks import SPGF, run
 
-from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, MergeConfig, PosteriorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.frame import FRAME_FAULTS
 
 pytestmark = pytest.mark.numerics
@@ -416,13 +416,17 @@ def test_config_rejects_unknown_keys_and_impossible_values():
         {"eta": 0.0}, {"eta": 1.5}, {"eta_occlusion": -1.0}, {"prior_weight": 0.0}, {"ema_alpha": 0.0},
         {"regression": "rtree"}, {"backend": "cuda"}, {"max_components": 0}, {"variance_floor": float("nan")},
         {"near_radius": 0.6}, {"add_aleatoric": 1}, {"features": 1.5}, {"initial_capacity": True}, {"segment": 3},
+        {"segment": None}, {"merge": 1.0}, {"posterior": PosteriorConfig()},
     ):  # fmt: skip
         with pytest.raises(ValueError, match=next(iter(changes))):
             UfMStarConfig(**changes)
-    with pytest.raises(TypeError, match="eta_oclusion"):
+    with pytest.raises(ValueError, match="eta_oclusion"):
         UfMStarConfig.from_dict({"eta_oclusion": 0.7})
-    with pytest.raises(TypeError, match="min_pixel"):
+    with pytest.raises(ValueError, match="min_pixel"):
         UfMStarConfig.from_dict({"segment": {"min_pixel": 7}})
+    for name, said in {"merge": "merge", "merge.los": "los", "eta.low": "eta", "mergers.loss": "mergers"}.items():
+        with pytest.raises(ValueError, match=said):
+            UfMStarConfig().with_values({name: 0.5})
     with pytest.raises(ValueError, match="noise_floor"):
         SPGFConfig(noise_floor=0.5)
     with pytest.raises(Exception, match=r"frozen|assign"):
@@ -435,7 +439,11 @@ def test_config_rejects_unknown_keys_and_impossible_values():
 
 def test_config_round_trips_through_json():
     config = UfMStarConfig(eta=0.4, max_components=99, segment=SPGFConfig(min_rows=3))
-    assert UfMStarConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    extended = config.with_values({"anchors.half_life": 10.0, "merge.loss": 0.5, "segment.sparse": 2, "eta": 0.3})
+    assert (extended.anchors, extended.merge) == (AnchorConfig(half_life=10.0), MergeConfig(loss=0.5))
+    assert (extended.segment, extended.eta) == (SPGFConfig(min_rows=3, sparse=2), 0.3)
+    for each in (config, extended):
+        assert UfMStarConfig.from_dict(json.loads(json.dumps(each.to_dict()))) == each
 
 
 def test_every_fault_has_its_own_sentence():

@@ -7,7 +7,7 @@ import own_method as example
 import pytest
 import torch
 
-from ufmstar_torch.eval.tour import open_sequence
+from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
 
 SPEC = NetworkSpec(widths=0.1, positive="softplus", size=(64, 96), preprocess="resize")

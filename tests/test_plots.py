@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ufmstar_torch.eval.report.colours import (
+from ufmstar_torch.eval.run.colours import (
     DEPTH_MAP,
     ERROR_MAP,
     INVALID_GREY,
@@ -21,8 +21,8 @@ from ufmstar_torch.eval.report.colours import (
     colour_table,
     robust_range,
 )
-from ufmstar_torch.eval.report.panels import FramePanel, contact_sheet, fit_scales, map_columns
-from ufmstar_torch.eval.report.video import preview_frame, write_video
+from ufmstar_torch.eval.run.panels import FramePanel, contact_sheet, fit_scales, map_columns
+from ufmstar_torch.eval.run.video import preview_frame, write_video
 
 
 def panel(name: str = "a", *, error: bool = True, size: tuple[int, int] = (24, 32), seed: int = 0) -> FramePanel:

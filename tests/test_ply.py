@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.eval.report.gaussians import (
+from ufmstar_torch.eval.run.gaussians import (
     OPACITY,
     SIGMA_FLOOR,
     icosphere,

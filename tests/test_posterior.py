@@ -9,7 +9,7 @@ import oracle_posterior as oracle
 import pytest
 import torch
 
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.anchors.given import check_anchors
 from ufmstar_torch.frame import check_frame
@@ -20,7 +20,7 @@ from ufmstar_torch.posterior.model import FEATURES, MODEL
 from ufmstar_torch.posterior.running import SIZE
 from ufmstar_torch.posterior.update import update
 
-CONFIG = UfMStarConfig(anchored=True, posterior=True)
+CONFIG = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
 K = torch.tensor([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]])
 
 
@@ -79,7 +79,7 @@ def test_compiled_field_and_distance_equal_the_reference(rows, cols):
     across, along = (np.where(x > 0, x / 20, np.inf) for x in (right, down))
     source = rng.random(n) < 0.05
     reached = distance(*(torch.from_numpy(x)[None] for x in (source, across, along)), cols, 0.6)
-    np.testing.assert_array_equal(field_cpu.distance(source, across, along, cols, 0.6), reached[0])
+    np.testing.assert_allclose(field_cpu.distance(source, across, along, cols, 0.6), reached[0], rtol=1e-13)
 
 
 def streams_of(seeds, dtype, size=(36, 48)):
@@ -266,11 +266,11 @@ def test_state_saved_and_loaded_goes_on_to_the_bit():
 
 
 def test_a_state_saved_before_posteriors_loads():
-    old = UfMStar(UfMStarConfig(anchored=True))
+    old = UfMStar(UfMStarConfig(anchors=AnchorConfig()))
     for depth, T, anchors in ufm_frames(2, streams=2):
         old(depth, T, K, anchors=anchors)
     state = {k: v for k, v in old.state_dict().items() if k != "posterior"}
-    new = UfMStar(UfMStarConfig(anchored=True))
+    new = UfMStar(UfMStarConfig(anchors=AnchorConfig()))
     new.load_state_dict(state)
     assert new.posterior.shape == (2, 0)
 
@@ -286,5 +286,5 @@ def test_streams_are_independent():
 
 
 def test_posterior_needs_anchors():
-    with pytest.raises(ValueError, match="posterior needs anchored"):
-        UfMStarConfig(posterior=True)
+    with pytest.raises(ValueError, match="posterior needs anchors"):
+        UfMStarConfig(posterior=PosteriorConfig())

@@ -20,10 +20,8 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLL
 from ufmstar_torch.eval.report import pictures as pictures_module
-from ufmstar_torch.eval.report.colours import INVALID_GREY
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.examples import Example, RowMaps, find_examples
-from ufmstar_torch.eval.report.panels import break_name
 from ufmstar_torch.eval.report.pictures import (
     BREAKDOWN,
     COMPARE,
@@ -50,13 +48,16 @@ from ufmstar_torch.eval.report.rooms import (
     choose_times,
     draw_room,
     find_rooms,
+    oblique_view,
     project,
-    views_of,
 )
 from ufmstar_torch.eval.report.write import write_report
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import WorkItem
+from ufmstar_torch.eval.run.colours import INVALID_GREY
+from ufmstar_torch.eval.run.panels import break_name
 
+UP = np.array([0.0, 0.0, 1.0])
 K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])
 
 
@@ -219,7 +220,7 @@ class TestCompare:
 
 class TestProjection:
     def test_axis_aligned(self) -> None:
-        view = Projection(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), "from above")
+        view = Projection(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), UP)
         axes, angle = project(view, np.diag([0.04, 9.0, 0.25])[None])
         np.testing.assert_allclose(view.plane(np.array([[1.0, 2.0, 3.0]])), [[1.0, 3.0]])
         np.testing.assert_allclose(axes, [[0.5 * SIGMAS, 0.2 * SIGMAS]])
@@ -227,7 +228,7 @@ class TestProjection:
 
     def test_a_line_at_thirty_degrees(self) -> None:
         along = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0])
-        view = Projection(np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), "")
+        view = Projection(np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), UP)
         axes, angle = project(view, np.outer(along, along)[None])
         assert angle[0] == pytest.approx(30)
         np.testing.assert_allclose(axes, [[SIGMAS, 0.0]], atol=1e-7)
@@ -238,7 +239,7 @@ class TestProjection:
         """In every direction n of the picture its extent is that of the marginal: sigmas sqrt(n^T P S P^T n)."""
         rng = np.random.default_rng(seed)
         R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-        view = Projection(R[0], R[1], "")
+        view = Projection(R[0], R[1], UP)
         A = rng.normal(size=(4, 3, 3))
         covariance = A @ A.transpose(0, 2, 1)
         axes, angle = project(view, covariance)
@@ -256,9 +257,8 @@ class TestProjection:
         forward /= np.linalg.norm(forward)
         T = np.eye(4)
         T[:3, :3] = np.stack([np.cross(forward, above), -above, forward], axis=1)
-        top, oblique = views_of(T[None])
-        np.testing.assert_allclose(top.towards, above, atol=1e-12)
-        np.testing.assert_allclose(top.up, forward, atol=1e-12)
+        oblique = oblique_view(T[None])
+        np.testing.assert_allclose(oblique.vertical, above, atol=1e-12)
         assert oblique.towards @ above == pytest.approx(np.sin(np.radians(35)))
         assert oblique.towards @ forward == pytest.approx(-np.cos(np.radians(35)))
 
@@ -267,8 +267,8 @@ class TestProjection:
         T[0, :3, :3] = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
         T[1, :3, 1] = 0  # no up on average either
         T[0, :3, 1] = 0
-        for view in views_of(T):
-            np.testing.assert_allclose(np.linalg.norm([view.right, view.up, view.towards], axis=1), 1, atol=1e-12)
+        view = oblique_view(T)
+        np.testing.assert_allclose(np.linalg.norm([view.right, view.up, view.towards], axis=1), 1, atol=1e-12)
 
 
 def snapshot(frame: str, mean: list[list[float]], m: list[float], sigma: float = 0.3) -> Snapshot:
@@ -278,18 +278,18 @@ def snapshot(frame: str, mean: list[list[float]], m: list[float], sigma: float =
 
 class TestRooms:
     def pixels(self, path: Path, snapshots: list[Snapshot], *roots: float) -> int:
-        """Pixels of the view from above where Gaussians of these sqrt(m) [m] lie on each other, the last one on top."""
+        """Pixels where Gaussians of these sqrt(m) [m] lie on each other, the last one on top."""
         scale = draw_room(path, snapshots, "room")
         colour = np.full(3, 255.0)
         for root in roots:
             colour = 0.85 * scale.rgb(np.array(root)).astype(float) + 0.15 * colour
         with Image.open(path) as picture:
             drawn = np.asarray(picture.convert("RGB")).astype(int)
-        above = drawn[70 : len(drawn) // 2, :, :]  # below the title
-        return int((np.abs(above - colour).max(-1) <= 2).sum())
+        return int((np.abs(drawn[70:-70] - colour).max(-1) <= 2).sum())  # without title and colour bar
 
     def test_the_nearest_is_painted_last(self, tmp_path: Path) -> None:
-        near, far = ([0.0, 0.0, 2.0], 4.0), ([0.0, 2.0, 2.0], 0.25)  # seen from -y
+        away = [0.0, 0.0, 2.0] - 2 * oblique_view(np.eye(4)[None]).towards
+        near, far = ([0.0, 0.0, 2.0], 4.0), (away.tolist(), 0.25)
         for one, other in ((near, far), (far, near)):
             room = [snapshot("f", [one[0], other[0]], [one[1], other[1]])]
             assert self.pixels(tmp_path / "r.png", room, 0.5, 2.0) > 300

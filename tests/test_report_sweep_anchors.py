@@ -32,8 +32,8 @@ VARIED = {
     "translation_noise",
     "rotation_drift",
     "translation_drift",
-    "anchor_half_life",
-    "anchor_shrinkage",
+    "anchors.half_life",
+    "anchors.shrinkage",
 }
 
 
@@ -83,7 +83,7 @@ def test_every_setting_that_the_suite_varies_is_swept(results):
     [
         ("rotation_drift", ROTATION_DRIFTS),
         ("track_noise", (0.0, 1.0, 2.0, 4.0, 8.0)),
-        ("anchor_half_life", (10.0, 30.0, 100.0)),
+        ("anchors.half_life", (10.0, 30.0, 100.0)),
     ],
 )
 def test_anchored_rows_are_a_line_that_goes_through_the_row_without_noise(results, name, values):
@@ -142,7 +142,7 @@ def test_the_band_of_a_line_with_anchors_is_its_interval(results):
     assert any(vertices[:, 1].min() == pytest.approx(mean.value - mean.half) for vertices in low)
 
 
-@pytest.mark.parametrize("name", ["track_noise", "anchor_half_life", "anchor_count"])
+@pytest.mark.parametrize("name", ["track_noise", "anchors.half_life", "anchor_count"])
 def test_what_only_anchors_have_stands_beside_plain_ufm_star(results, name):
     figure = draw_sweep(results, "depth_only", name)
     above, below = drawn(figure.axes[1]), drawn(figure.axes[5])

@@ -20,9 +20,9 @@ from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.results import run_folder, writers
-from ufmstar_torch.eval.results.folder import FolderError
-from ufmstar_torch.eval.results.writers import read_frame
+from ufmstar_torch.eval.run import run_folder, writers
+from ufmstar_torch.eval.run.folder import FolderError
+from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
 

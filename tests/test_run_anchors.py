@@ -10,24 +10,24 @@ import pytest
 import torch
 from runs import Brightness, job_of, networks, outputs, read_summary
 
-from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth, cli
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig, UncertainDepth, cli
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.commands.run import job_from, run
 from ufmstar_torch.eval.commands.run_command import read
 from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
-from ufmstar_torch.eval.report.outputs import Finished
-from ufmstar_torch.eval.report.panels import map_columns
 from ufmstar_torch.eval.report.text import run_table
-from ufmstar_torch.eval.report.video import preview_frame
-from ufmstar_torch.eval.results.folder import FolderError
-from ufmstar_torch.eval.results.journal import why_none
-from ufmstar_torch.eval.results.writers import read_frame
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.run.folder import FolderError
+from ufmstar_torch.eval.run.journal import why_none
+from ufmstar_torch.eval.run.panels import map_columns
+from ufmstar_torch.eval.run.pictures import Finished
+from ufmstar_torch.eval.run.video import preview_frame
+from ufmstar_torch.eval.run.writers import read_frame
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models import Preprocess
 
 TOUR = "tour:5?frames=8&size=120x160"
-ON = UfMStarConfig(on_bad_frame="skip", anchored=True)
-OFF = ON.replace(anchored=False)
+ON = UfMStarConfig(on_bad_frame="skip", anchors=AnchorConfig())
+OFF = ON.replace(anchors=None)
 CPU = torch.device("cpu")
 
 
@@ -239,7 +239,7 @@ def test_the_flag(tmp_path, capfd):
     printed = capfd.readouterr().out
     summary = read_summary(tmp_path / "a")
     assert summary["settings"]["anchors"] is True
-    assert summary["settings"]["ufm"]["anchored"] is True
+    assert summary["settings"]["ufm"]["anchors"] == AnchorConfig().to_dict()
     assert summary["settings"]["ufm"]["disagreement"] == "overlap"
     assert "UfM*, anchored  " in printed
     used, result = (summary["anchors"][key] for key in ("used_per_frame", "found_per_frame"))
@@ -251,7 +251,7 @@ def test_the_flag(tmp_path, capfd):
 
 @pytest.mark.slow
 def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour, tmp_path):
-    config = ON.replace(posterior=True)
+    config = ON.replace(posterior=PosteriorConfig())
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     summary = run(map_job(tour, config), whole)
     run(map_job(tour, config, lambda frame: too_far(frame, stop_at=5)), parts)
@@ -286,10 +286,10 @@ def test_pictures_have_a_column_for_what_anchors_add(tour, finished, tmp_path):
     assert abs(gained - width) < 8
 
 
-def test_anchored_without_anchors_is_a_mistake(tmp_path, capfd):
-    words = ["run", TOUR, "--depth", "self", "--ufm.anchored", "true", "--out", str(tmp_path / "out")]
+def test_settings_of_anchors_without_anchors_are_a_mistake(tmp_path, capfd):
+    words = ["run", TOUR, "--depth", "self", "--ufm.anchors.half_life", "10", "--out", str(tmp_path / "out")]
     assert cli.main(words) == 2
-    assert "--ufm.anchored needs anchors: give --anchors instead" in capfd.readouterr().err
+    assert "--ufm.anchors.* needs --anchors" in capfd.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

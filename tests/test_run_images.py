@@ -8,7 +8,7 @@ import torch
 from layouts import write_scannet
 
 from scenes import render
-from ufmstar_torch.eval.report.outputs import field_of_view, square_pixels
+from ufmstar_torch.eval.run.pictures import field_of_view, square_pixels
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.models import Preprocess

@@ -136,7 +136,7 @@ def test_arguments_are_left_alone_and_may_be_views(spgf):
     mixture, labels = spgf(view, K.expand(1, 3, 3), UfMStarConfig(segment=SMALL), **options)
     expected, same = spgf(depth, K, SMALL, **options)
     assert torch.equal(labels, same)
-    assert torch.equal(mixture.mean, expected.mean)
+    torch.testing.assert_close(mixture.mean, expected.mean, rtol=1e-14, atol=1e-15)  # strides may choose the loops
     assert not mixture.mean.requires_grad
     assert torch.equal(view.detach().nan_to_num(), depth.nan_to_num())
     for name, value in options.items():

@@ -11,7 +11,7 @@ import torch
 from random_gaussians import mixture
 
 import scenes
-from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.frame import FrameMaps, check_values
 from ufmstar_torch.kernels import check_cpu, reach_cpu, rigid_cpu, step_cpu, threads_cpu
@@ -29,7 +29,7 @@ CONFIGS = {
     "full": UfMStarConfig(
         segment=SMALL, features=2, max_components=12, initial_capacity=3, unmeasured="nan", aleatoric_in_moments=True
     ),
-    "anchored": UfMStarConfig(segment=SMALL, anchored=True, unmeasured="prior", prior_mean=0.2),
+    "anchored": UfMStarConfig(segment=SMALL, anchors=AnchorConfig(), unmeasured="nan", prior_mean=0.2),
 }
 
 
@@ -51,7 +51,7 @@ def frames(count: int, config: UfMStarConfig, dtype: torch.dtype, streams: int =
             more["aleatoric"] = 0.01 * torch.rand(depth.shape, generator=generator, dtype=dtype)
             more["aleatoric"][:, 3, 3], more["epistemic"] = -1.0, torch.full_like(depth, 0.1)
             more["valid"] = torch.rand(depth.shape, generator=generator) > 0.1
-        if config.anchored:
+        if config.anchors is not None:
             at = torch.randint(0, 48, (streams, 20, 2), generator=generator)
             present = torch.stack([depth[s, at[s, :, 1], at[s, :, 0]] for s in range(streams)]).double()
             more["anchors"] = Anchors(at.double(), 1.1 * present, 1e-4 * present.square())

@@ -21,7 +21,7 @@ from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream, Stopped
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
-from ufmstar_torch.eval.tour.open import open_tour
+from ufmstar_torch.eval.tour.sequence import open_tour
 
 FRAMES = 6
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from tiny_suite import Biased, base_network, evaluate, in_memory, row, write_network
 
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.engine.anchors import TRUTH_SIGMA, AnchorSource, Tracks, anchor_sources
@@ -23,10 +23,10 @@ from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.data import setting_of
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.eval.tour.open import open_tour
+from ufmstar_torch.eval.tour.sequence import open_tour
 
 NAME = "UfM*-DepthOnly"
-ON = UfMStarConfig(on_bad_frame="skip", anchored=True)
+ON = UfMStarConfig(on_bad_frame="skip", anchors=AnchorConfig())
 FIGURES = ("delta1", "rmse", "nll", "ece_delta", "ece_q", "spearman")
 
 
@@ -81,7 +81,7 @@ def assert_agrees(result, expected, used):
         ({"corrected": True}, "go with anchors"),
         ({"anchors": "truth", "track_noise": 1.0}, 'goes with anchors = "tracked"'),
         ({"anchors": "tracked", "track_noise": -1.0}, "track_noise must lie in"),
-        ({"anchored": True}, "anchored follows from anchors"),
+        ({"anchors.half_life": 10.0}, "go with anchors"),
     ],
 )
 def test_impossible_settings_are_refused(values, told):
@@ -97,14 +97,14 @@ def test_impossible_settings_are_refused(values, told):
         {"anchors": "tracked", "anchor_count": 0, "seed": 0},
         {"anchors": "truth", "seed": 3},
         {"anchors": "tracked", "track_noise": 2.0, "rotation_noise": 1.0, "seed": 1},
-        {"disagreement": "overlap", "anchors": "tracked", "anchor_half_life": 10.0},
+        {"disagreement": "overlap", "anchors": "tracked", "anchors.half_life": 10.0},
     ],
 )
 def test_a_setting_survives_its_flat_form_and_json(values):
     setting = setting_from(values)
     assert setting.to_dict() == values
     assert setting_of(json.loads(json.dumps(setting.to_dict()))) == setting
-    assert configured(setting).anchored
+    assert configured(setting).anchors is not None
     assert ufm_star_config(row(NAME, anchors="tracked")) == ON
 
 

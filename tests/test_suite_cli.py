@@ -6,7 +6,7 @@ import json
 import signal
 
 import pytest
-from suite_runs import TRUTH, Stub, one_by_one, write_rooms
+from suite_runs import TRUTH, Stub, write_rooms
 from tiny_suite import rows_of
 
 from ufmstar_torch import cli
@@ -23,7 +23,7 @@ def stubbed(monkeypatch):
     """The judge of sequences, replaced by one that draws figures; returns it."""
     stub = Stub()
     own = launch.evaluate_suite
-    monkeypatch.setattr(launch, "evaluate_suite", lambda *given, **how: own(*given, evaluate=one_by_one(stub), **how))
+    monkeypatch.setattr(launch, "evaluate_suite", lambda *given, **how: own(*given, evaluate=stub, **how))
     return stub
 
 

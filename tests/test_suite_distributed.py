@@ -15,16 +15,15 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, one_by_one
+from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept
 from trainings import SPEC
 
 from ufmstar_torch.eval.commands.eval_command import job_from, launch_from, read
-from ufmstar_torch.eval.engine.evaluate import evaluate_sequences
+from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import load_results
-from ufmstar_torch.eval.results import launch, machine
+from ufmstar_torch.eval.results import launch
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.launch import (
     ClusterTask,
     LaunchOptions,
@@ -37,6 +36,8 @@ from ufmstar_torch.eval.results.launch import (
 )
 from ufmstar_torch.eval.results.work import WorkerTask
 from ufmstar_torch.eval.results.worklist import Shard
+from ufmstar_torch.eval.run import machine
+from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
 
@@ -56,7 +57,7 @@ def options_for(rooms, out, *words, network=TRUTH, suite="depth-only"):
 def quiet(options, evaluate=None, stop=lambda: False):
     """Carry the options out, in silence: the outcome and the lines that were reported."""
     lines: list[str] = []
-    own = {} if evaluate is None else {"evaluate": one_by_one(evaluate)}
+    own = {} if evaluate is None else {"evaluate": evaluate}
     job, how = job_from(options), launch_from(options)
     outcome = evaluate_suite(job, how, stop=stop, report=lines.append, progress=lambda *_: None, **own)
     return outcome, lines
@@ -262,7 +263,7 @@ def test_jobs_through_submitit(rooms, tmp_path):
     ended, message = quiet(options)
     assert ended.finished
     assert message[0].startswith("jobs ")
-    go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")), evaluate_sequences)
+    go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")), evaluate_sequence)
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
 
 

@@ -17,14 +17,14 @@ from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, write_rooms
 from tiny_suite import evaluate, rows_of
 
 from ufmstar_torch.eval.commands.eval_command import job_from, read
-from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequences
+from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.results.cache import CacheError
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.work import DIED, with_references
 from ufmstar_torch.eval.results.worklist import Shard, content_digest
+from ufmstar_torch.eval.run.folder import FolderError
 
 
 def folder_of(job):
@@ -48,7 +48,7 @@ def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
 
 def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
     job = replace(job_on(rooms, tmp_path / "out"), frames=slice(1, None, 2), examples=1)
-    go(job, evaluate_sequences)
+    go(job, evaluate_sequence)
     networks = job.load(torch.device("cpu"))
     for item in job.items:
         for slug, result in evaluate(item.open(), job.suite.rows, networks, limit=job.frames).items():
@@ -138,7 +138,7 @@ def test_real_sequences_without_ground_truth_are_broken(rooms, tmp_path):
         file.unlink()
     (root / "ash" / "depth").rmdir()
     job = job_on(root, tmp_path / "out")
-    assert go(job, evaluate_sequences)[0]
+    assert go(job, evaluate_sequence)[0]
     assert folder_of(job).failures(job.items) == {"rooms/ash": "no frame has ground truth"}
     assert len(kept(job.out)) == 4
 
@@ -146,7 +146,7 @@ def test_real_sequences_without_ground_truth_are_broken(rooms, tmp_path):
 def test_images_without_poses_are_for_networks_alone(tmp_path):
     root, _ = write_nyu(tmp_path / "nyu")
     job = job_on(root, tmp_path / "out")
-    ended, message = go(job, evaluate_sequences)
+    ended, message = go(job, evaluate_sequence)
     assert ended
     folder, (item,) = folder_of(job), job.items
     done = sorted(path.stem for path in folder.place(item).glob("*.json") if path.stem != "failed")
@@ -155,7 +155,7 @@ def test_images_without_poses_are_for_networks_alone(tmp_path):
     assert "no poses" in failure["reason"]
     assert failure["rows"] == ["UfM-DepthOnly", "UfM-DepthOnly-100K", "UfMstar-DepthOnly"]
     assert sum("failed" in line for line in message) == 1
-    again, message = go(job, evaluate_sequences, resume=True)
+    again, message = go(job, evaluate_sequence, resume=True)
     assert again
     assert sum("failed" in line for line in message) == 1, "it is told each time"
 

@@ -22,8 +22,8 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.results.claim import ABANDONED_SECONDS
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.folder import FolderError, differences, hold
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest, find_work, read_names
+from ufmstar_torch.eval.run.folder import FolderError, differences, hold
 
 # ---- work list ----
 

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ufmstar_torch.eval.check.check import check_sequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.tour import Tour, TourStyle, export_tour, make_tour, render, tour_path, tour_sequence
 from ufmstar_torch.eval.tour.box_room import intrinsics, look
 from ufmstar_torch.eval.tour.intersect import entry
-from ufmstar_torch.eval.tour.open import open_sequence
 from ufmstar_torch.eval.tour.sensor import develop
 from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD, Finish, ball, box, part, surfaces, tube, turn
 from ufmstar_torch.eval.tour.style import HALL_TEXTURES, HOME_TEXTURES, STYLES, TEXTURES
@@ -418,7 +418,7 @@ def test_a_tour_by_name_is_a_sequence_whose_depth_and_poses_fit():
 def test_image_and_depth_of_a_frame_come_from_one_rendering(monkeypatch):
     calls = []
     real = render
-    monkeypatch.setattr("ufmstar_torch.eval.tour.open.render", lambda *a, **k: (calls.append(1), real(*a, **k))[1])
+    monkeypatch.setattr("ufmstar_torch.eval.tour.sequence.render", lambda *a, **k: (calls.append(1), real(*a, **k))[1])
     sequence = tour_sequence(2, frames=9, size=(24, 32))
     assert not calls, "nothing is rendered before it is asked for"
     frames = list(sequence)

@@ -17,7 +17,7 @@ from trainings import SPEC, tiny_job, write_frames
 
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.eval.tour.open import open_tour
+from ufmstar_torch.eval.tour.sequence import open_tour
 from ufmstar_torch.models import GaussianDepth
 from ufmstar_torch.models.checkpoints import read_safetensors
 from ufmstar_torch.models.trained import load_for_training

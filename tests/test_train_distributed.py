@@ -19,7 +19,7 @@ import torch
 import torch.distributed as dist
 from trainings import RECIPE, tiny_job, with_network, write_frames
 
-from ufmstar_torch.eval.results.folder import FolderError
+from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.models.checkpoints import read_safetensors
 from ufmstar_torch.train import FitSettings
 from ufmstar_torch.train.ensemble import share_of_time

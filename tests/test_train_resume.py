@@ -15,7 +15,7 @@ import pytest
 import torch
 from trainings import RECIPE, tiny_job, with_network, write_frames
 
-from ufmstar_torch.eval.results.folder import FolderError
+from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.models.checkpoints import read_safetensors
 from ufmstar_torch.train import ResumeError
 from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, read_checkpoint

@@ -18,7 +18,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from ufmstar_torch import UncertainDepth, cli
-from ufmstar_torch.eval.results.writers import read_frame
+from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.models import (
     BatchEnsemble,
     CheckpointError,

@@ -20,7 +20,7 @@ from segment_scenes import REFERENCES, numba_spgf, reference
 from walks import HEIGHT, SPGF, WIDTH, oracle_run, walks
 
 import scenes
-from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig, gaussian
+from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig, gaussian
 from ufmstar_torch.correspond import correspond
 from ufmstar_torch.fuse import fuse
 from ufmstar_torch.kernels.select import select_kernels
@@ -257,12 +257,12 @@ def test_check(dtype):
 def steps(config, streams, frames, device):
     """Outputs and module over a walk; the first stream's second frame has no depth."""
     # In float32 the CPU leaves out anchors' shares that the GPU counts, below the bound for that dtype.
-    ufm = UfMStar(config, dtype=torch.float64 if config.anchored else torch.float32)
+    ufm = UfMStar(config, dtype=torch.float64 if config.anchors is not None else torch.float32)
     out = []
     for i, (depth, pose, intrinsics, anchors) in enumerate(walks(streams, frames)):
         if i == 1:
             depth = torch.cat([torch.full_like(depth[:1], torch.nan), depth[1:]])
-        options = {"anchors": anchors} if config.anchored else {}
+        options = {"anchors": anchors} if config.anchors is not None else {}
         options |= {"features": (depth / 10).nan_to_num()[:, None]} if config.features else {}
         given = [depth, pose, intrinsics, (depth / 100).nan_to_num()]
         moved_options = {name: moved(value) for name, value in options.items()} if device != "cpu" else options
@@ -277,7 +277,7 @@ def steps(config, streams, frames, device):
         (1, {"initial_capacity": 2}),
         (4, {"unmeasured": "relative", "prior_mean": 0.2}),
         (1, {"unmeasured": "nan", "ema_alpha": 1.0, "max_components": 4}),
-        (4, {"initial_capacity": 2, "features": 1, "anchored": True}),
+        (4, {"initial_capacity": 2, "features": 1, "anchors": AnchorConfig()}),
         (1, {"disagreement": "overlap", "overlap_weighted": True, "unmeasured": "relative"}),
     ],
 )
@@ -300,7 +300,7 @@ def test_whole_step(streams, settings):
         given = {f.name for f in fields(e.statistics) if getattr(e.statistics, f.name) is not None}
         for name in given - ({"components", "unmeasured"} if late else set()):
             torch.testing.assert_close(getattr(a.statistics, name).cpu(), getattr(e.statistics, name))
-    assert (overflowed > 0) == (settings.get("initial_capacity") == 2 and not config.anchored)
+    assert (overflowed > 0) == (settings.get("initial_capacity") == 2 and config.anchors is None)
     n = int(cpu.mixture.components.max())
     assert n > 2, "the mixture must have grown"
     for name, value in cpu.mixture.tensors().items():

@@ -13,7 +13,7 @@ from walks import HEIGHT, SPGF, WIDTH, oracle_run, oracle_settings, run, walk, w
 
 import oracle
 import scenes
-from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig
 
 pytestmark = pytest.mark.numerics
 
@@ -83,7 +83,7 @@ def test_a_walk_agrees_with_the_oracle(truth, backend, streams):
 VARIANTS = {
     "overlap": {"disagreement": "overlap", "overlap_weighted": True, "initial_capacity": 2},
     "neighbourhood": {"regression": "neighbourhood", "features": 1},
-    "anchored": {"anchored": True, "features": 1},
+    "anchored": {"anchors": AnchorConfig(), "features": 1},
 }
 
 
@@ -145,7 +145,7 @@ OBSERVED = {
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_an_observer_follows_the_stages_and_changes_no_bit(backend):
-    config = UfMStarConfig(segment=SPGF, backend=backend, anchored=True)
+    config = UfMStarConfig(segment=SPGF, backend=backend, anchors=AnchorConfig())
     watched, plain = UfMStar(config), UfMStar(config)
     watched.observer = Trace()
     for depth, pose, K, anchors in walks(2, 3):

@@ -19,9 +19,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from ufmstar_torch.eval.results import files
-from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_atomic
-from ufmstar_torch.eval.results.writers import (
+from ufmstar_torch.eval.run import files
+from ufmstar_torch.eval.run.files import to_json, write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.writers import (
     FULL,
     FrameWriter,
     encode_length_png,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import Judge, SequenceTask, evaluate_sequences
+from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.method import Method
@@ -73,22 +73,12 @@ def rows_of(names, setting=DEFAULT):
     return tuple(Row(Method.parse(name), setting) for name in names)
 
 
-def evaluate(sequence, rows, networks, store=None, **options):
-    """The results of a sequence on the CPU, by the row's slug; an error of it is raised."""
-    (results,) = evaluate_all([sequence], rows, networks, store, **options)
+def evaluate(sequence, rows, networks, store=None, *, sinks=(), progress=lambda _: None, stop=lambda: False, **judge):
+    """The results of a sequence on the CPU, by the row's slug."""
+    how = Judge(networks, CPU, store, **judge)
+    results = evaluate_sequence(sequence, rows, how, sinks=sinks, progress=progress, stop=stop)
     assert [result.row for result in results] == list(rows)
     return {result.row.slug: result for result in results}
-
-
-def evaluate_all(sequences, rows, networks, store=None, *, stop=lambda: False, **options):
-    """The results of each sequence on the CPU; the first error is raised."""
-    of_task = {name: options.pop(name) for name in ("sinks", "progress") if name in options}
-    tasks, outcomes = [SequenceTask(sequence, rows, **of_task) for sequence in sequences], {}
-    evaluate_sequences(iter(tasks), Judge(networks, CPU, store, **options), outcomes.__setitem__, stop=stop)
-    for outcome in outcomes.values():
-        if isinstance(outcome, Exception):
-            raise outcome
-    return [outcomes[task] for task in tasks]
 
 
 def same(one, other):

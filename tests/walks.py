@@ -69,7 +69,7 @@ def walk(config, frames, streams=slice(None)):
     ufm, outputs = UfMStar(config), []
     for depth, pose, K, anchors in frames:
         parts = [anchors.pixel, anchors.depth, anchors.variance]
-        options = {"anchors": Anchors(*(x[streams] for x in parts))} if config.anchored else {}
+        options = {"anchors": Anchors(*(x[streams] for x in parts))} if config.anchors is not None else {}
         if config.features:
             options["features"] = (depth / 10).nan_to_num()[streams, None]
         aleatoric = (depth / 100).nan_to_num()[streams]

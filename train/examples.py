@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.report.panels import FramePanel, contact_sheet, map_columns
+from ufmstar_torch.eval.run.panels import FramePanel, contact_sheet, map_columns
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.data import DepthDataModule

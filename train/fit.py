@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.results.files import write_json_atomic
-from ufmstar_torch.eval.results.machine import hardware, versions
+from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.models.trained import load_for_training, save_trained
 from ufmstar_torch.train.ensemble import read_result, train_members
 from ufmstar_torch.train.folder import SUMMARY, open_folder

@@ -19,7 +19,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.results.folder import FolderKind, OutputFolder
+from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder
 from ufmstar_torch.train.member import WEIGHTS
 from ufmstar_torch.train.settings import Job
 

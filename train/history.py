@@ -19,7 +19,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 
-from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.train.checkpoints import POSITION
 
 SECONDS = "ufmstar_seconds"

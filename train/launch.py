@@ -18,7 +18,7 @@ import lightning.pytorch as pl
 import torch.distributed as dist
 from lightning.pytorch.strategies import ParallelStrategy
 
-from ufmstar_torch.eval.results.folder import FolderError
+from ufmstar_torch.eval.run.folder import FolderError
 
 # Longer than the processes of a launch are apart, also where machines are handed out one after another.
 WAIT_SECONDS = 600.0

@@ -14,7 +14,7 @@ import torch
 from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from ufmstar_torch.eval.results.files import write_json_atomic
+from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import save_trained
 from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, Checkpoints, Stops, read_checkpoint

@@ -11,8 +11,8 @@ from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.generic import has_images_and_depth, open_unposed
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.layout import detect_layout
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.tour.open import open_sequence
 from ufmstar_torch.train.data_config import Part
 from ufmstar_torch.train.samples import RawSample, SampleError
 

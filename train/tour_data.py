@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.checked import Checked, number
-from ufmstar_torch.eval.results.files import write_together
+from ufmstar_torch.eval.run.files import write_together
 from ufmstar_torch.eval.tour.style import TourStyle, style_of
 from ufmstar_torch.train.samples import RawSample, SampleError
 

@@ -5,6 +5,9 @@ from typing import TYPE_CHECKING
 from ufmstar_torch.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from ufmstar_torch.config import AnchorConfig as AnchorConfig
+    from ufmstar_torch.config import MergeConfig as MergeConfig
+    from ufmstar_torch.config import PosteriorConfig as PosteriorConfig
     from ufmstar_torch.config import SPGFConfig as SPGFConfig
     from ufmstar_torch.config import UfMStarConfig as UfMStarConfig
     from ufmstar_torch.mixture import GaussianMixture as GaussianMixture
@@ -18,8 +21,11 @@ else:
 
 __version__ = "0.1.0"
 __all__ = [
+    "AnchorConfig",
     "DepthPrediction",
     "GaussianMixture",
+    "MergeConfig",
+    "PosteriorConfig",
     "Recalibration",
     "SPGFConfig",
     "UfMStar",

@@ -135,7 +135,10 @@ def _require_fixed(ufm: UfMStar) -> None:
             limit is None or slots < limit
         ),
         "no anchors, overlap weights, neighbourhood or merging": (
-            config.anchored or config.overlap_weighted or config.regression != "exact" or bool(config.merge)
+            config.anchors is not None
+            or config.overlap_weighted
+            or config.regression != "exact"
+            or config.merge is not None
         ),
         "disagreement='w2'": config.disagreement != "w2",
         "no features": bool(config.features),

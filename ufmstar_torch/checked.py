@@ -1,8 +1,8 @@
 """Frozen settings whose values are checked when they are made, and their plain form for JSON.
 
-The metadata of a field describes it: ``symbol`` (the paper's letter), ``unit`` and ``range``, or
-``choices``. An unknown name is a ``TypeError`` as for any dataclass, an impossible value a ``ValueError`` that names
-the field.
+The metadata of a field describes it: ``symbol`` (the paper's letter), ``unit`` and ``range``, ``choices``, or
+``section`` (settings of their own). An unknown name is a ``TypeError`` as for any dataclass, an impossible value a
+``ValueError`` that names the field.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, asdict, field, fields
+from dataclasses import MISSING, Field, asdict, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self, get_args, get_type_hints
 
@@ -36,6 +36,12 @@ def choice(default: str | int, *others: str | int) -> Any:
     return field(default=default, metadata={"choices": (default, *others)})
 
 
+def section(kind: type[Checked], *, optional: bool = False) -> Any:
+    """A field with settings of its own: ``kind()`` by default, or None with ``optional``."""
+    metadata = {"section": kind, "optional": optional}
+    return field(default=None, metadata=metadata) if optional else field(default_factory=kind, metadata=metadata)
+
+
 class Checked:
     """Base of a frozen dataclass: checks of the values, and a plain form that refuses unknown keys."""
 
@@ -51,6 +57,9 @@ class Checked:
                     raise ValueError(f"{owner}.{f.name} must be a whole number, got {value!r}")
             if "choices" in f.metadata and value not in f.metadata["choices"]:
                 raise ValueError(f"{owner}.{f.name} must be one of {f.metadata['choices']}, got {value!r}")
+            kind = f.metadata.get("section")
+            if kind is not None and not isinstance(value, kind) and not (value is None and f.metadata["optional"]):
+                raise ValueError(f"{owner}.{f.name} must be settings {kind.__name__}, got {value!r}")
             if isinstance(f.default, bool) and not isinstance(value, bool):
                 raise ValueError(f"{owner}.{f.name} must be True or False, got {value!r}")
 
@@ -94,6 +103,32 @@ class Checked:
         if isinstance(spec, str | Path):
             return cls.from_json(spec)
         return cls.from_dict(spec) if isinstance(spec, Mapping) else spec
+
+    def with_values(self, values: Mapping[str, Any]) -> Self:
+        """A copy with values changed by dotted name, as {"ema_alpha": 1.0, "merge.loss": 0.5}. A section that is None
+        starts from its defaults.
+
+        Raises:
+            ValueError: an unknown name, or an impossible value.
+        """
+        changes: dict[str, Any] = {}
+        within: dict[str, dict[str, Any]] = {}
+        for name, value in values.items():
+            group, _, own = name.partition(".")
+            if own:
+                within.setdefault(group, {})[own] = value
+            else:
+                changes[name] = value
+        known = {f.name: f for f in fields(self)}
+        if unknown := sorted((changes.keys() | within.keys()) - known.keys()):
+            raise ValueError(f"{type(self).__name__} has no {unknown}; it has {list(known)}")
+        for group, inner in within.items():
+            kind = known[group].metadata.get("section")
+            if kind is None:
+                raise ValueError(f"{type(self).__name__}.{group} is no section, got {group}.{next(iter(inner))}")
+            start = changes.get(group, getattr(self, group))
+            changes[group] = (kind() if start is None else start).with_values(inner)
+        return replace(self, **changes)
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as plain nested values, ready for JSON."""

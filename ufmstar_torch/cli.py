@@ -98,7 +98,7 @@ def _set_up(options: Any) -> None:
 
         torch.set_num_threads(threads)  # and with them those of the compiled kernels
     if device is not None and not getattr(options, "slurm", ()):  # the computers of a cluster have devices of their own
-        from ufmstar_torch.eval.results.machine import require_device
+        from ufmstar_torch.eval.run.machine import require_device
 
         require_device(device)
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-from ufmstar_torch.checked import Checked, choice, number
+from ufmstar_torch.checked import Checked, choice, number, section
+from ufmstar_torch.posterior.config import PosteriorConfig as PosteriorConfig
 
 # [m] Largest depth of a network that states none; SPGF's own.
 UNSTATED_RANGE = 20.0
@@ -145,9 +145,38 @@ class SPGFConfig(Checked):
 
 
 @dataclass(frozen=True)
+class AnchorConfig(Checked):
+    """Anchors, sparse measured depths (``ufmstar_torch.anchors``).
+
+    Attributes:
+        half_life: age after which an anchor's evidence counts half
+        shrinkage: anchors with which a Gaussian's own mean counts half
+    """
+
+    half_life: float = number(30.0, "ln 2/ln(1/gamma)", "frames", 0.0, open_low=True)
+    shrinkage: float = number(2.0, "kappa", "anchors", 0.0, open_low=True)
+
+
+@dataclass(frozen=True)
+class MergeConfig(Checked):
+    """Merging of components that overlap (``ufmstar_torch.merge``).
+
+    Attributes:
+        loss: loss per pixel up to which two Gaussians are joined
+        share: share in its own points below which a Gaussian is dissolved in the others
+        every: frames of a stream from one merging to the next
+    """
+
+    loss: float = number(1.0, "l_max", "nat", 0.0, 10.0, open_low=True)
+    share: float = number(0.05, "s_min", "1", 0.0, 0.5)
+    every: int = number(50, "n", "frames", 1)
+
+
+@dataclass(frozen=True)
 class UfMStarConfig(Checked):
     """All settings of UfM*. The defaults are the paper's, with two exceptions, each explained where it stands: the
-    pruning rule (``segment.prune``, docs/results/segmentation.md) and ``regression``.
+    pruning rule (``segment.prune``, docs/results/segmentation.md) and ``regression``. Extensions that are not in the
+    paper have a section each, None = off.
 
     Attributes:
         segment: thresholds of the segmentation
@@ -161,7 +190,7 @@ class UfMStarConfig(Checked):
         prior_weight: weight of the prior in the regression
         prior_mean: disagreement where no Gaussian is near
         unmeasured: M where no two views were compared: as the paper (0 of what was seen once, prior_mean where no
-            Gaussian is near), prior_mean for both (prior), a share of the depth squared (relative), or NaN (nan)
+            Gaussian is near), a share of the depth squared (relative), or NaN (nan)
         unmeasured_relative: relative: standard deviation as a share of the depth
         regression: exact sum over the Gaussians in view, or the paper's neighbourhood
         near_radius: neighbourhood: Gaussians whose extent comes this near to a pixel's point are summed
@@ -171,23 +200,18 @@ class UfMStarConfig(Checked):
         variance_floor: smallest variance of a pixel
         add_aleatoric: add the network's aleatoric variance to the result
         add_epistemic: add the network's epistemic variance to the result
-        anchored: use anchors, sparse measured depths (an extension)
-        anchor_half_life: age after which an anchor's evidence counts half
-        anchor_shrinkage: anchors with which a Gaussian's own mean counts half
-        posterior: with anchors, also a corrected depth and its variance (UfMStarOutput.posterior)
-        merge: loss per pixel up to which two Gaussians are joined; 0 = Gaussians are never merged
-        merge_share: share in its own points below which a Gaussian is dissolved in the others
-        merge_every: frames of a stream from one merging to the next
         features: additional regressed quantities per Gaussian
         initial_capacity: slots for Gaussians at the start; the number grows as needed
         max_components: largest number of Gaussians; null = no limit
-        spill: folder for Gaussians beyond max_components that are out of view, or "memory"; null = new ones are dropped
         rotation_tolerance: largest deviation of a pose's rotation from an orthogonal matrix
         on_bad_frame: refuse a frame with a fault, or skip and count it
         backend: implementation of the kernels
+        anchors: use anchors, sparse measured depths (an extension)
+        posterior: with anchors, also a corrected depth and its variance (an extension)
+        merge: join Gaussians that overlap (an extension)
     """
 
-    segment: SPGFConfig = field(default_factory=SPGFConfig)
+    segment: SPGFConfig = section(SPGFConfig)
     aleatoric_in_moments: bool = False  # SPGF's optional per-pixel variance: A r r^T added to J
 
     # Correspondence (section "Multiview Gaussian Correspondence")
@@ -204,7 +228,7 @@ class UfMStarConfig(Checked):
     # Regression (section "Uncertainty Regression")
     prior_weight: float = number(1.0, "pi_0", "px/m^3", 0.0, open_low=True)
     prior_mean: float = number(0.0, "mu_0", "m^2", 0.0)
-    unmeasured: str = choice("paper", "prior", "relative", "nan")
+    unmeasured: str = choice("paper", "relative", "nan")
     unmeasured_relative: float = number(0.2, "rho", "1", 0.0, open_low=True)
     # The paper's neighbourhood approximates the exact sum to save time, which our kernel does not need.
     regression: str = choice("exact", "neighbourhood")
@@ -216,38 +240,25 @@ class UfMStarConfig(Checked):
     add_aleatoric: bool = True
     add_epistemic: bool = True
 
-    # Anchors (an extension, not in the paper: ``anchors``, ``evidence``)
-    anchored: bool = False
-    anchor_half_life: float = number(30.0, "ln 2/ln(1/gamma)", "frames", 0.0, open_low=True)
-    anchor_shrinkage: float = number(2.0, "kappa", "anchors", 0.0, open_low=True)
-    posterior: bool = False
-
-    # Merging (an extension, not in the paper: ``merge``)
-    merge: float = number(0.0, "l_max", "nat", 0.0, 10.0)
-    merge_share: float = number(0.05, "s_min", "1", 0.0, 0.5)
-    merge_every: int = number(50, "n", "frames", 1)
-
     # State
     features: int = number(0, "dim H - 1", "1", 0)
     initial_capacity: int = number(256, "K_0", "components", 1)
     max_components: int | None = number(None, "K_max", "components", 1)
-    spill: str | None = None
 
     # Input checks and speed
     rotation_tolerance: float = number(0.01, "|R^T R - I|_max", "1", 0.0, 0.1)
     on_bad_frame: str = choice("raise", "skip")
     backend: str = choice("auto", "torch", "numba", "triton")
 
+    # Extensions, not in the paper
+    anchors: AnchorConfig | None = section(AnchorConfig, optional=True)
+    posterior: PosteriorConfig | None = section(PosteriorConfig, optional=True)
+    merge: MergeConfig | None = section(MergeConfig, optional=True)
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.segment, SPGFConfig):
-            raise ValueError(f"UfMStarConfig.segment must be an SPGFConfig, got {type(self.segment).__name__}")
-        if self.unmeasured == "prior" and not self.prior_mean:
-            raise ValueError("UfMStarConfig.unmeasured = 'prior' needs a prior_mean above 0")
-        if self.spill is not None and (not self.spill or self.max_components is None):
-            raise ValueError("UfMStarConfig.spill needs a folder or 'memory', and max_components")
-        if self.posterior and not self.anchored:
-            raise ValueError("UfMStarConfig.posterior needs anchored = True")
+        if self.posterior is not None and self.anchors is None:
+            raise ValueError("UfMStarConfig.posterior needs anchors: set anchors=AnchorConfig() as well")
         if self.far_radius < self.near_radius:
             raise ValueError(
                 f"UfMStarConfig.far_radius must be at least near_radius = {self.near_radius}, got {self.far_radius}"
@@ -268,14 +279,6 @@ class UfMStarConfig(Checked):
         """
         segment = SPGFConfig(min_pixels=2000, min_rows=32, prune="either", slope_focal="camera")
         return cls(segment=segment, regression="neighbourhood")
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> UfMStarConfig:
-        """Rebuild a config from :meth:`to_dict`; an unknown key is a ``TypeError``."""
-        plain = dict(values)
-        if isinstance(plain.get("segment"), Mapping):
-            plain["segment"] = SPGFConfig(**plain["segment"])
-        return cls(**plain)
 
     def within(self, stated: float | None) -> UfMStarConfig:
         """The settings for a network that states its largest depth [m]: ``segment.max_depth``, where that is None."""

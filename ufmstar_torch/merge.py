@@ -13,7 +13,7 @@ the Kullback-Leibler divergence of the reduced mixture from the former one; per 
 
     l(i, j) = [log|Sigma| - a log|Sigma_i| - (1-a) log|Sigma_j|] / (2 min(a, 1-a))   [nat],
 
-0 for equal components and KL(lighter || heavier) where the lighter one weighs nothing. A pair within ``config.merge``
+0 for equal components and KL(lighter || heavier) where the lighter one weighs nothing. A pair within ``merge.loss``
 overlaps so far that the regression mixed the two in any case. In each round those join who are each other's best.
 
 A component seen from two views or more does not join a heavier one that was seen from one view: what was not measured
@@ -21,7 +21,7 @@ would read as measured. Of the counts c, c - 1 comparisons each stay: c = c_i + 
 
 **Dissolve.** The share that a component has in explaining its own points, s_k = mean of w_k(x) over the cubature points
 mu_k +- sqrt(3) L_k e_i (L_k L_k^T = Sigma_k), falls while others are observed again and again. Without it a regressed
-quantity changes at these points by s_k times its difference to the others. Where s_k < ``config.merge_share``, and
+quantity changes at these points by s_k times its difference to the others. Where s_k < ``merge.share``, and
 those that stay explain the rest, its weight, its m and features with it, and the anchors' sums go to those that stay by
 their shares at these points. Their means and covariances stay.
 """
@@ -62,17 +62,17 @@ class MergeKernels:
 
 
 def merged(state: UfMStarState, fine: Tensor, config: UfMStarConfig, kernels: MergeKernels) -> UfMStarState:
-    """The state after a frame, merged every ``config.merge_every`` frames of a stream.
+    """The state after a frame, merged every ``merge.every`` frames of a stream.
 
     Args:
         state: of B streams, after the step.
         fine: [B] True where the frame was used.
-        config: ``merge`` = 0: the state as it is. Otherwise the look whether a stream is due waits for an accelerator.
+        config: ``merge`` None: the state as it is. Otherwise checking which streams are due waits for an accelerator.
         kernels: which implementation of each part.
     """
-    if not config.merge or state.mean.device.type == "meta":
+    if config.merge is None or state.mean.device.type == "meta":
         return state
-    due = fine & (state.frames % config.merge_every == 0)
+    due = fine & (state.frames % config.merge.every == 0)
     if not bool(due.any()):
         return state
     mixture, evidence = merge(state.mixture, state.evidence, due, config, kernels)
@@ -88,16 +88,17 @@ def merge(
         mixture: [B, K] in any frame: both rules are rigid invariants up to the choice of the cubature points.
         evidence: [B, K, 3] sums of anchors beside it, or [B, 0, 3].
         due: [B] the streams to merge; the others stay as they are.
-        config: ``merge``, ``merge_share``, ``prior_weight``.
+        config: ``merge``, which is not None, and ``prior_weight``.
         kernels: which implementation of each part.
 
     Returns:
         The mixture [B, K] and the evidence. What neither joined nor received anything is unchanged to the last bit.
     """
+    assert config.merge is not None
     before = mixture.to(torch.float64)
     rows = evidence.shape[1]
     sums = evidence.double() if rows else evidence.new_zeros(*before.weight.shape, evidence.shape[2]).double()
-    joined, sums, changed = _joined(before, sums, kernels.partition(before, config.merge))
+    joined, sums, changed = _joined(before, sums, kernels.partition(before, config.merge.loss))
     floored = floor_covariance(joined.covariance, storage_floor(joined.covariance, mixture.covariance.dtype))
     joined = joined.replace(covariance=torch.where(changed[..., None, None], floored, joined.covariance))
     fewer, sums, received = _dissolved(joined, sums, kernels.own_shares(joined, config), config)
@@ -288,7 +289,8 @@ def _dissolved(
     mixture: GaussianMixture, sums: Tensor, own: Tensor, config: UfMStarConfig
 ) -> tuple[GaussianMixture, Tensor, Tensor]:
     """The mixture and the sums without the components that others explain, and which slots received something."""
-    weak = mixture.valid & (own < config.merge_share)
+    assert config.merge is not None
+    weak = mixture.valid & (own < config.merge.share)
     number = int(weak.sum(1).max()) if weak.numel() else 0
     if not number:
         return mixture, sums, torch.zeros_like(weak)
@@ -303,7 +305,7 @@ def _dissolved(
     share = torch.cat([_mean_shares(mixture, x, config) for x in points.split(rows, dim=1)], 1)
     share = torch.where(stays[:, None], share, 0.0)
     rest = total(share, 2)
-    goes = of_weak(weak) & (rest >= 1 - config.merge_share)
+    goes = of_weak(weak) & (rest >= 1 - config.merge.share)
     given = torch.where(goes[..., None], share / torch.where(goes, rest, torch.ones_like(rest))[..., None], 0.0)
 
     values = torch.cat([mixture.disagreement[..., None], mixture.features], -1)

@@ -72,7 +72,7 @@ class StepOutput:
         disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid; [B, n] on a subset.
         features: regressed features [B, H, W, F] or [B, n, F].
         residual: [B, H, W, 2] or [B, n, 2] from anchors, the mean relative error r and mean square excess e expected at
-            each pixel (``anchors.evidence``); None unless ``config.anchored``.
+            each pixel (``anchors.evidence``); None unless ``config.anchors``.
         measured: [B, H, W] or [B, n] share in [0, 1] of M that rests on surfaces seen from two views or more.
         read_labels: returns ``labels``; a GPU writes them when they are asked for.
         current_cam: C_i in the camera frame.
@@ -104,12 +104,12 @@ class UfMStarOutput:
     Attributes:
         depth: the depth as given [m].
         variance: V, the total variance of the depth [m^2]: M, plus A and E where given (and not switched
-            off in the config) and B with ``config.anchored``, at least ``config.variance_floor``. NaN where not valid.
+            off in the config) and B with ``config.anchors``, at least ``config.variance_floor``. NaN where not valid.
         disagreement: M, the multiview disagreement [m^2]. NaN where not valid.
         aleatoric, epistemic: A and E as given [m^2], or None.
         anchored: B, the mean square error that anchors found beyond M + A + E [m^2] (``evidence``); None unless
-            ``config.anchored``.
-        bias: the relative error r = g/d - 1 that anchors lead to expect; None unless ``config.anchored``.
+            ``config.anchors``.
+        bias: the relative error r = g/d - 1 that anchors lead to expect; None unless ``config.anchors``.
         posterior_depth, posterior_variance: what :meth:`posterior` returns; None unless ``config.posterior``.
         features: regressed further entries of H, [B, H, W, F], in the caller's units.
         measured: share in [0, 1] of M that rests on surfaces seen from two views or more; below one half the pixel
@@ -161,7 +161,7 @@ class UfMStarOutput:
             ValueError: without ``config.posterior``.
         """
         if self.posterior_depth is None or self.posterior_variance is None:
-            raise ValueError("posterior needs UfMStarConfig(anchored=True, posterior=True)")
+            raise ValueError("posterior needs UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())")
         return self.posterior_depth, self.posterior_variance
 
     def corrected(self) -> tuple[Tensor, Tensor]:
@@ -170,10 +170,10 @@ class UfMStarOutput:
         From E[(x - r)^2] = E[x^2] - r^2: the bias's square leaves B, of which no less than 0 remains.
 
         Raises:
-            ValueError: without ``config.anchored`` nothing is known of a bias.
+            ValueError: without ``config.anchors`` nothing is known of a bias.
         """
         if self.anchored is None or self.bias is None:
-            raise ValueError("corrected needs anchors: UfMStarConfig(anchored=True)")
+            raise ValueError("corrected needs anchors: UfMStarConfig(anchors=AnchorConfig())")
         remaining = (self.anchored - (self.depth * self.bias).square()).clamp_min(0)
         return self.depth * (1 + self.bias), self.variance - self.anchored + remaining
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ufmstar_torch.anchors.given import Anchors, require_anchors
 from ufmstar_torch.anchors.streams import Given, StreamLandmarks
-from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty
 from ufmstar_torch.prediction import DepthPrediction, infer, stated_range
 from ufmstar_torch.recalibrate import Recalibration
@@ -176,12 +176,12 @@ class UncertainDepth(NetworksInTurn):
             single-model mode, and with ``samples`` it is the sampling-based mode. "full" runs every member
             (or ``samples`` passes of a stochastic network) per image and takes the predictive mean, the mean
             aleatoric variance and the variance between the members as epistemic variance.
-        posterior: also a corrected depth and its variance, ``out.ufm.posterior()``: ``config`` with ``anchored`` and
-            ``posterior`` switched on.
+        posterior: also a corrected depth and its variance, ``out.ufm.posterior()``: ``config`` with the sections
+            ``anchors`` and ``posterior``.
         samples: number of stochastic passes per image in mode "full" with one network (MC-Dropout; the
             network must sample by itself in eval mode). None: the network is deterministic.
         preprocess: maps image and intrinsics to the network's input; None passes both through.
-        anchors: what yields the anchors of every image, with ``config.anchored``: "corners" (tracked in the image),
+        anchors: what yields the anchors of every image, with ``config.anchors``: "corners" (tracked in the image),
             "dense" (searched in earlier images), a file of landmarks, or a
             :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a list with one for
             each. Saved and reset with the state. None: those given with an image, if any.
@@ -194,11 +194,11 @@ class UncertainDepth(NetworksInTurn):
 
     Raises:
         TypeError: something that is no ``nn.Module``: a function needs ``ufmstar_torch.models.wrap_network``.
-        ValueError: no network, an unknown mode, ``samples`` that fit neither, or anchors without ``config.anchored``.
+        ValueError: no network, an unknown mode, ``samples`` that fit neither, or anchors without ``config.anchors``.
 
     Example::
 
-        model = UncertainDepth(network, UfMStarConfig(anchored=True), anchors="corners")
+        model = UncertainDepth(network, UfMStarConfig(anchors=AnchorConfig()), anchors="corners")
         for image, pose, intrinsics in video:  # [1, 3, H, W] uint8, [4, 4], [3, 3]
             out = model(image, pose, intrinsics)
             out.variance  # M + A + E + B
@@ -228,10 +228,13 @@ class UncertainDepth(NetworksInTurn):
             raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
         super().__init__(networks, samples=samples, preprocess=preprocess)
         if posterior:
-            config = (config or UfMStarConfig()).replace(anchored=True, posterior=True)
+            config = config or UfMStarConfig()
+            config = config.replace(
+                anchors=config.anchors or AnchorConfig(), posterior=config.posterior or PosteriorConfig()
+            )
         self.ufm = UfMStar((config or UfMStarConfig()).within(self.max_depth), recalibration=recalibration)
-        if anchors is not None and not self.ufm.config.anchored:
-            raise ValueError("anchors go with UfMStarConfig(anchored=True)")
+        if anchors is not None and self.ufm.config.anchors is None:
+            raise ValueError("anchors go with UfMStarConfig(anchors=AnchorConfig())")
         self.landmarks = None if anchors is None else StreamLandmarks(anchors)
         self.mode = mode
         self.multiview_device = None if multiview_device is None else torch.device(multiview_device)
@@ -256,7 +259,7 @@ class UncertainDepth(NetworksInTurn):
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px].
             valid: [B, h, w] bool at the depth map's size, True = use.
             features: [B, F, h, w] likewise, F = ``config.features``; None with F = 1: the aleatoric variance [m^2].
-            anchors: sparse depths of this frame, [B, N] padded and masked, with ``config.anchored``; their pixels are
+            anchors: sparse depths of this frame, [B, N] padded and masked, with ``config.anchors``; their pixels are
                 those of ``image`` and ``intrinsics``, whatever the preprocessing makes of them. None = those of the
                 constructor's source, or none.
 

@@ -21,7 +21,7 @@ from ufmstar_torch.stateful import flat
 SCALAR, ISOTONIC = "scalar", "isotonic"
 _SHOWN = 12  # digits of a digest
 # Settings of UfM* that do not change what V means.
-_HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components", "spill")
+_HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ class UfMStarState:
         skipped: [B] int64 number of frames skipped for a fault.
         smoothed: [B, H, W] moving average of the dense disagreement [m^2] in the mixture's dtype, NaN without a
             value; of size 0 x 0 before the first average.
-        evidence: [B, K, 3] sums over anchors, row k of slot k; K = 0 without ``config.anchored``.
+        evidence: [B, K, 3] sums over anchors, row k of slot k; K = 0 without ``config.anchors``.
         overall_evidence: [B, 3] sums over anchors of the stream.
         posterior: [B, S] float64 what the posterior has learnt (``posterior.running``); S = 0 without
             ``config.posterior``.
@@ -61,8 +61,8 @@ class UfMStarState:
         capacity = min(config.initial_capacity, config.max_components or config.initial_capacity)
         mixture = GaussianMixture.empty(streams, capacity, features=config.features, dtype=dtype, device=device)
         counter = torch.zeros(streams, dtype=torch.int64, device=device)
-        rows = capacity if config.anchored else 0
-        learnt = POSTERIOR_SIZE if config.posterior else 0
+        rows = capacity if config.anchors is not None else 0
+        learnt = POSTERIOR_SIZE if config.posterior is not None else 0
         return cls(
             **mixture.tensors(),
             T_world_first=torch.eye(4, dtype=torch.float64, device=device).repeat(streams, 1, 1),
@@ -92,16 +92,17 @@ class UfMStarState:
         b, k = self.weight.shape
         rows = self.evidence.shape[1] if self.evidence.dim() == 3 and self.evidence.shape[1] in (0, k) else k
         image = tuple(self.smoothed.shape[1:]) if self.smoothed.dim() == 3 else ("H", "W")
+        learnt = POSTERIOR_SIZE if config.posterior is not None else 0
         shapes = {
             "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": (b, k), "count": (b, k),
             "features": (b, k, config.features), "T_world_first": (b, 4, 4), "started": (b,), "frames": (b,),
             "skipped": (b,), "smoothed": (b, *image), "evidence": (b, rows, EVIDENCE_SUMS),
-            "overall_evidence": (b, EVIDENCE_SUMS), "posterior": (b, POSTERIOR_SIZE if config.posterior else 0),
+            "overall_evidence": (b, EVIDENCE_SUMS), "posterior": (b, learnt),
         }  # fmt: skip
         for name, shape in shapes.items():
             if (given := tuple(getattr(self, name).shape)) != shape:
                 raise ValueError(f"{name} must have shape {shape} beside weight {(b, k)}, got {given}")
-        if config.max_components is not None and config.spill is None and k > max(config.max_components, 1):
+        if config.max_components is not None and k > max(config.max_components, 1):
             raise ValueError(f"{k} slots exceed max_components = {config.max_components}")
         if self.weight.device.type == "meta":
             return

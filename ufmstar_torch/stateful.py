@@ -24,7 +24,7 @@ class Config(Protocol):
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """The config of :meth:`to_dict`; an unknown name is a TypeError or ValueError."""
+        """The config of :meth:`to_dict`; an unknown name is a ValueError."""
         ...
 
 
@@ -111,7 +111,7 @@ class StatefulModule(nn.Module):
             raise ValueError(f"state must be that of a {cls.__name__}, with '_extra_state', got {sorted(state)[:5]}")
         try:
             config = cls.CONFIG.from_dict(_config_of(state["_extra_state"]))
-        except TypeError as error:
+        except ValueError as error:
             raise ValueError(f"state: its configuration is of another version: {error}") from error
         first = state.get(cls.STATE[0])
         dtype = first.dtype if isinstance(first, Tensor) and first.is_floating_point() else torch.float32

@@ -199,7 +199,7 @@ def step(
         config: of UfM*.
         pixels: [B, n] indices into the flattened image to regress only there; None = every pixel.
         smooth: apply the exponential moving average.
-        anchors: of this frame; only with ``config.anchored``.
+        anchors: of this frame; only with ``config.anchors``.
         observer: is called after every stage and around every kernel.
         kernels: which implementation of each part.
 
@@ -238,7 +238,7 @@ def step(
         Evidence(state.evidence, state.overall_evidence), mixture.to(torch.float64).rigid(R_cam, t_cam),
         frame, anchors, config, functools.partial(learn, distribute=kernels.distribute),
     )  # fmt: skip
-    mixture_cam = unmeasured.before_regression(mixture_cam, config)
+    mixture_cam = unmeasured.before_regression(mixture_cam)
     stage("append")
 
     result = kernels.regress_image(mixture_cam, frame.depth, frame.intrinsics, frame.valid, config, pixels)

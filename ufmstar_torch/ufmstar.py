@@ -14,7 +14,7 @@ from ufmstar_torch import unmeasured
 from ufmstar_torch.anchors.hook import AnchorInput, Anchors, check_anchors
 from ufmstar_torch.arguments import require_float
 from ufmstar_torch.camera import invert_rigid
-from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.config import AnchorConfig, UfMStarConfig
 from ufmstar_torch.fixed_order import apply
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
 from ufmstar_torch.kernels.select import (
@@ -35,7 +35,6 @@ from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
 from ufmstar_torch.posterior.update import Posterior
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress
-from ufmstar_torch.spill import Spill, Spilled
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
 from ufmstar_torch.step import Step, StepObserver
@@ -97,7 +96,6 @@ class UfMStar(StatefulModule):
         if recalibration is not None:
             recalibration.require(self.config)
         self.recalibration = recalibration
-        self._spill = None if self.config.spill is None else Spill(self.config)
         for name, value in UfMStarState.initial(0, self.config, dtype, device or "cpu").tensors().items():
             self.register_buffer(name, value)
 
@@ -132,7 +130,7 @@ class UfMStar(StatefulModule):
             epistemic: likewise E [m^2].
             valid: like ``depth``, bool, True = use.
             features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed; of at most 1e12.
-            anchors: sparse depths of this frame, with ``config.anchored``; None = none.
+            anchors: sparse depths of this frame, with ``config.anchors``; None = none.
 
         Returns:
             The variance and its parts.
@@ -141,7 +139,7 @@ class UfMStar(StatefulModule):
             TypeError: wrong kind of argument or dtype.
             ValueError: wrong shape or device; another number of streams than before (:meth:`reset` first);
                 a pose that is not rigid or bad intrinsics (``config.on_bad_frame == "skip"``: counted instead);
-                anchors without ``config.anchored``.
+                anchors without ``config.anchors``.
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         out, variance, anchored, posterior = self._observe(frame, anchors)
@@ -227,16 +225,17 @@ class UfMStar(StatefulModule):
         Args:
             size: (H, W) of the depth maps [px].
             streams: B.
-            anchored: with the corners' triangulation (``LandmarkTracker``); None = as ``config.anchored``.
+            anchored: with the corners' triangulation (``LandmarkTracker``); None = as ``config.anchors``.
             progress: is called with the stages that are done and all of them, to show that something happens.
 
         Raises:
             ValueError: a size or number of streams that is not positive.
         """
-        anchored = self.config.anchored if anchored is None else anchored
-        twin = UfMStar(
-            self.config.replace(anchored=anchored, spill=None), dtype=self.mean.dtype, device=self.mean.device
-        )
+        anchored = self.config.anchors is not None if anchored is None else anchored
+        config = self.config
+        if anchored != (config.anchors is not None):
+            config = config.replace(anchors=AnchorConfig() if anchored else None)
+        twin = UfMStar(config, dtype=self.mean.dtype, device=self.mean.device)
         warm_up(twin, size, streams, progress)
 
     def query(self, points: Tensor, frame: str = "world") -> Regression:
@@ -269,8 +268,7 @@ class UfMStar(StatefulModule):
                 T = invert_rigid(self.T_world_first)
                 local = apply(T[:, None, :3, :3], local.double()) + T[:, None, :3, 3]
             dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
-            state = self.state if self._spill is None else self._spill.everything(self.state)
-            mixture = unmeasured.before_regression(state.mixture, self.config)
+            mixture = unmeasured.before_regression(self.mixture)
             result = regress(mixture, local.to(dtype), self.config)
             return unmeasured.after_regression(result, None, self.config)[0]
 
@@ -311,11 +309,6 @@ class UfMStar(StatefulModule):
         self._settle()
         return self._stored()
 
-    @property
-    def spilled(self) -> Spilled | None:
-        """What ``config.spill`` keeps out of memory; None without it."""
-        return None if self._spill is None else self._spill.spilled(self.state)
-
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget everything, or only some streams.
 
@@ -327,10 +320,10 @@ class UfMStar(StatefulModule):
 
         Raises:
             IndexError: an index is out of range.
-            ValueError: a mask of the wrong length; ``keep_evidence`` without ``config.anchored``.
+            ValueError: a mask of the wrong length; ``keep_evidence`` without ``config.anchors``.
         """
-        if keep_evidence and not self.config.anchored:
-            raise ValueError("keep_evidence needs UfMStarConfig(anchored=True): nothing is learnt without")
+        if keep_evidence and self.config.anchors is None:
+            raise ValueError("keep_evidence needs UfMStarConfig(anchors=AnchorConfig()): nothing is learnt without")
         with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
             self._reset(streams, keep_evidence)
 
@@ -350,12 +343,12 @@ class UfMStar(StatefulModule):
         """Checked, with what the network itself claims where they lie.
 
         Raises:
-            ValueError: anchors without ``config.anchored``; and as :func:`check_anchors`.
+            ValueError: anchors without ``config.anchors``; and as :func:`check_anchors`.
         """
         if anchors is None:
             return None
-        if not self.config.anchored:
-            raise ValueError("anchors need UfMStarConfig(anchored=True)")
+        if self.config.anchors is None:
+            raise ValueError("anchors need UfMStarConfig(anchors=AnchorConfig())")
         kernel = select_anchor_check(self.config.backend, frame.depth.device.type)
         return check_anchors(anchors, frame, self._own(frame), kernel)
 
@@ -380,7 +373,7 @@ class UfMStar(StatefulModule):
             average: apply the moving average.
 
         Returns:
-            The step's output; V and B (None unless ``config.anchored``) [m^2], at every pixel [B, H, W] or [B, n]; the
+            The step's output; V and B (None unless ``config.anchors``) [m^2], at every pixel [B, H, W] or [B, n]; the
             posterior (None unless ``config.posterior``, and at some pixels).
         """
         checked_anchors = self._anchors(anchors, frame)
@@ -394,22 +387,18 @@ class UfMStar(StatefulModule):
                 raise_faults(known.tolist())
             if self.observer is not None:
                 self.observer.stage("check")
-            step, config = self._step(frame.depth.device.type), self.config
-            if self._spill is not None:
-                state, config = self._spill.read_back(state, frame), self._spill.config
+            step = self._step(frame.depth.device.type)
             state, out = step(
-                state, frame, config, pixels=pixels, smooth=average, anchors=checked_anchors,
+                state, frame, self.config, pixels=pixels, smooth=average, anchors=checked_anchors,
                 observer=self.observer,
             )  # fmt: skip
-            if (self.config.merge or self._spill is not None) and isinstance(step, LateStep):
-                state = step.settled(state, config)
+            if self.config.merge is not None and isinstance(step, LateStep):
+                state = step.settled(state, self.config)
             state, out, posterior = self._with_posterior(state, out, frame, checked_anchors, dense=pixels is None)
-            if self.config.merge:
+            if self.config.merge is not None:
                 kernels = select_merge(self.config.backend, frame.depth.device.type)
                 state = merged(state, frame.fault == 0, self.config, kernels)
                 out = replace(out, statistics=replace(out.statistics, components=state.mixture.components))
-            if self._spill is not None:
-                state = self._spill.write_out(state, frame)
             self._store(state.tensors())
             self._warn_without_segments(frame, out)
 
@@ -433,7 +422,7 @@ class UfMStar(StatefulModule):
         self, state: UfMStarState, out: StepOutput, frame: FrameInput, anchors: AnchorInput | None, *, dense: bool
     ) -> tuple[UfMStarState, StepOutput, Posterior | None]:
         """State and output with what the posterior learns and returns; as they are without ``config.posterior``."""
-        if not (self.config.posterior and dense):
+        if self.config.posterior is None or not dense:
             return state, out, None
         claimed = out.disagreement
         for own in self._own(frame):

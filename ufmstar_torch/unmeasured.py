@@ -22,18 +22,10 @@ from ufmstar_torch.regress import Regression
 HALF = 0.5
 
 
-def before_regression(mixture: GaussianMixture, config: UfMStarConfig) -> GaussianMixture:
-    """The mixture [B, K] with one more feature, 1 where a component was seen from two views or more and else 0.
-
-    With ``config.unmeasured == "prior"`` the others have the disagreement ``config.prior_mean``.
-    """
-    compared = mixture.count > 1
-    features = torch.cat([mixture.features, compared[..., None].to(mixture.features.dtype)], dim=-1)
-    mixture = mixture.replace(features=features)
-    if config.unmeasured != "prior":
-        return mixture
-    stated = torch.full_like(mixture.disagreement, config.prior_mean)
-    return mixture.replace(disagreement=torch.where(compared, mixture.disagreement, stated))
+def before_regression(mixture: GaussianMixture) -> GaussianMixture:
+    """The mixture [B, K] with one more feature, 1 where a component was seen from two views or more and else 0."""
+    compared = (mixture.count > 1).to(mixture.features.dtype)
+    return mixture.replace(features=torch.cat([mixture.features, compared[..., None]], dim=-1))
 
 
 def after_regression(result: Regression, depth: Tensor | None, config: UfMStarConfig) -> tuple[Regression, Tensor]:

@@ -88,7 +88,7 @@ def warm_up(
     features = depth.new_zeros(streams, config.features, height, width) if config.features else None
     corner = depth[:, 0, :1]
     anchors = None
-    if config.anchored:
+    if config.anchors is not None:
         anchors = Anchors(torch.zeros(streams, 1, 2, device=device), corner, 1e-4 * corner)
     jobs: list[tuple[str, str, dict[str, Any]]] = [
         (__name__, "description", {}),  # first: this process needs it soonest
@@ -103,7 +103,7 @@ def warm_up(
         for _ in range(2):  # the fusion meets a mixture from the second on
             module(depth, pose, K, features=features, anchors=anchors)
         module.mean_uncertainty(depth, pose, K, features=features, pixels=1)
-        if config.anchored:
+        if config.anchors is not None:
             compile_triangulation()
         for function in also:
             function()

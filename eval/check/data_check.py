@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.eval.check.check import SequenceCheck, check_sequence
-from ufmstar_torch.eval.results.files import to_json
+from ufmstar_torch.eval.run.files import to_json
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.poses import OURS
-from ufmstar_torch.eval.tour.open import open_sequence
 
 _SAMPLED = 12  # frames whose depth is looked at for its range
 _DECODED = 500  # frames that are read to see that they can be; of more, as many evenly spaced ones: seconds

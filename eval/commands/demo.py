@@ -26,7 +26,7 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.camera import unproject
-from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.demo_command import DemoOptions
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks, landmarks_of
 from ufmstar_torch.eval.engine.estimators import Alone, Gaussians, Pointwise
@@ -42,11 +42,11 @@ from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.ufm import UfMConfig
 from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, POSTERIOR, panel, write_pictures
-from ufmstar_torch.eval.report.panels import FramePanel
 from ufmstar_torch.eval.report.text import demo_names
-from ufmstar_torch.eval.results.files import to_json, write_json_atomic
-from ufmstar_torch.eval.results.folder import FolderKind, OutputFolder, remover
-from ufmstar_torch.eval.results.summary import versions
+from ufmstar_torch.eval.run.files import to_json, write_json_atomic
+from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
+from ufmstar_torch.eval.run.panels import FramePanel
+from ufmstar_torch.eval.run.summary import versions
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.tour import Tour, make_tour, tour_sequence
@@ -57,7 +57,7 @@ from ufmstar_torch.pipeline import NetworksInTurn
 KINDS = {"home": "familiar", "hall": "unfamiliar"}
 STYLE = "mixed"
 SHEET_ROWS = 6
-_POSTERIOR = UfMStarConfig(anchored=True, posterior=True)
+_POSTERIOR = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
 _WEIGHTS = ("weights", "demo.safetensors")
 SUMMARY = "summary.json"
 DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*DEMO_FILES))

@@ -58,7 +58,7 @@ def main(options: DemoOptions) -> int:
     from ufmstar_torch.eval.commands import demo
     from ufmstar_torch.eval.commands.terminal import Bars
     from ufmstar_torch.eval.report.text import demo_explanation, demo_table
-    from ufmstar_torch.eval.results.folder import FolderError
+    from ufmstar_torch.eval.run.folder import FolderError
 
     try:
         with Bars() as bars:

@@ -9,13 +9,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from ufmstar_torch.config import AnchorConfig, PosteriorConfig
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, parse
 from ufmstar_torch.eval.sequences.frame import parse_slice
 
 PRESETS = ("paper", "default")
 # Options that a job has under their names.
-_OF_JOB = ("device", "confident", "bins", "examples", "samples", "runtime", "precision", "streams")
+_OF_JOB = ("device", "confident", "bins", "examples", "samples", "runtime", "precision")
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.methods.suite import Suite
@@ -116,11 +117,6 @@ class EvalOptions:
     Attributes:
         device: cpu or cuda; of several processes, each takes the next GPU in turn
         threads: number of CPU threads of each process; default: all cores, divided among --processes
-        streams: number of sequences that a process evaluates at the same time: each network and UfM* get their frames
-            as one batch. UfM* gives the same bits; a network may differ in its last bits from one image at a time
-            (torch and ONNX Runtime choose algorithms by the batch), and must not mix the images of a batch.
-            MC-Dropout, UfM and tracked anchors go sequence by sequence; times in records are a batch's, divided by its
-            frames
         processes: number of processes on this computer
         shard: i/n, only the i-th of n parts of the sequences, 1/n to n/n
         slurm: KEY=VALUE for submitit, as partition=gpu; jobs=N is the number of jobs; repeatable
@@ -134,7 +130,6 @@ class EvalOptions:
 
     device: str = "cpu"
     threads: int | None = None
-    streams: int = 1
     processes: int = 1
     shard: str | None = None
     slurm: tuple[str, ...] = option((), repeat=True)
@@ -153,7 +148,7 @@ class EvalOptions:
             if not values[name]:
                 raise ValueError(f"--{name} is missing; ufmstar eval --help, and --list for the suites")
         parse_slice(self.data.frames)
-        least_of = {"processes": 1, "streams": 1, "examples": 0, "threads": 1, "seed": 0, "samples": 2}
+        least_of = {"processes": 1, "examples": 0, "threads": 1, "seed": 0, "samples": 2}
         for name, least in least_of.items():
             if values[name] is not None and values[name] < least:
                 raise ValueError(f"--{name} must be at least {least}, got {values[name]}")
@@ -271,7 +266,10 @@ def _evaluate(options: EvalOptions) -> int:
         rows = [row for row in job.suite.rows if row.method.fusion == UFM_STAR]
         if rows:
             anchors = {row.setting.anchors for row in rows}
-            config = UfMStarConfig(anchored=anchors != {""}, posterior=any(row.setting.posterior for row in rows))
+            config = UfMStarConfig(
+                anchors=AnchorConfig() if anchors != {""} else None,
+                posterior=PosteriorConfig() if any(row.setting.posterior for row in rows) else None,
+            )
             shown = partial(bars.frames, "kernels, compiled on the first run")
             warm_up_command(config, torch.device("cpu"), shown, dense=DENSE in anchors)
         outcome = evaluate_suite(job, launch, stop=stop, report=bars.say, progress=bars.frames)

@@ -82,7 +82,8 @@ class _Fields:
 
 def fields_of(config: type, prefix: str = "", **how: Any) -> Any:
     """A field of type ``dict[str, Any]``: an option for every field of a settings class, nested ones included; the
-    arguments are :class:`_Fields`'s. The value of a bool is written out: ``--ufm.add_aleatoric false``."""
+    arguments are :class:`_Fields`'s. A section that is None by default is None unless one of its options is given. The
+    value of a bool is written out: ``--ufm.add_aleatoric false``."""
     return field(default_factory=dict, metadata={"fields_of": _Fields(config, prefix, **how)})
 
 
@@ -191,8 +192,9 @@ def _add_fields(group: Any, wanted: _Fields) -> None:
     for f in fields(wanted.config):
         if f.name in wanted.without:
             continue
-        if is_dataclass(hints[f.name]):
-            _add_fields(group, _Fields(hints[f.name], f"{wanted.prefix}{f.name}.", unset=wanted.unset))
+        if (section := _section(hints[f.name])) is not None:
+            absent = wanted.unset or _default(f) is None
+            _add_fields(group, _Fields(section, f"{wanted.prefix}{f.name}.", unset=absent))
             continue
         parts = get_args(hints[f.name]) if get_origin(hints[f.name]) in (Union, types.UnionType) else (hints[f.name],)
         parts += (types.NoneType,) if wanted.unset else ()
@@ -206,6 +208,11 @@ def _add_fields(group: Any, wanted: _Fields) -> None:
             help=" ".join(text for text in (help_.get(f.name), _range(f)) if text),
             **how,
         )
+
+
+def _section(hint: Any) -> type | None:
+    """The dataclass in the hint of a field, which may be optional."""
+    return next((part for part in (hint, *get_args(hint)) if isinstance(part, type) and is_dataclass(part)), None)
 
 
 def _range(f: Field[Any]) -> str:
@@ -244,7 +251,11 @@ def _settings(wanted: _Fields, values: Mapping[str, Any]) -> dict[str, Any]:
     *path, _ = wanted.prefix.split(".")
     for key in path:
         values = values[key]
-    own = {f.name: values[f.name] for f in fields(wanted.config) if f.name not in wanted.without}
+    own = {f.name: values.get(f.name) for f in fields(wanted.config) if f.name not in wanted.without}
+    for f in fields(wanted.config):
+        section = own.get(f.name)
+        if _default(f) is None and isinstance(section, Mapping):  # off unless one of its values is given
+            own[f.name] = {name: value for name, value in section.items() if value is not None} or None
     return {name: value for name, value in own.items() if not (wanted.unset and value is None)}
 
 

@@ -18,7 +18,6 @@ from ufmstar_torch.anchors.landmarks import DENSE, LandmarkSource
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.commands.run_command import OWN_DEPTH, RunOptions
 from ufmstar_torch.eval.engine.anchors import landmarks_of
-from ufmstar_torch.eval.engine.behind import Behind
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
@@ -26,15 +25,16 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
-from ufmstar_torch.eval.report.outputs import Finished, common_columns, draw_sheet, draw_video, mixture_writers
-from ufmstar_torch.eval.results.files import write_json_atomic
-from ufmstar_torch.eval.results.journal import Journal
-from ufmstar_torch.eval.results.run_folder import RunFolder
-from ufmstar_torch.eval.results.run_job import RunJob
-from ufmstar_torch.eval.results.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
+from ufmstar_torch.eval.engine.writer_thread import WriterThread
+from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.run.journal import Journal
+from ufmstar_torch.eval.run.pictures import Finished, common_columns, draw_sheet, draw_video, mixture_writers
+from ufmstar_torch.eval.run.run_folder import RunFolder
+from ufmstar_torch.eval.run.run_job import RunJob
+from ufmstar_torch.eval.run.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.recalibrate import beside, named, read_recalibration
 
@@ -94,11 +94,11 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
     def compiling(done: int, total: int) -> None:
         progress(Progress("kernels", done, total))
 
-    dense = job.config.anchored and isinstance(job.landmarks(), DenseEvidence)
+    dense = job.config.anchors is not None and isinstance(job.landmarks(), DenseEvidence)
     warm_up_command(job.config, job.device, compiling, images=job.source.needs_image, dense=dense)
     row, metrics = job.row(folder.checkpoint), RunMetrics(UFM, folder.checkpoint.metrics)
     stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=folder.checkpoint.position)
-    with Behind([metrics, Journal(job, folder, metrics)]) as behind:
+    with WriterThread([metrics, Journal(job, folder, metrics)]) as behind:
         stream.drive([behind, ProgressSink(progress, _skipped(folder))], stop=stop)
 
 
@@ -163,7 +163,9 @@ def job_from(chosen: RunOptions) -> RunJob:
     sequence = open_sequence(chosen.sequence, **chosen.opening.given())
     if not sequence.posed:
         raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
-    landmarks = _landmarks(chosen.uncertainty.anchors or DENSE, sequence) if config.anchored else LandmarkTracker
+    landmarks = (
+        _landmarks(chosen.uncertainty.anchors or DENSE, sequence) if config.anchors is not None else LandmarkTracker
+    )
     indices = range(len(sequence))[parse_slice(options["frames"])]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")

@@ -12,6 +12,7 @@ from ufmstar_torch.eval.commands.opening import SequenceOptions
 from ufmstar_torch.eval.commands.options import UsageError, as_dict, fields_of, option, parse, positional
 from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+from ufmstar_torch.stateful import flat
 
 PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
 OWN_DEPTH = ("self", "ground-truth")
@@ -127,7 +128,7 @@ class RunOptions:
     uncertainty: UfMOptions
 
     def __post_init__(self) -> None:
-        UfMStarConfig.from_dict(self.uncertainty.ufm | {"anchored": True})
+        _ = self.config  # checks the settings
         parse_slice(self.frames)
         parse_size(self.maps.size)
         for words, name in (
@@ -137,9 +138,6 @@ class RunOptions:
         ):
             parse_intrinsics(words, name)
         _check_depth(as_dict(self.network) | as_dict(self.maps))
-        for name, flag in (("anchored", "anchors"), ("posterior", "posterior")):
-            if self.uncertainty.ufm[name] and not getattr(self.uncertainty, flag):
-                raise ValueError(f"--ufm.{name} needs anchors: give --{flag} instead")
         if self.resume and self.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
 
@@ -147,14 +145,20 @@ class RunOptions:
     def config(self) -> UfMStarConfig:
         """The configuration of UfM*."""
         chosen = self.uncertainty
-        tracked = {"anchored": bool(chosen.anchors) or chosen.posterior, "posterior": chosen.posterior}
-        return UfMStarConfig.from_dict(chosen.ufm | tracked)
+        sections: dict[str, Any] = {}
+        for name, used in (("anchors", chosen.anchors or chosen.posterior), ("posterior", chosen.posterior)):
+            if chosen.ufm[name] is not None and not used:
+                raise ValueError(f"--ufm.{name}.* needs --{name}")
+            sections[name] = (chosen.ufm[name] or {}) if used else None
+        return UfMStarConfig.from_dict(chosen.ufm | sections)
 
     def settings(self) -> dict[str, Any]:
         """What is run, as plain values that a configuration file may hold: not how it is started."""
         started = ("resume", "overwrite", "debug")
         plain = {name: value for name, value in as_dict(self).items() if name not in started}
-        return plain | {"ufm": self.config.to_dict()}
+        sections = ("anchors", "posterior", "merge")
+        ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in sections}
+        return plain | {"ufm": ufm}
 
 
 def read(words: Sequence[str]) -> RunOptions:
@@ -169,9 +173,9 @@ def read(words: Sequence[str]) -> RunOptions:
     defaults: dict[str, Any] = {}
     if options.uncertainty.ufm_preset == "paper":
         paper = UfMStarConfig.paper()
-        changed = {**vars(paper), "on_bad_frame": "skip"}
-        defaults = {f"ufm.{name}": value for name, value in changed.items() if name != "segment"}
-        defaults |= {f"ufm.segment.{name}": value for name, value in paper.segment.to_dict().items()}
+        changed = flat(paper.to_dict()) | {"on_bad_frame": "skip"}
+        off = ("anchors", "posterior", "merge")
+        defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in off}
     if options.uncertainty.preset is not None:
         preset = SPGFConfig.preset(options.uncertainty.preset).to_dict()
         defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
@@ -182,8 +186,8 @@ def main(options: RunOptions) -> int:
     """Run, and print the results' table; the exit code."""
     from ufmstar_torch.eval.commands.run import job_from, run
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-    from ufmstar_torch.eval.results.folder import FolderError
-    from ufmstar_torch.eval.results.machine import share_threads
+    from ufmstar_torch.eval.run.folder import FolderError
+    from ufmstar_torch.eval.run.machine import share_threads
 
     if options.threads is None:
         share_threads()
@@ -227,7 +231,7 @@ def _check_depth(options: Mapping[str, Any]) -> None:
 def _report(summary: Mapping[str, Any], out: str) -> int:
     """Print the table and where the outputs are; the exit code."""
     from ufmstar_torch.eval.report.text import run_table
-    from ufmstar_torch.eval.results.summary import FINISHED, INTERRUPTED
+    from ufmstar_torch.eval.run.summary import FINISHED, INTERRUPTED
 
     if summary["frames"]["done"]:
         print(run_table(summary))

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import copy
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.engine.gaussian_streams import StreamInput, UfMStarStreams
 from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.method import ALONE, UFM
 from ufmstar_torch.eval.methods.row import Row
@@ -23,7 +20,7 @@ from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import FrameStatistics
 from ufmstar_torch.recalibrate import Recalibration, read_recalibration
-from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
+from ufmstar_torch.ufmstar import UfMStar
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,18 +71,13 @@ class Estimator(ABC):
             raise ValueError(f"the saved state has {sorted(state)} too many")
 
 
-# The arguments of :meth:`Estimator.update`.
-EstimatorInput = tuple[Prediction, Tensor, Anchors | None]
-
-
-def make_estimator(row: Row, device: torch.device, max_depth: float | None = None, *, streams: int = 1) -> Estimator:
+def make_estimator(row: Row, device: torch.device, max_depth: float | None = None) -> Estimator:
     """The estimator of a row, in its initial state.
 
     Args:
         row: which.
         device: where it runs.
         max_depth: [m] the largest depth that the row's networks can predict, None where it is not known.
-        streams: of UfM* (:meth:`Gaussians.stream`); with ``config.spill``, whose folder is one sequence's, one.
 
     Raises:
         ValueError: a recalibration that was fitted under other settings.
@@ -102,7 +94,6 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
     return Gaussians(
         config,
         device,
-        streams=streams if config.spill is None else 1,
         uses_variances=method.uses_aleatoric,
         corrected=setting.corrected,
         posterior=setting.posterior,
@@ -169,7 +160,7 @@ class Gaussians(Estimator):
     """UfM*.
 
     Args:
-        config: its settings; several streams need ``on_bad_frame = "skip"``.
+        config: its settings.
         device: of the mixture.
         uses_variances: False leaves A and E aside.
         corrected: answer with the depth corrected by the anchors' bias, and the variance that remains.
@@ -178,7 +169,6 @@ class Gaussians(Estimator):
         aleatoric_in_h: the config has two features: the aleatoric variance, kept in the mixture, and 1. What is read
             back is added instead of the pixel's own, A'(x) = sum_k w_k(x) a_k + (1 - sum_k w_k(x)) A: the pixel's own
             as far as no component explains it, where the mixture alone would read as 0.
-        streams: sequences that are evaluated at once; this is the estimator of the first.
     """
 
     def __init__(
@@ -191,61 +181,36 @@ class Gaussians(Estimator):
         posterior: bool = False,
         recalibration: Recalibration | None = None,
         aleatoric_in_h: bool = False,
-        streams: int = 1,
     ) -> None:
-        self._streams = UfMStarStreams(lambda: UfMStar(config, recalibration=recalibration, device=device), streams)
-        self.streams, self._stream = streams, 0
+        self.ufm = UfMStar(config, recalibration=recalibration, device=device)
         self._uses_variances, self._corrected, self._in_h = uses_variances, corrected, aleatoric_in_h
         self._posterior = posterior
         self._anchors = 0
 
-    @property
-    def ufm(self) -> UfMStar:
-        """The module, with all of its streams."""
-        return self._streams.module(self._stream)
-
-    def stream(self, number: int) -> Self:
-        """The estimator of a stream, in its initial state; an earlier one of this stream must not be used again."""
-        other = copy.copy(self)
-        other._stream, other._anchors = number, 0
-        self._streams.restart(number)
-        return other
-
-    def batch(self, prediction: Prediction) -> object:
-        """The same for streams whose next predictions UfM* can take in as one batch."""
-        return self._streams.choose(self._stream, prediction.size), prediction.size, *prediction.maps()
-
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
         """See :meth:`Estimator.update`. Raises ValueError: ``aleatoric_in_h`` without an aleatoric variance."""
-        return self.update_together([self], [(prediction, T_world_cam, anchors)])[0]
-
-    @staticmethod
-    def update_together(streams: Sequence[Gaussians], inputs: Sequence[EstimatorInput]) -> list[Estimate]:
-        """The next frames of some streams of one UfM*, which have the same :meth:`batch`. Raises ValueError, as
-        :meth:`update`."""
-        frames = {one._stream: one._input(*given) for one, given in zip(streams, inputs, strict=True)}
-        out = streams[0]._streams(frames)
-        return [one._estimate(frames[one._stream], out[one._stream]) for one in streams]
-
-    def _input(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None) -> StreamInput:
         a, e = _variances(prediction, self._uses_variances)
         features = None
         if self._in_h:
             if a is None:
                 raise ValueError("aleatoric_in_h needs a network that predicts an aleatoric variance")
-            features = torch.stack([a, torch.ones_like(a)])
-        return StreamInput(prediction.depth, T_world_cam, prediction.intrinsics, a, e, features, anchors)
-
-    def _estimate(self, given: StreamInput, out: UfMStarOutput) -> Estimate:
-        """What the row makes of UfM*'s output for one stream."""
-        a = given.aleatoric
+            features = torch.stack([a, torch.ones_like(a)])[None]
+        out = self.ufm(
+            prediction.depth[None],
+            T_world_cam,
+            prediction.intrinsics,
+            _one(a),
+            _one(e),
+            features=features,
+            anchors=anchors,
+        )
         self._anchors = int(out.statistics.anchors_used[0])
-        depth, variance = out.corrected() if self._corrected else (given.depth[None], out.variance)
+        depth, variance = out.corrected() if self._corrected else (out.depth, out.variance)
         if self._posterior:
             depth, variance = out.posterior()
         if self._in_h and a is not None:
-            kept, explained = out.features.unbind(-1)
-            a = (kept + (1 - explained) * a)[0]
+            mixed, explained = out.features.unbind(-1)
+            a = (mixed + (1 - explained) * a)[0]
             variance = variance + a
         optional = {name: getattr(out, name) for name in ("anchored", "bias", "posterior_depth", "posterior_variance")}
         return _estimate(
@@ -253,7 +218,7 @@ class Gaussians(Estimator):
             variance=variance[0],
             valid=out.valid[0],
             aleatoric=a,
-            epistemic=given.epistemic,
+            epistemic=e,
             disagreement=out.disagreement[0],
             **{name: None if value is None else value[0] for name, value in optional.items()},
             statistics=out.statistics,
@@ -261,32 +226,28 @@ class Gaussians(Estimator):
 
     def mixture_world(self) -> GaussianMixture:
         """[1, K] M_i in the world's frame, float64; after a frame."""
-        T = self._streams.tensor(self._stream, "T_world_first").double()
-        mixture = self._streams.mixture(self._stream).to(torch.float64)
-        return mixture.rigid(T[:, :3, :3], T[:, :3, 3])
+        T = self.ufm.T_world_first.double()
+        return self.ufm.mixture.to(torch.float64).rigid(T[:, :3, :3], T[:, :3, 3])
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the occupied components, with what anchors added to them; the bytes of the moving
         average beside them."""
-        mixture, kept_of = self._streams.mixture(self._stream), partial(self._streams.tensor, self._stream)
+        mixture = self.ufm.mixture
         count = int(mixture.components.sum())
         kept: dict[str, float] = {
             "bytes": count * mixture.bytes_per_component(),
             "count": count,
-            "smoothing_bytes": kept_of("smoothed").nbytes,
+            "smoothing_bytes": self.ufm.smoothed.nbytes,
         }
-        if self.ufm.config.anchored:
-            kept["bytes"] += (count + 1) * kept_of("overall_evidence").nbytes + kept_of("posterior").nbytes
+        if self.ufm.config.anchors is not None:
+            kept["bytes"] += (count + 1) * self.ufm.overall_evidence.nbytes + self.ufm.posterior.nbytes
             kept["anchors"] = self._anchors
         return kept
 
     def state(self) -> dict[str, Tensor]:
-        return self._streams.state(self._stream)
+        return dict(self.ufm.state_dict())
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """See :meth:`Estimator.load_state`; one of several streams raises ValueError."""
-        if self.streams > 1:
-            raise ValueError(f"a state goes into a UfM* of one stream, this one has {self.streams}")
         _load(self.ufm, state)
 
 

@@ -8,8 +8,7 @@ where it predicts something. How many it leaves out is among its figures (``left
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from statistics import median
@@ -21,12 +20,12 @@ from torch import Tensor
 from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
-from ufmstar_torch.eval.engine.estimators import Estimator, Gaussians, make_estimator
+from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.judge import RowMetrics, references
 from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionStore
 from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.rows import RowRunner
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, drive_together
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED
@@ -61,21 +60,11 @@ class RowResult:
 
 
 @dataclass(frozen=True, eq=False)
-class SequenceTask:
-    """What is judged of a sequence."""
-
-    sequence: FrameSequence  # posed frames with ground truth
-    rows: Sequence[Row]  # different ones
-    sinks: Sequence[FrameSink] = ()  # take the frames after the metrics; a row's key is its slug
-    progress: Callable[[Progress], object] = lambda _: None  # called at the start and after every frame
-
-
-@dataclass(frozen=True, eq=False)
 class Judge:
     """How sequences are judged.
 
     Raises:
-        ValueError: a share of confident pixels out of range, or less than one stream.
+        ValueError: a share of confident pixels out of range.
     """
 
     networks: Mapping[str, DepthSource]  # by base
@@ -84,115 +73,80 @@ class Judge:
     limit: slice = field(default_factory=lambda: slice(None))  # which frames, before a setting's skip
     confident: float = 0.5  # of the pixels of a frame, the share of which a reference method counts as confident
     bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
-    # sequences that are judged at the same time: networks and UfM* get their frames as one batch. UfM* gives the same
-    # bits as for one sequence after the other; a network may not (``NetworkSource.several``).
-    streams: int = 1
 
     def __post_init__(self) -> None:
         if not 0 < self.confident <= 1:
             raise ValueError(f"confident must lie in (0, 1], got {self.confident}")
-        if self.streams < 1:
-            raise ValueError(f"streams must be at least 1, got {self.streams}")
 
 
-Done = Callable[[SequenceTask, list[RowResult] | Exception], None]
-
-
-def evaluate_sequences(
-    tasks: Iterable[SequenceTask], judge: Judge, done: Done, *, stop: Callable[[], bool] = lambda: False
-) -> None:
-    """Judge every row on the frames of every sequence.
+def evaluate_sequence(
+    sequence: FrameSequence,
+    rows: Sequence[Row],
+    judge: Judge,
+    *,
+    sinks: Sequence[FrameSink] = (),
+    progress: Callable[[Progress], object] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> list[RowResult]:
+    """Judge every row on the frames of a sequence.
 
     Args:
-        tasks: the next one is asked for when there is room for it.
-        judge: how.
-        done: called with every task and its results, one for each row in their order, or with the error (``BROKEN``)
-            for which the sequence cannot be used. The errors are SequenceError, ValueError for no row, one of them
-            twice, a base without a network, an override that UfM* does not know, or preprocessing of maps that exist
-            already, and what readers and networks raise.
-        stop: asked before every frame.
+        sequence: posed frames with ground truth.
+        rows: different ones.
+        judge: networks, device and metrics.
+        sinks: receive the frames after the metrics; a row's key is its slug.
+        progress: called at the start and after every frame.
+        stop: called before every frame.
+
+    Returns:
+        A result for each row, in their order.
 
     Raises:
-        Stopped: ``stop`` returned True; nothing of the sequences in hand counts.
+        SequenceError: the sequence cannot be judged.
+        ValueError: no row, one of them twice, a base without a network, an override that UfM* does not know, or
+            preprocessing of maps that exist already.
+        FrameError, RuntimeError, ValueError: what readers and networks raise.
+        Stopped: ``stop`` returned True.
     """
-    shared: dict[Row, Gaussians] = {}  # of a row of UfM*, the streams of one module
-    running: dict[FrameStream, _Evaluation] = {}
+    indices = range(len(sequence))[judge.limit]
+    _check(sequence, rows, indices, judge.networks)
+    expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
+    sources = {(base, how): judge.networks[base].prepared(how) for base, how in expected}
+    anchors = anchor_sources(rows, sequence.folder)
+    runners = []
+    for row in rows:
+        source = sources[row.method.base, row.setting.preprocess]
+        estimator = make_estimator(row, judge.device, source.max_depth)
+        how: dict[str, Any] = {"every": row.method.every_member, "setting": row.setting}
+        runners.append(RowRunner(row.slug, source, estimator, **how, anchors=anchors.get(row), device=judge.device))
+    tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)
+    check = partial(_check_frame, sources=sources.values(), tracked=tracked)
+    named = {row.slug: {other.slug: other.method.name for other in references(row, rows)} for row in rows}
+    metrics, accounts = RowMetrics(named, judge.confident, judge.bins), _Accounts()
+    stream = FrameStream(sequence, indices, runners, store=judge.store, device=judge.device, check=check)
+    stream.drive([metrics, accounts, *sinks, ProgressSink(progress)], stop=stop)
+    opened = Counter(skipped.reason for skipped in sequence.skipped)
+    left_out = {"left_out_on_opening": dict(sorted(opened.items()))}
+    return [_result(row, metrics, accounts, left_out) for row in rows]
 
-    def begun() -> Iterator[tuple[FrameStream, Sequence[FrameSink]]]:
-        for task in tasks:
-            slot = min(set(range(judge.streams)) - {one.slot for one in running.values()})
-            try:
-                evaluation = _Evaluation(task, judge, shared, slot)
-            except BROKEN as error:
-                done(task, error)
-                continue
-            running[evaluation.stream] = evaluation
-            yield evaluation.stream, evaluation.sinks
 
-    with closing(drive_together(begun(), at_once=judge.streams, stop=stop, broken=BROKEN)) as ended:
-        for stream, error in ended:
-            evaluation = running.pop(stream)
-            done(evaluation.task, error or evaluation.outcome())
-
-
-class _Evaluation:
-    """A sequence while it is judged.
-
-    Raises:
-        SequenceError, ValueError: as :func:`evaluate_sequences` states.
-    """
-
-    def __init__(self, task: SequenceTask, judge: Judge, shared: dict[Row, Gaussians], slot: int) -> None:
-        self.task, self.slot = task, slot
-        sequence, rows = task.sequence, task.rows
-        indices = range(len(sequence))[judge.limit]
-        _check(sequence, rows, indices, judge.networks)
-        expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
-        sources = {(base, how): judge.networks[base].prepared(how) for base, how in expected}
-        anchors = anchor_sources(rows, sequence.folder)
-        named = {row.slug: {other.slug: other.method.name for other in references(row, rows)} for row in rows}
-        self._metrics, self._accounts = RowMetrics(named, judge.confident, judge.bins), _Accounts()
-        self.sinks: Sequence[FrameSink] = [self._metrics, self._accounts, *task.sinks, ProgressSink(task.progress)]
-        runners = []
-        for row in rows:
-            source = sources[row.method.base, row.setting.preprocess]
-            estimator: Estimator | None = shared.get(row)
-            if estimator is None:
-                estimator = make_estimator(row, judge.device, source.max_depth, streams=judge.streams)
-            if isinstance(estimator, Gaussians) and estimator.streams > 1:
-                shared[row] = estimator
-                estimator = estimator.stream(slot)
-            how: dict[str, Any] = {"every": row.method.every_member, "setting": row.setting}
-            runners.append(RowRunner(row.slug, source, estimator, **how, anchors=anchors.get(row), device=judge.device))
-        tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)
-        check = partial(_check_frame, sources=sources.values(), tracked=tracked)
-        self.stream = FrameStream(sequence, indices, runners, store=judge.store, device=judge.device, check=check)
-
-    def outcome(self) -> list[RowResult] | Exception:
-        """After the last frame: a result for each row, or why there is none."""
-        try:
-            return [self._result(row) for row in self.task.rows]
-        except BROKEN as error:
-            return error
-
-    def _result(self, row: Row) -> RowResult:
-        """What a row leaves behind. Raises SequenceError: it has judged nothing."""
-        key, metrics, accounts = row.slug, self._metrics, self._accounts
-        frames = accounts.frames(key, metrics.judged[key])
-        if not frames["judged"]:
-            reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
-            none = "none of those that were read has ground truth"
-            raise SequenceError(f"no frame could be judged: {reasons or none}")
-        opened = Counter(skipped.reason for skipped in self.task.sequence.skipped)
-        return RowResult(
-            row=row,
-            frames={**frames, "left_out_on_opening": dict(sorted(opened.items()))},
-            figures=metrics.figures(key),
-            curves=metrics.curves(key),
-            state=accounts.state(key),
-            ms=accounts.median_ms(key),
-            sums=metrics.sums(key),
-        )
+def _result(row: Row, metrics: RowMetrics, accounts: _Accounts, left_out: Mapping[str, Any]) -> RowResult:
+    """Of one row after the last frame. Raises SequenceError: it has judged nothing."""
+    key = row.slug
+    frames = accounts.frames(key, metrics.judged[key])
+    if not frames["judged"]:
+        reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
+        none = "none of those that were read has ground truth"
+        raise SequenceError(f"no frame could be judged: {reasons or none}")
+    return RowResult(
+        row=row,
+        frames={**frames, **left_out},
+        figures=metrics.figures(key),
+        curves=metrics.curves(key),
+        state=accounts.state(key),
+        ms=accounts.median_ms(key),
+        sums=metrics.sums(key),
+    )
 
 
 def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal, cast
 from weakref import WeakKeyDictionary
 
@@ -65,9 +65,7 @@ class NetworkSource(DepthSource):
         self._generator = torch.Generator(device)
         self._inputs: WeakKeyDictionary[Frame, tuple[Tensor, Tensor]] = WeakKeyDictionary()
         self._seeded: Frame | None = None
-        sampling = stochastic(networks.networks) if seeding is not None else []
-        self._draws = bool(sampling)
-        for network in sampling:
+        for network in stochastic(networks.networks) if seeding is not None else []:
             set_sampling(network, True, self._generator)
 
     @property
@@ -97,43 +95,20 @@ class NetworkSource(DepthSource):
         """See :class:`DepthSource`."""
         return self._turns.turn(position)
 
-    @property
-    def batches(self) -> bool:
-        """Whether :meth:`several` may be used: networks that draw samples draw them frame by frame."""
-        return not self._draws
-
     def one(self, frame: Frame, n: int) -> Prediction:
         """One inference, of member (or sample) n. Raises FrameError: the frame has no image."""
-        return self.several([frame], n)[0]
-
-    def several(self, frames: Sequence[Frame], n: int) -> list[Prediction]:
-        """The inferences of member n for several frames, as one batch if the network's inputs are of one size.
-
-        A prediction may differ in its last bits from that of :meth:`one`: torch and ONNX Runtime choose their
-        algorithms by the size of a batch. Of the time, each frame gets an equal share.
-
-        Raises:
-            FrameError: a frame has no image.
-        """
-        if self._seeding == "frame" and self._seeded is not frames[-1]:  # a frame seeds once for all members
-            self._generator.manual_seed(frames[-1].index)
-            self._seeded = frames[-1]
+        if self._seeding == "frame" and self._seeded is not frame:  # a frame seeds once for all members
+            self._generator.manual_seed(frame.index)
+            self._seeded = frame
         with torch.no_grad():
-            inputs = [self._input(frame) for frame in frames]
-            if len({x.shape for x, _ in inputs}) > 1:
-                return [self._inference([given], n)[0] for given in inputs]
+            x, K = self._input(frame)
             if self._seeding == "sample":
-                self._generator.manual_seed(frames[0].index + _SAMPLE_STRIDE * n)
-            return self._inference(inputs, n)
-
-    def _inference(self, inputs: Sequence[tuple[Tensor, Tensor]], n: int) -> list[Prediction]:
-        """Of inputs of one size."""
-        x, K = (torch.cat(values) if len(values) > 1 else values[0] for values in zip(*inputs, strict=True))
-        reduced = self._precision == BF16
-        with self._timer.stage("network"), torch.autocast(self._device.type, torch.bfloat16, enabled=reduced):
-            prediction = self._turns.member(x, K, n)
-        made = Prediction.each(prediction, K, self._timer.take()["network"])
-        return [one.to(torch.float32) for one in made] if reduced else made
+                self._generator.manual_seed(frame.index + _SAMPLE_STRIDE * n)
+            reduced = self._precision == BF16
+            with self._timer.stage("network"), torch.autocast(self._device.type, torch.bfloat16, enabled=reduced):
+                prediction = self._turns.member(x, K, n)
+        made = Prediction.single(prediction, K, self._timer.take()["network"])
+        return made.to(torch.float32) if reduced else made
 
     def prepare(self, frame: Frame) -> None:
         """See ``DepthSource``; on the processor."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -56,16 +56,14 @@ class Prediction:
         return {name: value for name, value in named.items() if value is not None}
 
     @classmethod
-    def each(cls, prediction: DepthPrediction, intrinsics: Tensor, ms: float | None) -> list[Prediction]:
-        """What a network returned for B images, [B, h, w]; ``intrinsics`` [B, 3, 3], ``ms`` of all together."""
-        share = None if ms is None else ms / len(intrinsics)
+    def single(cls, prediction: DepthPrediction, intrinsics: Tensor, ms: float | None) -> Prediction:
+        """From what a network returned for one image, [1, h, w], and its intrinsics [1, 3, 3]."""
 
-        def of(value: Tensor | None, i: int) -> Tensor | None:
-            return None if value is None else value[i].detach()
+        def map_of(value: Tensor | None) -> Tensor | None:
+            return None if value is None else value[0].detach()
 
-        a, e = prediction.aleatoric_variance, prediction.epistemic_variance
-        cameras = intrinsics.cpu().double()
-        return [cls(prediction.depth[i].detach(), of(a, i), of(e, i), K, share) for i, K in enumerate(cameras.unbind())]
+        a, e = map_of(prediction.aleatoric_variance), map_of(prediction.epistemic_variance)
+        return cls(prediction.depth[0].detach(), a, e, intrinsics[0].cpu().double(), ms)
 
 
 def combined(predictions: Sequence[Prediction]) -> Prediction:
@@ -78,7 +76,7 @@ def combined(predictions: Sequence[Prediction]) -> Prediction:
     joint = combine([DepthPrediction(p.depth[None], batch(p.aleatoric), batch(p.epistemic)) for p in predictions])
     times = [p.ms for p in predictions if p.ms is not None]
     ms = sum(times) if len(times) == len(predictions) else None
-    return Prediction.each(joint, predictions[0].intrinsics[None], ms)[0]
+    return Prediction.single(joint, predictions[0].intrinsics[None], ms)
 
 
 class DepthSource(ABC):
@@ -172,30 +170,25 @@ class FramePredictions:
     def of(self, source: DepthSource, position: int, every: bool) -> Prediction:
         """What a row gets that has used ``position`` images before: of all members, or of the one in turn. Raises
         FrameError: the frame has nothing to predict from."""
-        member, passes = _asked(source, position, every)
-        known = self._looked_up(source, member)
-        if known is None:
-            for n in self._left(source, passes):
-                self.add(source, n, source.one(self.frame, n))
-            # Members that other rows use alone are not run again; the store keeps only what a row asked for.
-            made = [self._inferences[source.digest or source, n] for n in passes]
-            known = self._known[source.digest or source, member] = combined(made) if member == _ALL else made[0]
+        if every and source.passes > 1:
+            member, passes = _ALL, range(source.passes)
+        else:
+            member, passes = str(n := source.turn(position)), range(n, n + 1)
+        found = self._looked_up(source, member)
+        if found is None:
+            made = [self._inference(source, n) for n in passes]
+            found = self._known[source.digest or source, member] = combined(made) if member == _ALL else made[0]
             if self._store is not None and source.cacheable:
-                self._store.store(self._stored_as(source, member), known)
-        return known
+                self._store.store(self._stored_as(source, member), found)
+        return found
 
-    def missing(self, source: DepthSource, position: int, every: bool) -> list[int]:
-        """The inferences that :meth:`of` has to make; arguments as there."""
-        member, passes = _asked(source, position, every)
-        return self._left(source, passes) if self._looked_up(source, member) is None else []
-
-    def add(self, source: DepthSource, n: int, made: Prediction) -> None:
-        """Use an inference of member (or sample) n."""
-        made = made.to(self._device)
-        self._inferences[source.digest or source, n] = made.to(torch.float32) if source.cacheable else made
-
-    def _left(self, source: DepthSource, passes: Iterable[int]) -> list[int]:
-        return [n for n in passes if (source.digest or source, n) not in self._inferences]
+    def _inference(self, source: DepthSource, n: int) -> Prediction:
+        """Of member (or sample) n, made once whichever rows use it; the store keeps only what a row asked for."""
+        key = (source.digest or source, n)
+        if key not in self._inferences:
+            made = source.one(self.frame, n).to(self._device)
+            self._inferences[key] = made.to(torch.float32) if source.cacheable else made
+        return self._inferences[key]
 
     def _looked_up(self, source: DepthSource, member: str) -> Prediction | None:
         """In memory, then in the store."""
@@ -208,14 +201,6 @@ class FramePredictions:
 
     def _stored_as(self, source: DepthSource, member: str) -> PredictionKey:
         return PredictionKey(source.digest, self._sequence, self.frame.name, member, self._content)
-
-
-def _asked(source: DepthSource, position: int, every: bool) -> tuple[str, Sequence[int]]:
-    """The member's name in a store, and the inferences that its prediction takes."""
-    if every and source.passes > 1:
-        return _ALL, range(source.passes)
-    n = source.turn(position)
-    return str(n), [n]
 
 
 def sequence_digest(sequence: FrameSequence) -> str:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.anchors import AnchorSource, FrameAnchors
-from ufmstar_torch.eval.engine.estimators import Estimate, Estimator, EstimatorInput
+from ufmstar_torch.eval.engine.clock import StageTimer
+from ufmstar_torch.eval.engine.estimators import Estimate, Estimator
 from ufmstar_torch.eval.engine.predictions import DepthSource, Prediction
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
@@ -22,11 +23,10 @@ from ufmstar_torch.frame import FRAME_FAULTS
 _IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drift."
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class RowFrame:
-    """A frame as a row sees it, and what the row makes of it."""
+    """A frame as a row sees it, and its estimate."""
 
-    row: RowRunner
     prediction: Prediction  # the depth map, on the estimator's device
     # [h, w] ground truth at the prediction's pixels [m], 0 = none; None without a depth map.
     truth: NDArray[np.float32] | None
@@ -34,20 +34,7 @@ class RowFrame:
     member: int | None  # which network predicted; None where all did, and of maps
     anchors: FrameAnchors | None  # of the frame; None of a row without anchors
     ms: dict[str, float]  # "network" where one ran, "anchors" where some were tracked, and "uncertainty" [ms]
-    answer: Estimate | RuntimeError | ValueError | None = None  # of the estimator, or the error that the frame raises
-
-    @property
-    def estimate(self) -> Estimate:
-        """What the row makes of the frame, on the CPU. Raises RuntimeError, ValueError: what the estimator raised."""
-        assert self.answer is not None
-        if isinstance(self.answer, Exception):
-            raise self.answer
-        return self.answer
-
-    def of_estimator(self) -> EstimatorInput:
-        """What the row's estimator gets."""
-        anchors = None if self.anchors is None else self.anchors.anchors
-        return self.prediction, torch.from_numpy(self.T_world_cam), anchors
+    estimate: Estimate  # what the row makes of the frame, on the CPU
 
 
 class RowRunner:
@@ -84,32 +71,31 @@ class RowRunner:
         self.anchors, self._skips_faults = anchors, skips_faults
         self._tracks = None if anchors is None else anchors.tracks
         self.images = 0
-        self.device = device or torch.device("cpu")
+        self._timer = StageTimer(device or torch.device("cpu"))
         self._drift = Drift(setting)
 
-    def begin(self, frame: Frame, prediction: Prediction, truth: NDArray[np.float32] | None) -> RowFrame:
-        """The next frame as the row sees it; its ground truth is for anchors of it alone."""
-        T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
-        anchors = None if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
-        single = self.source.networks and not self.every
-        member = self.source.turn(self.images) if single else None
-        times = {"network": prediction.ms, "anchors": None if anchors is None else anchors.ms}
-        known = {stage: time for stage, time in times.items() if time is not None}
-        return RowFrame(self, prediction, truth, T, member, anchors, known)
-
-    def finish(self, taken: RowFrame, name: str) -> None:
-        """Process the next frame, of this name, which :meth:`begin` returned and the estimator has answered.
+    def update(self, frame: Frame, prediction: Prediction, truth: NDArray[np.float32] | None) -> RowFrame:
+        """Process the next frame. Its ground truth [h, w] is only for anchors that are drawn from it.
 
         Raises:
             FrameError: the estimator refuses the pose or the intrinsics, and the row skips such frames.
             RuntimeError, ValueError: as the estimator.
         """
-        statistics = taken.estimate.statistics
+        T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
+        anchors = None if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
+        member = self.source.turn(self.images) if self.source.networks and not self.every else None
+        with self._timer.stage("uncertainty"):
+            found = None if anchors is None else anchors.anchors
+            estimate = self.estimator.update(prediction, torch.from_numpy(T), found)
+        times = {"network": prediction.ms, "anchors": None if anchors is None else anchors.ms, **self._timer.take()}
+        ms = {stage: time for stage, time in times.items() if time is not None}
         self.images += 1
-        if self._skips_faults and statistics is not None and int(statistics.fault[0]):
+        fault = 0 if estimate.statistics is None else int(estimate.statistics.fault[0])
+        if self._skips_faults and fault:
             if self._tracks is not None:
                 self._tracks.undo()
-            raise FrameError(name, FRAME_FAULTS[int(statistics.fault[0])])
+            raise FrameError(frame.name, FRAME_FAULTS[fault])
+        return RowFrame(prediction, truth, T, member, anchors, ms, estimate)
 
     def state(self) -> dict[str, Tensor]:
         """All tensors on which the next frame depends, networks left aside: they remember nothing."""

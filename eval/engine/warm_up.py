@@ -35,7 +35,7 @@ def warm_up_command(
         dense: anchors are :class:`DenseEvidence`.
     """
     also = [metrics, *([preprocessing] if images else []), *([dense_anchors] if dense else [])]
-    warm_up(UfMStar(config.replace(spill=None), device=device), (32, 32), 1, progress, also)
+    warm_up(UfMStar(config, device=device), (32, 32), 1, progress, also)
 
 
 def metrics() -> None:

@@ -10,14 +10,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
-from functools import reduce
-from operator import getitem
 from types import MappingProxyType
 from typing import Any
 
 from ufmstar_torch.anchors.landmarks import DENSE, FILE_TYPES
 from ufmstar_torch.checked import Checked, choice, number
-from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.config import AnchorConfig, MergeConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.stateful import flat
 
 TRACKED, TRUTH = "tracked", "truth"
@@ -45,7 +43,7 @@ class Setting(Checked):
         translation_drift: the same of the position [m per square root of frames].
         skip: images left out between two that are used; the paper's skip interval, 0 = consecutive ones.
         seed: of everything that is drawn: noise, and which anchors are taken.
-        anchors: what UfM* is anchored by (``UfMStarConfig.anchored`` follows): "" nothing; "tracked": corners of the
+        anchors: what UfM* is anchored by (``UfMStarConfig.anchors`` follows): "" nothing; "tracked": corners of the
             images, triangulated with the row's poses; "dense": dense evidence, likewise; "truth": ground truth at
             pixels drawn at random, the upper bound; or a file of landmarks in the folder of each sequence, see
             ``ufmstar_torch.anchors.LandmarkMap.read``.
@@ -90,8 +88,9 @@ class Setting(Checked):
             raise ValueError("corrected and posterior contradict each other")
         if self.track_noise and self.anchors != TRACKED:
             raise ValueError('track_noise goes with anchors = "tracked"')
-        if "anchored" in self.overrides:
-            raise ValueError('anchored follows from anchors: set anchors = "tracked" or "truth"')
+        for group in ("anchors", "posterior"):
+            if not getattr(self, group) and any(name.startswith(f"{group}.") for name in self.overrides):
+                raise ValueError(f"{group}. settings go with {group}: set {group} as well")
         if self.aleatoric_in_h and (self.anchors or self.overrides.keys() & {"features", "add_aleatoric"}):
             raise ValueError("aleatoric_in_h goes without anchors, features and add_aleatoric")
         object.__setattr__(self, "overrides", MappingProxyType(dict(sorted(self.overrides.items()))))
@@ -168,7 +167,7 @@ def setting_from(values: Mapping[str, Any]) -> Setting:
 
 
 def default_of(name: str, preset: str = DEFAULTS) -> Any:
-    """The value that a row has where nothing is changed.
+    """The value that a row has where nothing is changed; None of a section that is off.
 
     Args:
         name: of a setting.
@@ -179,11 +178,15 @@ def default_of(name: str, preset: str = DEFAULTS) -> Any:
     """
     if name in _OWN:
         return getattr(DEFAULT, name)
-    values = flat(_start(preset).to_dict())
+    start = _start(preset)
+    # Sections that the row's own ``anchors`` and ``posterior`` switch on; merging is off where nothing is changed.
+    on = start.replace(anchors=AnchorConfig(), posterior=PosteriorConfig())
+    off = dict.fromkeys(flat(MergeConfig().to_dict(), "merge."))
+    values = flat(on.to_dict()) | off
+    if inner := [other for other in values if other.startswith(f"{name}.")]:
+        raise ValueError(f"setting {name!r} is a group: name one of its values, as {inner[0]}")
     if name in values:
         return values[name]
-    if any(other.startswith(f"{name}.") for other in values):
-        raise ValueError(f"setting {name!r} is a group: name one of its values, as {name}.min_pixels")
     known = [own for own in _OWN if own != "seed"]
     near = get_close_matches(name, [*known, *values], n=1)
     meant = f"; did you mean {near[0]}?" if near else ""
@@ -192,14 +195,15 @@ def default_of(name: str, preset: str = DEFAULTS) -> Any:
 
 def configured(setting: Setting) -> UfMStarConfig:
     """UfM*'s configuration under a setting. Raises ValueError: an unknown name, or a value that it does not take."""
-    values = _start(setting.ufm_preset).to_dict() | {"anchored": bool(setting.anchors), "posterior": setting.posterior}
+    config = _start(setting.ufm_preset).replace(
+        anchors=AnchorConfig() if setting.anchors else None,
+        posterior=PosteriorConfig() if setting.posterior else None,
+    )
     if setting.aleatoric_in_h:
-        values |= {"features": 2, "add_aleatoric": False}
-    for name, value in setting.overrides.items():
+        config = config.replace(features=2, add_aleatoric=False)
+    for name in setting.overrides:
         default_of(name)
-        *groups, own = name.split(".")
-        reduce(getitem, groups, values)[own] = value
-    return UfMStarConfig.from_dict(values)
+    return config.with_values(setting.overrides)
 
 
 def _start(preset: str) -> UfMStarConfig:

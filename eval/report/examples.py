@@ -12,7 +12,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.report.colours import known_where
+from ufmstar_torch.eval.run.colours import known_where
 
 Map = NDArray[np.float32]
 _SCENE = ("image", "truth", "K")

@@ -12,10 +12,10 @@ import numpy as np
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report import style
-from ufmstar_torch.eval.report.colours import FAINT, INK, plain
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, mean_of
 from ufmstar_torch.eval.report.names import ECE_DELTA, NETWORK_MS, STATE, TOTAL_MS, UNCERTAINTY_MS
+from ufmstar_torch.eval.run.colours import FAINT, INK, plain
 
 NETWORK_COLOUR = "#bdbdbd"
 MOST_NAMES = 10  # more points have a legend instead

@@ -14,12 +14,12 @@ from ufmstar_torch.eval.engine.judge import BY_ERROR
 from ufmstar_torch.eval.methods.method import ALONE, BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report import style
-from ufmstar_torch.eval.report.colours import FAINT, INK
 from ufmstar_torch.eval.report.data import Merged, Results
 from ufmstar_torch.eval.report.means import value_of
 from ufmstar_torch.eval.report.names import count
 from ufmstar_torch.eval.report.style import Look
 from ufmstar_torch.eval.results.record import Record
+from ufmstar_torch.eval.run.colours import FAINT, INK
 
 Curves = Mapping[str, Sequence[float]]
 PER_LINE, MOST_SEQUENCES = 3, 12

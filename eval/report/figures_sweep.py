@@ -19,17 +19,17 @@ from ufmstar_torch.eval.methods.method import ALONE, BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULTS, DENSE, TRACKED, TRUTH, default_of
 from ufmstar_torch.eval.report import names, style
-from ufmstar_torch.eval.report.colours import FAINT, INK, plain
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, difference, mean_of
 from ufmstar_torch.eval.report.style import Look
 from ufmstar_torch.eval.results.record import Record
+from ufmstar_torch.eval.run.colours import FAINT, INK, plain
 
 COUNT = "anchor_count"
 Rest = tuple[tuple[str, Any], ...]
 # Rows without a number of anchors have at most so many.
 _COUNTS = {"": 0, TRACKED: TrackerConfig().max_points, TRUTH: TRUTH_COUNT}
-# What a row without anchors cannot have, beside what begins with "anchor_".
+# What a row without anchors cannot have, beside what begins with "anchor_" or "anchors.".
 _OF_ANCHORS = ("anchors", "track_noise", "corrected", "posterior")
 _ANCHORED = {TRACKED: "anchored", DENSE: "dense anchors", TRUTH: "truth anchors"}
 
@@ -85,7 +85,7 @@ def sweep_lines(results: Results, base: str, name: str) -> list[SweepLine]:
             groups.setdefault((row.method, rest), {}).setdefault(float(value), []).append(row)
     if name == COUNT:  # lines over several numbers of anchors begin with the rows that do without
         for (method, rest), by_value in groups.items():
-            without = tuple(i for i in rest if i[0] not in _OF_ANCHORS and not i[0].startswith("anchor_"))
+            without = tuple(i for i in rest if i[0] not in _OF_ANCHORS and not i[0].startswith(("anchor_", "anchors.")))
             plain = groups.get((method, without), {})
             if len(by_value) > 1 and 0.0 in plain:
                 by_value.setdefault(0.0, plain[0.0])
@@ -105,6 +105,8 @@ def default_value(name: str, preset: str = DEFAULTS) -> float:
         value = default_of(name, preset)
     except ValueError:  # a setting of another version: without a default, its rows stand alone
         return math.nan
+    if value is None and name == "merge.loss":  # components are never merged
+        return 0.0
     return float(value) if _is_number(value) else math.nan
 
 

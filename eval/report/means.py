@@ -13,8 +13,7 @@ from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.names import LOWER, Quantity
 from ufmstar_torch.eval.results.record import Record
 
-# With fewer sequences there is neither an interval nor a verdict: Student's interval of two to four values assumes a
-# normal distribution, which was not checked.
+# Student's interval of fewer values rests on a normal distribution, which nobody checked: no interval is given.
 MIN_SEQUENCES = 5
 
 
@@ -30,10 +29,12 @@ class Mean(NamedTuple):
         """Whether 0 lies outside the interval; False where there is no interval."""
         return abs(self.value) > self.half
 
-    @property
-    def decidable(self) -> bool:
-        """Whether there are enough sequences for an interval."""
-        return self.sequences >= MIN_SEQUENCES
+    def better(self, quantity: Quantity) -> bool | None:
+        """Whether a difference beyond its interval is an improvement; None within the interval, or where neither
+        direction is better."""
+        if not self.beyond or quantity.better is None:
+            return None
+        return (self.value < 0) == (quantity.better == LOWER)
 
 
 def value_of(record: Record, key: str) -> float:
@@ -51,9 +52,9 @@ def mean_over(values: Iterable[float]) -> Mean:
     """The mean over sequences; NaN (no such figure) is left out."""
     from ufmstar_torch.eval.metrics import mean_and_ci
 
-    kept = [value for value in values if not math.isnan(value)]
-    mean, half = mean_and_ci(kept)
-    return Mean(mean, half if len(kept) >= MIN_SEQUENCES else math.nan, len(kept))
+    known = [value for value in values if not math.isnan(value)]
+    mean, half = mean_and_ci(known)
+    return Mean(mean, half if len(known) >= MIN_SEQUENCES else math.nan, len(known))
 
 
 def mean_of(records: Iterable[Record], quantity: Quantity) -> Mean:
@@ -61,19 +62,13 @@ def mean_of(records: Iterable[Record], quantity: Quantity) -> Mean:
     return mean_over(_by_sequence(records, quantity).values())
 
 
-def paired(mine: Iterable[Record], theirs: Iterable[Record], quantity: Quantity) -> list[tuple[float, float]]:
-    """A figure of both sides on the sequences that have it on both."""
-    others = _by_sequence(theirs, quantity)
-    pairs = ((value, others.get(where, math.nan)) for where, value in _by_sequence(mine, quantity).items())
-    return [pair for pair in pairs if not any(map(math.isnan, pair))]
-
-
-def difference(mine: Iterable[Record], theirs: Iterable[Record], quantity: Quantity) -> Mean:
-    """Mean of mine - theirs over the sequences that both have.
+def difference(records: Iterable[Record], reference: Iterable[Record], quantity: Quantity) -> Mean:
+    """Mean of (row - reference) over the sequences that both have.
 
     Sequences differ far more than methods do, and that part cancels in each difference.
     """
-    return mean_over(one - other for one, other in paired(mine, theirs, quantity))
+    theirs = _by_sequence(reference, quantity)
+    return mean_over(v - theirs[where] for where, v in _by_sequence(records, quantity).items() if where in theirs)
 
 
 def _by_sequence(records: Iterable[Record], quantity: Quantity) -> dict[tuple[str, str], float]:
@@ -82,13 +77,6 @@ def _by_sequence(records: Iterable[Record], quantity: Quantity) -> dict[tuple[st
         value = quantity.factor * value_of(record, quantity.key)
         by_sequence.setdefault((record.dataset, record.sequence), []).append(value)
     return {where: math.fsum(values) / len(values) for where, values in by_sequence.items()}
-
-
-def better(mean: Mean, quantity: Quantity) -> bool | None:
-    """Whether a difference beyond its interval is to the better; None where it is not beyond, or neither way is."""
-    if not mean.beyond or quantity.better is None:
-        return None
-    return (mean.value < 0) == (quantity.better == LOWER)
 
 
 def references(results: Results, row: Row) -> list[Row]:
@@ -100,19 +88,19 @@ def references(results: Results, row: Row) -> list[Row]:
     method, base = row.method, row.method.base
     same_images = Setting(skip=row.setting.skip, preprocess=row.setting.preprocess)
     plain = Setting(preprocess=row.setting.preprocess)
-    mine = [r for r in results.rows if r.method.base == base and r != row]
+    others = [r for r in results.rows if r.method.base == base and r != row]
     expected: list[Row] = []
     if method.fusion != ALONE:
-        expected += [r for r in mine if r.method.fusion == ALONE and r.setting == same_images]
+        expected += [r for r in others if r.method.fusion == ALONE and r.setting == same_images]
     if method.fusion == UFM_STAR and row.setting.plain:
-        points = [r for r in mine if r.method.fusion == UFM and not r.method.full and r.setting == plain]
+        points = [r for r in others if r.method.fusion == UFM and not r.method.full and r.setting == plain]
         expected += sorted(points, key=lambda r: r.method.max_points or math.inf)[:1]
         if method.full or method.fixed_param:
-            alike = (r for r in mine if r.method.fusion == UFM_STAR and r.setting == row.setting)
+            alike = (r for r in others if r.method.fusion == UFM_STAR and r.setting == row.setting)
             expected += [r for r in alike if not (r.method.full or r.method.fixed_param)]
     if row.setting != plain:  # an ablation's row, or the paper's settings, to ours
-        expected += [r for r in mine if r.method == method and r.setting == row.setting.chosen]
-        expected += [r for r in mine if r.method == method and row.setting.plain and r.setting == plain]
+        expected += [r for r in others if r.method == method and r.setting == row.setting.chosen]
+        expected += [r for r in others if r.method == method and row.setting.plain and r.setting == plain]
     return [r for r in expected if has_variance(results.of(r))]
 
 

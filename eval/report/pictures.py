@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
-from ufmstar_torch.eval.report.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.examples import Example, find_examples
 from ufmstar_torch.eval.report.names import row_label
-from ufmstar_torch.eval.report.panels import Bar, Box, GridRow, Panel, PanelScales, draw_grid
 from ufmstar_torch.eval.report.rooms import Snapshot, choose_times, draw_room, find_rooms
 from ufmstar_torch.eval.results.worklist import WorkItem
+from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
+from ufmstar_torch.eval.run.panels import Bar, Box, GridRow, Panel, PanelScales, draw_grid
 
 STRIP, BREAKDOWN, COMPARE, ROOM = "strip", "breakdown", "compare", "room"
 # So that a report of a hundred sequences stays one that can be read, and mailed.
@@ -155,9 +155,9 @@ def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequenc
         f"{sequence}: the Gaussians of {label} at {times}",
         "Each Gaussian is an ellipse as large as the patch it stands for, painted from far to near; what lies "
         "above the camera (the ceiling) is left out. Black: seen from one view only, or with no disagreement. "
-        "Blue: the camera, its path and where it looks.",
-        f"The room of {sequence} from above and obliquely, {' then '.join(map(str, counts))} Gaussians, coloured "
-        f"by disagreement from 0 to {scale.high:.2g} m.",
+        "Blue: the camera's path.",
+        f"The room of {sequence}, {' then '.join(map(str, counts))} Gaussians, coloured by disagreement from 0 to "
+        f"{scale.high:.2g} m.",
     )
 
 

@@ -1,4 +1,4 @@
-"""The Gaussians of a room at several times, from above and obliquely, coloured by the disagreement of the views."""
+"""The paper's figure of a room as Gaussians: obliquely from above, at several times, coloured by their disagreement."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.report.colours import ERROR_MAP, FAINT, INK, ColourScale, plain, robust_range, save_png
 from ufmstar_torch.eval.report.examples import load_arrays
-from ufmstar_torch.eval.report.panels import Bar, axes_at, draw_bar, new_sheet, say
+from ufmstar_torch.eval.run.colours import ERROR_MAP, INK, ColourScale, plain, robust_range, save_png
+from ufmstar_torch.eval.run.panels import Bar, axes_at, draw_bar, new_sheet
 
 Array = NDArray[np.float64]
 # A patch that is evenly covered from -a to a has sigma = a / sqrt(3): so drawn, an ellipse is as large as its patch.
@@ -24,7 +24,7 @@ MOST_TIMES = 4
 ELEVATION = 35.0  # degrees
 _PATH = "#00a6d6"
 _STORED = ("mean_world", "covariance_world", "disagreement", "T_world_cam")
-_CELL, _LEFT, _TOP, _BOTTOM = 3.1, 0.3, 0.62, 0.66  # inches
+_CELL, _LEFT, _TOP, _BOTTOM = 3.1, 0.1, 0.62, 0.66  # inches
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,34 +73,26 @@ def choose_times(snapshots: Sequence[Snapshot], most: int = MOST_TIMES) -> list[
 
 
 def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourScale:
-    """Draw each time in a column, from above and obliquely, with the camera's path, on one scale of sqrt(m) [m], which
-    is returned; write the picture (PNG). Raises ValueError: no snapshot has a Gaussian.
+    """Draw each time in a column, with the camera's path, on one scale of sqrt(m) [m], which is returned; write the
+    picture (PNG). Raises ValueError: no snapshot has a Gaussian.
     """
     if not any(len(snapshot.mean) for snapshot in snapshots):
         raise ValueError("snapshots must hold at least one Gaussian")
     scale = ColourScale(*robust_range([snapshot.root for snapshot in snapshots], from_zero=True), ERROR_MAP)
-    views = views_of(np.stack([snapshot.T_world_cam for snapshot in snapshots]))
-    up = views[0].towards
-    ceiling = max(float((snapshot.path @ up).max()) for snapshot in snapshots) + HEADROOM
-    shown = [snapshot.take(snapshot.mean @ up <= ceiling) for snapshot in snapshots]
-    limits = [_limits(view, shown) for view in views]
-    tall = [_CELL * (high[1] - low[1]) / (high[0] - low[0]) for low, high in limits]
-    width, bottom = _LEFT + len(snapshots) * _CELL + 0.1, _BOTTOM + sum(tall)
-    figure = new_sheet(width, _TOP + bottom, title)
-    for line, (view, (low, high)) in enumerate(zip(views, limits, strict=True)):
-        bottom -= tall[line]
-        side: dict[str, Any] = {"size": 8, "color": FAINT, "rotation": 90, "va": "center", "ha": "center"}
-        say(figure, 0.2, bottom + tall[line] / 2, view.name, **side)
-        for column, snapshot in enumerate(shown):
-            axes = axes_at(figure, _LEFT + column * _CELL, bottom, _CELL, tall[line])
-            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-            _draw_view(axes, view, snapshot, scale)
-            if line == 0:
-                label = f"after frame {snapshot.frame}: {len(snapshots[column].mean)} Gaussians"
-                axes.set_title(plain(label), size=8.5, color=INK, pad=4)
-            if line == 0 and column == 0:
-                _draw_ruler(axes, low, high)
-    bar = axes_at(figure, _LEFT, 0.42, min(4.0, width - 2 * _LEFT), 0.1)
+    view = oblique_view(np.stack([snapshot.T_world_cam for snapshot in snapshots]))
+    ceiling = max(float((snapshot.path @ view.vertical).max()) for snapshot in snapshots) + HEADROOM
+    shown = [snapshot.take(snapshot.mean @ view.vertical <= ceiling) for snapshot in snapshots]
+    low, high = _limits(view, shown)
+    height = _CELL * (high[1] - low[1]) / (high[0] - low[0])
+    width = 2 * _LEFT + len(snapshots) * _CELL
+    figure = new_sheet(width, _TOP + height + _BOTTOM, title)
+    for column, (before, snapshot) in enumerate(zip(snapshots, shown, strict=True)):
+        axes = axes_at(figure, _LEFT + column * _CELL, _BOTTOM, _CELL, height)
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
+        _draw_view(axes, view, snapshot, scale)
+        label = f"after frame {snapshot.frame}: {len(before.mean)} Gaussians"
+        axes.set_title(plain(label), size=8.5, color=INK, pad=4)
+    bar = axes_at(figure, 3 * _LEFT, 0.42, min(4.0, width - 6 * _LEFT), 0.1)
     draw_bar(bar, Bar("√m, disagreement between the views [m]", scale, 0))
     save_png(figure, path)
     return scale
@@ -109,14 +101,8 @@ def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourSc
 def _draw_view(axes: Any, view: Projection, snapshot: Snapshot, scale: ColourScale) -> None:
     from matplotlib.collections import EllipseCollection
 
-    axes.set_aspect("equal", adjustable="box")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for side in axes.spines.values():
-        side.set_color("#d9d9d9")
     painted = snapshot.take(np.argsort(snapshot.mean @ view.towards, kind="stable"))  # from far to near
     semi_axes, angle = project(view, painted.covariance)
-    colours = scale.rgb(painted.root) / 255
     wide, narrow = 2 * semi_axes.T
     drawn = EllipseCollection(
         wide,
@@ -125,32 +111,13 @@ def _draw_view(axes: Any, view: Projection, snapshot: Snapshot, scale: ColourSca
         units="xy",
         offsets=view.plane(painted.mean),
         offset_transform=axes.transData,
-        facecolors=np.concatenate([colours, np.full((len(colours), 1), 0.85)], axis=1),
+        facecolors=np.concatenate([scale.rgb(painted.root) / 255, np.full((len(angle), 1), 0.85)], axis=1),
         edgecolors=(1, 1, 1, 0.55),
         linewidths=0.4,
     )
     axes.add_collection(drawn, autolim=False)
-    walked = view.plane(snapshot.path)
-    axes.plot(*walked.T, color="white", linewidth=2.6)
-    axes.plot(*walked.T, color=_PATH, linewidth=1.3)
-    _draw_camera(axes, view, snapshot.T_world_cam)
-
-
-def _draw_camera(axes: Any, view: Projection, T_world_cam: Array) -> None:
-    """A dot where the camera is, and which way it looks."""
-    here = view.plane(T_world_cam[:3, 3])
-    ahead = view.plane(T_world_cam[:3, 3] + 0.45 * T_world_cam[:3, 2])
-    axes.plot(*here, "o", markersize=5, color=_PATH, markeredgecolor="white", markeredgewidth=0.8)
-    arrow = {"arrowstyle": "-|>", "color": _PATH, "linewidth": 1.4, "shrinkA": 0, "shrinkB": 0}
-    axes.annotate("", xy=ahead, xytext=here, arrowprops=arrow)
-
-
-def _draw_ruler(axes: Any, low: Array, high: Array) -> None:
-    """One metre, or ten where the room is wide."""
-    length = 1.0 if high[0] - low[0] < 15 else 10.0
-    x, y = low + 0.04 * (high - low)
-    axes.plot([x, x + length], [y, y], color=INK, linewidth=2, solid_capstyle="butt")
-    axes.text(x + length / 2, y + 0.02 * (high[1] - low[1]), f"{length:g} m", size=7.5, color=INK, ha="center")
+    axes.plot(*view.plane(snapshot.path).T, color=_PATH, linewidth=1.3)
+    axes.plot(*view.plane(snapshot.T_world_cam[:3, 3]), "o", markersize=5, color=_PATH, markeredgecolor="white")
 
 
 def _limits(view: Projection, snapshots: Sequence[Snapshot]) -> tuple[Array, Array]:
@@ -179,11 +146,12 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """An orthographic camera, by the unit vectors [3] of the world that point right and up in its picture."""
+    """An orthographic camera, by the unit vectors [3] of the world that point right and up in its picture, and the
+    world's own up."""
 
     right: Array
     up: Array
-    name: str
+    vertical: Array
 
     @property
     def towards(self) -> Array:
@@ -210,8 +178,8 @@ def project(view: Projection, covariance: Array) -> tuple[Array, Array]:
     return axes, np.degrees(np.arctan2(2 * b, a - c) / 2)
 
 
-def views_of(T_world_cam: Array) -> tuple[Projection, Projection]:
-    """From above, and obliquely from behind the first of cameras [n, 4, 4], ``ELEVATION`` over the horizon.
+def oblique_view(T_world_cam: Array) -> Projection:
+    """From behind the first of cameras [n, 4, 4], ``ELEVATION`` over the horizon.
 
     Data sets differ in which axis points up; a camera's own up (-y) is right on average.
     """
@@ -220,10 +188,8 @@ def views_of(T_world_cam: Array) -> tuple[Projection, Projection]:
     # A camera that looks straight down has no forward on the floor: any direction serves then.
     fallback = np.eye(3)[np.argmin(np.abs(up))]
     forward = _unit(first - up * (first @ up), _unit(fallback - up * (fallback @ up), fallback))
-    right = np.cross(forward, up)
     tilt = np.radians(ELEVATION)
-    oblique = Projection(right, np.cos(tilt) * up + np.sin(tilt) * forward, "obliquely")
-    return Projection(right, forward, "from above"), oblique
+    return Projection(np.cross(forward, up), np.cos(tilt) * up + np.sin(tilt) * forward, up)
 
 
 def _unit(vector: Array, otherwise: Array) -> Array:

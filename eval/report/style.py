@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, Method
-from ufmstar_torch.eval.report.colours import FAINT, INK, plain, require_matplotlib
-from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.eval.run.colours import FAINT, INK, plain, require_matplotlib
+from ufmstar_torch.eval.run.files import write_atomic
 
 GRID = "#e6e6e6"
 TITLE, LABEL, TICK = 11, 9, 8  # sizes of letters [pt]

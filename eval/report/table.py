@@ -1,4 +1,4 @@
-"""A table as one data frame of cells, and its forms: Markdown, LaTeX (booktabs) and CSV; ``table.html.j2`` has HTML."""
+"""A table of printed cells, and its files: LaTeX (booktabs), CSV and Markdown; ``report.html.j2`` has its HTML."""
 
 from __future__ import annotations
 
@@ -31,13 +31,14 @@ class Cell:
     remark: str = ""
 
     @classmethod
-    def of(cls, mean: Mean, decimals: int | None, *, signed: bool = False, bold: bool = False) -> Cell:
+    def of(cls, mean: Mean, decimals: int | None, *, signed: bool = False, remark: str = "") -> Cell:
         """A mean with its interval, where there is one and it is at least .01 wide (of differences, any)."""
         if math.isnan(mean.value):
             return cls()
         decimals = significant(mean.value) if decimals is None else decimals
         wide = mean.half >= SMALL_INTERVAL or (signed and mean.half > 0)
-        return cls(number(mean.value, decimals, signed=signed), number(mean.half, decimals) if wide else "", bold)
+        half = number(mean.half, decimals) if wide else ""
+        return cls(number(mean.value, decimals, signed=signed), half, remark=remark)
 
 
 class Column(NamedTuple):
@@ -49,17 +50,17 @@ class Column(NamedTuple):
 
 
 class Line(NamedTuple):
-    """A row of a table: its block (rows that belong together), its label, whether that is bold, and its cells."""
+    """A row of a table: its block (rows that belong together), its label and its cells."""
 
     block: int
     label: str
-    bold: bool
     cells: tuple[Cell, ...]
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table. Raises ValueError: a line has another number of cells than there are columns."""
+    """A table. Bold means one thing: the best value of a block. Raises ValueError: a line has another number of cells
+    than there are columns."""
 
     name: str  # of its files
     title: str
@@ -124,9 +125,7 @@ def mark_best(cells: Sequence[Cell], quantity: Quantity | None) -> list[Cell]:
 def markdown(table: Table) -> str:
     """The table under its title, with its notes below."""
     rows = [[table.first, *(column.name for column in table.columns)], ["---", *("---:" for _ in table.columns)]]
-    for line in table.lines:
-        label = markdown_text(line.label)
-        rows.append([f"**{label}**" if line.bold else label, *map(_markdown_cell, line.cells)])
+    rows += [[markdown_text(line.label), *map(_markdown_cell, line.cells)] for line in table.lines]
     body = "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
     notes = "\n".join(f"- {markdown_text(note)}" for note in table.notes)
     return "\n\n".join(filter(None, (f"### {markdown_text(table.title)}", body, notes))) + "\n"
@@ -163,34 +162,30 @@ _LATEX = {
 
 
 def latex(table: Table) -> str:
-    """A ``table`` environment, set as the paper's; the document needs the package booktabs."""
-    caption = " ".join([f"{latex_text(table.title)}.", *map(latex_text, table.notes)])
-    lines = [r"% needs \usepackage{booktabs}", r"\begin{table}[t]", r"\centering", rf"\caption{{{caption}}}"]
-    lines.append(rf"\label{{tab:{re.sub(r'[^A-Za-z0-9.-]+', '-', table.name)}}}")
-    lines += [rf"\begin{{tabular}}{{l{'c' * len(table.columns)}}}", r"\toprule"]
-    if table.groups:
-        spans, rules, start = [], "", 2
-        for name, count in table.groups:
-            spans.append(rf"\multicolumn{{{count}}}{{c}}{{{latex_text(name)}}}" if count > 1 else latex_text(name))
-            rules += rf"\cmidrule(lr){{{start}-{start + count - 1}}}" if name else ""
-            start += count
-        lines += [_latex_row("", spans), rules]
-    lines += [_latex_row(latex_text(table.first), [column.latex for column in table.columns]), r"\midrule"]
-    for number_, block in enumerate(table.blocks):
-        lines += [r"\addlinespace"] if number_ else []
-        for line in block:
-            label = rf"\textbf{{{latex_text(line.label)}}}" if line.bold else latex_text(line.label)
-            lines.append(_latex_row(label, map(_latex_cell, line.cells)))
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
+    """The table for booktabs, with title and notes as its caption."""
+    heads: Any = [(latex_text(column.group), column.latex) for column in table.columns]
+    heads = pd.MultiIndex.from_tuples(heads) if table.groups else [name for _, name in heads]
+    frame = pd.DataFrame(
+        [[_latex_cell(cell) for cell in line.cells] for line in table.lines],
+        index=[latex_text(line.label) for line in table.lines],
+        columns=heads,
+    )
+    frame.columns.names = [*[""] * (frame.columns.nlevels - 1), latex_text(table.first)]
+    caption = latex_text(" ".join([f"{table.title}.", *table.notes]))
+    label = "tab:" + re.sub(r"[^A-Za-z0-9-]+", "-", table.name)
+    how = {"caption": caption, "label": label, "position": "t", "multicolumn_format": "c"}
+    lines = frame.to_latex(column_format="l" + "c" * len(table.columns), **how).splitlines()
+    lines.insert(1, r"\centering")
+    at = lines.index(r"\midrule") + 1
+    for block in [*table.blocks][:-1]:
+        at += len(block) + 1
+        lines.insert(at - 1, r"\addlinespace")
+    return "\n".join([r"% needs \usepackage{booktabs}", *lines, ""])
 
 
 def latex_text(text: str) -> str:
     """Plain text as LaTeX; "UfM*" gets its star as an exponent."""
     return "".join(_LATEX.get(character, character) for character in text)
-
-
-def _latex_row(label: str, cells: Iterable[str]) -> str:
-    return rf"{' & '.join([label, *cells])} \\"
 
 
 def _latex_cell(cell: Cell) -> str:
@@ -210,16 +205,16 @@ def table_csv(tables: Iterable[Table]) -> str:
     """Tables below each other: title, label, and for each column its value and, where any has one, its half-width."""
     frames = []
     for table in tables:
-        frame = pd.DataFrame({"table": table.title, table.first: [line.label for line in table.lines]}, dtype=object)
-        for position, column in enumerate(table.columns):
-            prefix = f"{column.group}: "
-            name = column.name if column.name.lower().startswith(prefix.lower()) or not column.group else None
-            name = name or f"{prefix}{column.name}"
-            cells = [line.cells[position] for line in table.lines]
-            frame[name] = [cell.value for cell in cells]
+        columns: dict[str, list[str]] = {
+            "table": [table.title] * len(table.lines), table.first: [line.label for line in table.lines],
+        }  # fmt: skip
+        for column, cells in zip(table.columns, zip(*(line.cells for line in table.lines), strict=True), strict=True):
+            grouped = column.name.lower().startswith(column.group.lower())
+            name = column.name if grouped else f"{column.group}: {column.name}"
+            columns[name] = [cell.value for cell in cells]
             if any(cell.half for cell in cells):
-                frame[f"{name} ±"] = [cell.half for cell in cells]
-        frames.append(frame)
+                columns[f"{name} ±"] = [cell.half for cell in cells]
+        frames.append(pd.DataFrame(columns, dtype=object))
     return pd.concat(frames).map(csv_text).to_csv(index=False, lineterminator="\n")
 
 

@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
 
-from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.report.data import FORMAT, Results
 from ufmstar_torch.eval.report.efficiency import efficiency_tables, paper_efficiency_tables
-from ufmstar_torch.eval.report.findings import comparisons
-from ufmstar_torch.eval.report.means import MIN_SEQUENCES, Mean, better, has_variance, mean_of, mean_over, value_of
+from ufmstar_torch.eval.report.means import (
+    MIN_SEQUENCES,
+    Mean,
+    difference,
+    has_variance,
+    mean_of,
+    mean_over,
+    references,
+    value_of,
+)
 from ufmstar_torch.eval.report.names import DIFFERENCES, ENERGY, EXTRA, MAIN, MEMORY, Quantity, row_labels, shared_words
 from ufmstar_torch.eval.report.paper import PaperTable, paper_table_of
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, csv_text, latex, mark_best, markdown, table_csv
-from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_atomic
 from ufmstar_torch.eval.results.record import Record
+from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
 
 METHOD = "Method"
-# [nats] A mean NLL above it is that of a few pixels: sigma = .25 d of a room makes about 1.
-NLL_OF_FEW = 100.0
 _PAPER_COLUMNS = {quantity.key: quantity for quantity in (*MAIN, ENERGY, MEMORY)}
+_REMARKS = {True: "better", False: "worse", None: ""}
 
 
 def main_table(results: Results, dataset: str | None = None) -> Table:
@@ -53,36 +57,33 @@ def sequence_tables(results: Results, dataset: str) -> list[Table]:
 
 
 def difference_table(results: Results, dataset: str | None = None) -> Table:
-    """Row less reference, in pairs on the same sequences; bold where the interval leaves out 0 to the better side."""
+    """Row less reference, in pairs on the same sequences; a remark where the interval leaves out 0."""
     blocks: dict[str, int] = {}
     lines, labels = [], row_labels(results.rows)
-    rows = (row for row in results.rows if has_variance(results.of(row)))
-    for (row, reference), made in comparisons(results, dataset, rows).items():
-        means = {c.quantity: c.difference for c in made}
-        count = max(mean.sequences for mean in means.values())
-        block = blocks.setdefault(row.method.base, len(blocks))
-        cells = (Cell(str(count)), *(_difference_cell(means.get(q, Mean()), q) for q in DIFFERENCES))
-        lines.append(Line(block, f"{labels[row]} – {labels[reference]}", False, cells))
+    for row in results.rows:
+        listed = results.of(row, dataset)
+        for reference in references(results, row) if has_variance(listed) else ():
+            means = [difference(listed, results.of(reference, dataset), q) for q in DIFFERENCES]
+            count = max(mean.sequences for mean in means)
+            if count:
+                figures = map(_difference_cell, means, DIFFERENCES)
+                block = blocks.setdefault(row.method.base, len(blocks))
+                lines.append(Line(block, f"{labels[row]} – {labels[reference]}", (Cell(str(count)), *figures)))
     columns = [
         Column("", "sequences", "Sequences"),
         *(Column("", f"Δ {q.heading}", rf"$\Delta$ {q.latex_heading}") for q in DIFFERENCES),
     ]
-    notes = [
-        "Mean over sequences of row – reference on the same sequence, with its 95 % confidence interval.",
-        "Bold: better beyond the interval. (worse): worse beyond it. All others may be chance, and with many rows "
-        "one in twenty lies beyond its interval by chance.",
-    ]
-    if any(int(line.cells[0].value) < MIN_SEQUENCES for line in lines):
-        notes.append(f"Of fewer than {MIN_SEQUENCES} sequences there is no confidence interval, and no verdict.")
+    note = (
+        "Mean over sequences of row – reference on the same sequence, with its 95 % confidence interval (from "
+        f"{MIN_SEQUENCES} sequences on); better and worse: beyond the interval."
+    )
     title = f"{results.title}, paired differences, {_where(results, dataset)}"
     ordered = sorted(lines, key=lambda line: line.block)
-    return Table("differences", title, "Row – reference", columns, ordered, notes)
+    return Table("differences", title, "Row – reference", columns, ordered, (note,))
 
 
 def _difference_cell(mean: Mean, quantity: Quantity) -> Cell:
-    verdict = better(mean, quantity)
-    cell = Cell.of(mean, quantity.decimals, signed=True, bold=verdict is True)
-    return cell if verdict is not False else replace(cell, remark="worse")
+    return Cell.of(mean, quantity.decimals, signed=True, remark=_REMARKS[mean.better(quantity)])
 
 
 class _Figures(NamedTuple):
@@ -101,7 +102,7 @@ def _means(
     alike = len({frozenset((r.dataset, r.sequence) for r in listed) for listed in records.values()}) == 1
     group = "Ours" if quoted else ""
     columns = _figures(records, quantities, group)
-    notes = [_network_note(results), _prepared_note(records), _interval_note(records), _nll_note(records, quantities)]
+    notes = [_network_note(results), _prepared_note(records), _interval_note(records)]
     costs = _costs(results.efficiency, records, group) if name == "main" and results.efficiency else []
     if any(cell.value for column in costs for cell in column.cells.values()):
         columns += costs
@@ -113,10 +114,7 @@ def _means(
         notes.append("The rows are means over different sequences, so none is marked as the best.")
     if quoted:
         columns += _quoted(quoted, records)
-        notes.append(
-            f"The paper's own figures are of {quoted.network} on {quoted.measured_on}; compare the differences between "
-            "rows, not the rows with each other."
-        )
+        notes.append(f"The paper's own figures are of {quoted.network} on {quoted.measured_on}.")
     title = f"{results.title}, {_where(results, dataset)}"
     return _table(name, title, records, columns, tuple(filter(None, notes)))
 
@@ -135,16 +133,16 @@ def _costs(efficiency: Mapping[str, Any], records: Mapping[Row, Sequence[Record]
     """Energy and memory of the rows' uncertainty: energy over the sequences that were measured, memory over all of
     them; dashes where nothing was measured."""
     measured_rows = {line["row"]: line for line in efficiency.get("rows", ())}
-    spent, kept = {}, {}
+    energy, memory = {}, {}
     for row, listed in records.items():
         if row.label in measured_rows:
             where = {(record.dataset, record.sequence) for record in listed}
             measured = (one for one in efficiency.get("sequences", ()) if (one["dataset"], one["sequence"]) in where)
-            spent[row] = mean_over(v for one in measured if (v := one["energy_mj"].get(row.label)) is not None)
+            energy[row] = mean_over(v for one in measured if (v := one["energy_mj"].get(row.label)) is not None)
             network = measured_rows[row.label]["memory"].get("network_uncertainty_bytes")
             sizes = () if network is None else (network + (r.state.get("bytes_mean") or 0.0) for r in listed)
-            kept[row] = mean_over(1e-6 * size for size in sizes)
-    return [_column(ENERGY, group, spent), _column(MEMORY, group, kept)]
+            memory[row] = mean_over(1e-6 * size for size in sizes)
+    return [_column(ENERGY, group, energy), _column(MEMORY, group, memory)]
 
 
 def _quoted(quoted: PaperTable, rows: Iterable[Row]) -> list[_Figures]:
@@ -168,7 +166,7 @@ def _table(name: str, title: str, rows: Iterable[Row], columns: Sequence[_Figure
         of_block = list(group)
         marked = [mark_best([c.cells.get(row, Cell()) for row in of_block], c.quantity) for c in columns]
         for row, cells in zip(of_block, zip(*marked, strict=True), strict=True):
-            lines.append(Line(block, labels[row], row.method.fusion == UFM_STAR, cells))
+            lines.append(Line(block, labels[row], cells))
     return Table(name, title, METHOD, [column.head for column in columns], lines, notes)
 
 
@@ -207,18 +205,6 @@ def _interval_note(records: Mapping[Row, Sequence[Record]]) -> str:
     )
 
 
-def _nll_note(records: Mapping[Row, Sequence[Record]], quantities: Sequence[Quantity]) -> str:
-    """A warning where the NLL is that of a few pixels."""
-    shown = any(quantity.key == "nll" for quantity in quantities)
-    values = [record.figures.get("nll") for of_row in records.values() for record in of_row]
-    if not shown or max((nll for nll in values if nll is not None), default=0.0) < NLL_OF_FEW:
-        return ""
-    return (
-        f"An NLL above {NLL_OF_FEW:.0f} is the effect of a few pixels with almost no variance; those with "
-        "none at all have no NLL (their share stands among the further figures)."
-    )
-
-
 def _cost_note(efficiency: Mapping[str, Any]) -> str:
     used = set(efficiency["devices"]["units"].values())
     missing = "; ".join(dict.fromkeys(why for unit, why in efficiency["power"]["missing"].items() if unit in used))
@@ -252,7 +238,7 @@ def overview(results: Results) -> dict[str, dict[str | None, Table]]:
     """The main table, paired differences and further figures by title: over all sequences (None) and, where there are
     several data sets, over those of each, as far as they are not empty."""
     each = results.datasets if len(results.datasets) > 1 else ()
-    makers = {"The main table": main_table, "Paired differences": difference_table, "Further figures": extra_table}
+    makers = {"Main table": main_table, "Paired differences": difference_table, "Further figures": extra_table}
     made = {title: {over: make(results, over) for over in (None, *each)} for title, make in makers.items()}
     return {title: {k: table for k, table in tables.items() if not table.is_empty} for title, tables in made.items()}
 
@@ -269,34 +255,20 @@ def _table_files(results: Results) -> Iterator[tuple[str, list[Table]]]:
 
 
 def write_tidy(results: Results) -> list[Path]:
-    """Write ``results.json``, ``results.csv`` (a line per figure) and ``table.csv`` (means over sequences; the data set
-    "*" stands for all together); their paths."""
+    """Write ``results.json`` and ``results.csv``, a line per row, sequence and figure; their paths."""
     lines = [
-        {**_of(record, record.dataset, record.sequence), "figure": key, "value": value}
+        {
+            "suite": record.suite, "dataset": record.dataset, "sequence": record.sequence, "network": record.network,
+            "method": record.method, "setting": dict(record.setting), "figure": key, "value": value,
+        }
         for record in results.records
         for key, value in _values(record)
-    ]
-    means = []
-    for dataset in (*results.datasets, *((None,) if len(results.datasets) > 1 else ())):
-        for row in results.rows:
-            records = results.of(row, dataset)
-            for key in dict.fromkeys(key for record in records for key, _ in _values(record)):
-                mean = mean_over(value_of(record, key) for record in records)
-                figures = {"mean": mean.value, "half_width": mean.half, "sequences": mean.sequences}
-                means.append({**_of(records[0], dataset or "*"), "figure": key, **figures})
+    ]  # fmt: skip
     missing = [{"dataset": d, "sequence": s, "row": row.slug} for d, s, row in results.missing]
     about = {"format": FORMAT, "suite": results.suite, "title": results.title}
-    tidy = {**about, "lines": lines, "table": means, "failed": list(results.failed), "missing": missing}
-    write_json_atomic(results.out / "results.json", tidy)
-    tables = {"results.csv": lines, "table.csv": means}
-    written = [_write_text(results.out / name, _tidy_csv(entries)) for name, entries in tables.items()]
-    return [results.out / "results.json", *written]
-
-
-def _of(record: Record, dataset: str, *sequence: str) -> dict[str, Any]:
-    """What a line is of."""
-    named = {"suite": record.suite, "dataset": dataset, **({"sequence": sequence[0]} if sequence else {})}
-    return {**named, "network": record.network, "method": record.method, "setting": dict(record.setting)}
+    path = results.out / "results.json"
+    write_json_atomic(path, {**about, "lines": lines, "failed": list(results.failed), "missing": missing})
+    return [path, _write_text(results.out / "results.csv", _tidy_csv(lines))]
 
 
 def _values(record: Record) -> Iterator[tuple[str, float | None]]:
@@ -307,21 +279,11 @@ def _values(record: Record) -> Iterator[tuple[str, float | None]]:
         yield from ((f"{name}.{key}", value) for key, value in group.items() if isinstance(value, int | float))
 
 
-def _tidy_csv(entries: Sequence[Mapping[str, Any]]) -> str:
-    """Lines with a column for each setting in place of "setting"; numbers in full, nothing for a missing value."""
-    settings = dict.fromkeys(sorted({name for entry in entries for name in entry["setting"]}))
-    rows = []
-    for entry in entries:
-        row: dict[str, Any] = {}
-        for key, value in entry.items():
-            row |= settings | value if key == "setting" else {key: value}
-        rows.append({key: _field(value) for key, value in row.items()})
-    return pd.DataFrame(rows, dtype=object).to_csv(index=False, lineterminator="\n")
-
-
-def _field(value: Any) -> str:
-    plain = to_json(value)
-    return "" if plain is None else csv_text(plain) if isinstance(plain, str) else json.dumps(plain)
+def _tidy_csv(lines: Sequence[Mapping[str, Any]]) -> str:
+    """Lines with a column for each setting; numbers in full, nothing for a missing value."""
+    flat = ({**line, **line["setting"]} for line in lines)
+    rows = [{name: csv_text(v) if isinstance(v, str) else v for name, v in line.items()} for line in flat]
+    return pd.DataFrame(rows, dtype=object).drop(columns="setting").to_csv(index=False, lineterminator="\n")
 
 
 def _write_text(path: Path, text: str) -> Path:

@@ -10,12 +10,15 @@ from typing import Any
 
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.outputs import CURVES, ELLIPSOIDS, ENSEMBLE, NETWORK, PLY, POSTERIOR, SHEET
+from ufmstar_torch.eval.report.outputs import CURVES, ENSEMBLE, NETWORK, POSTERIOR
 from ufmstar_torch.eval.report.table import markdown
-from ufmstar_torch.eval.report.tables import NLL_OF_FEW, main_table
+from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.eval.report.write import Report
-from ufmstar_torch.eval.results.summary import NEAR_ZERO
+from ufmstar_torch.eval.run.pictures import ELLIPSOIDS, PLY, SHEET
+from ufmstar_torch.eval.run.summary import NEAR_ZERO
 
+# [nats] A mean NLL above it is that of a few pixels: sigma = .25 d of a room makes about 1.
+NLL_OF_FEW = 100.0
 _CALIBRATION = {"nll": "NLL", "ece_delta": "ECE_delta", "ece_q": "ECE_q"}
 _DEMO_COLUMNS = {"delta1": "delta1", **_CALIBRATION, "ause_rmse": "AUSE [m]"}
 _RUN_COLUMNS = {"delta1": "delta1", "abs_rel": "AbsRel", "rmse": "RMSE [m]", **_CALIBRATION, "spearman": "Spearman"}

@@ -15,7 +15,7 @@ from ufmstar_torch.eval.report.page import write_page
 from ufmstar_torch.eval.report.pictures import Picture, pictures_of
 from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.report.tables import write_tables, write_tidy
-from ufmstar_torch.eval.results.files import remove_temporaries, write_json_atomic
+from ufmstar_torch.eval.run.files import remove_temporaries, write_json_atomic
 
 INDEX = "pictures.json"
 KINDS = ("svg", "png")

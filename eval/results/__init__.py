@@ -1,1 +1,1 @@
-"""What an evaluation or a run leaves on disk: folders, records, caches, and the processes that write them."""
+"""What an evaluation leaves on disk: folders, records, caches, and the processes that write them."""

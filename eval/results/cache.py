@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from ufmstar_torch.eval.engine.predictions import Prediction, PredictionKey
-from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.eval.run.files import write_atomic
 
 _DIGEST = 32  # bytes of a SHA-256
 

@@ -24,10 +24,10 @@ from ufmstar_torch.eval.engine.evaluate import RowResult
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.metrics.packed_sums import pack
 from ufmstar_torch.eval.results.claim import PATTERN, Claim, claim
-from ufmstar_torch.eval.results.files import remove_temporaries, write_atomic, write_json_atomic
-from ufmstar_torch.eval.results.folder import FolderError, FolderKind, OutputFolder, remover
 from ufmstar_torch.eval.results.record import FORMAT, Record
 from ufmstar_torch.eval.results.worklist import WorkItem
+from ufmstar_torch.eval.run.files import remove_temporaries, write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
 
 FAILED, CACHE = "failed.json", "cache"
 # What a report leaves; removed by --overwrite.

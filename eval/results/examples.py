@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.eval.engine.estimators import Gaussians
 from ufmstar_torch.eval.engine.rows import RowFrame
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
-from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.eval.sequences.frame import Frame, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.sequences.intrinsics import scale_intrinsics

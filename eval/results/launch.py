@@ -23,11 +23,11 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import evaluate_sequences
+from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.machine import available_cores, device_of
 from ufmstar_torch.eval.results.work import EvalJob, Evaluate, Worker, WorkerTask
 from ufmstar_torch.eval.results.worklist import Shard
+from ufmstar_torch.eval.run.machine import available_cores, device_of
 from ufmstar_torch.optional import optional
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
@@ -124,7 +124,7 @@ def evaluate_suite(
     stop: Stop,
     report: Report,
     progress: Callable[[str, int, int], None],
-    evaluate: Evaluate = evaluate_sequences,
+    evaluate: Evaluate = evaluate_sequence,
 ) -> EvalOutcome:
     """Evaluate a job; ``progress`` and ``evaluate`` (see ``Worker``) are of this process's own work.
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.results.files import write_json_atomic
+from ufmstar_torch.eval.run.files import write_json_atomic
 
 FORMAT = 1
 

@@ -12,11 +12,11 @@ from typing import Any
 import torch
 
 from ufmstar_torch.eval.engine.anchors import landmark_digests
-from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, RowResult, SequenceTask, evaluate_sequences
+from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, RowResult, evaluate_sequence
 from ufmstar_torch.eval.engine.judge import references
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.predictions import DepthSource
-from ufmstar_torch.eval.engine.stream import Stopped
+from ufmstar_torch.eval.engine.stream import FrameSink, Stopped
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.suite import Suite
@@ -24,13 +24,14 @@ from ufmstar_torch.eval.results.cache import PredictionCache
 from ufmstar_torch.eval.results.claim import Claim
 from ufmstar_torch.eval.results.eval_folder import CACHE, EvalFolder
 from ufmstar_torch.eval.results.examples import ExampleWriter
-from ufmstar_torch.eval.results.machine import hardware, versions
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
+from ufmstar_torch.eval.run.machine import hardware, versions
+from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.recalibrate import read_recalibration
 
-Evaluate = Callable[..., None]
+Evaluate = Callable[..., list[RowResult]]
 _POLL_SECONDS = 0.2
 DIED = "the process that evaluated it was killed (for want of memory?)"
 # Of a sequence of single images.
@@ -57,7 +58,6 @@ class EvalJob:
     # runtime, precision: of the networks (``Inference``).
     runtime: str = "auto"
     precision: str = "float32"
-    streams: int = 1  # sequences that a process evaluates at the same time
 
     @property
     def unused(self) -> tuple[str, ...]:
@@ -112,9 +112,12 @@ class WorkerTask:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _InHand(SequenceTask):
+class _InHand:
     """A sequence that is evaluated."""
 
+    sequence: FrameSequence
+    rows: Sequence[Row]  # to compute
+    sinks: Sequence[FrameSink]
     # item, claim: which, and the claim to it.
     item: WorkItem
     claim: Claim
@@ -136,7 +139,7 @@ class Worker:
         stop: asked before every frame; True ends the work.
         report: receives a line when a sequence is finished.
         progress: called with a sequence's label, its number of finished frames, and the number of all of them.
-        evaluate: computes rows on sequences; see ``evaluate_sequences``.
+        evaluate: computes rows on a sequence; see ``evaluate_sequence``.
     """
 
     def __init__(
@@ -148,7 +151,7 @@ class Worker:
         stop: Callable[[], bool] = lambda: False,
         report: Callable[[str], None] = lambda line: None,
         progress: Callable[[str, int, int], None] = lambda label, done, total: None,
-        evaluate: Evaluate = evaluate_sequences,
+        evaluate: Evaluate = evaluate_sequence,
     ) -> None:
         self.task, self.job, self.folder, self.networks = task, task.job, folder, networks
         self.stop, self.report, self.progress, self.evaluate = stop, report, progress, evaluate
@@ -166,13 +169,14 @@ class Worker:
         job, task = self.job, self.task
         cache = PredictionCache(job.cache or job.out / CACHE)
         device = torch.device(job.device)
-        judge = Judge(self.networks, device, cache, job.frames, job.confident, job.bins, job.streams)
+        judge = Judge(self.networks, device, cache, job.frames, job.confident, job.bins)
         own = task.shard.of(job.items)
         queue = [*own, *(item for item in job.items if task.helps and item not in own)]
         try:
             while queue:
                 taken: list[WorkItem] = []
-                self.evaluate(self._tasks(queue, taken), judge, self._finish, stop=self.stop)
+                for one in self._tasks(queue, taken):
+                    self._evaluate(one, judge)
                 queue = taken if task.waits else []
                 if queue:
                     time.sleep(_POLL_SECONDS)
@@ -185,7 +189,7 @@ class Worker:
                 one.claim.release()
         return True
 
-    def _tasks(self, queue: Iterable[WorkItem], taken: list[WorkItem]) -> Iterator[SequenceTask]:
+    def _tasks(self, queue: Iterable[WorkItem], taken: list[WorkItem]) -> Iterator[_InHand]:
         """Claim one sequence of the queue after another; those with rows to compute are opened. ``taken`` gets the
         sequences that another process has. Raises Stopped, FolderError, as :meth:`run`."""
         for item in queue:
@@ -229,7 +233,6 @@ class Worker:
             sequence=sequence,
             rows=with_references(todo, possible) if todo else missing,
             sinks=[ExampleWriter(self.folder.place(item))] if self.job.keeps_examples(item) else [],
-            progress=lambda now: self.progress(item.label, now.done, now.total),
             item=item,
             claim=claim,
             digest=digest,
@@ -242,6 +245,16 @@ class Worker:
             return one
         self._settle(one)
         return None
+
+    def _evaluate(self, one: _InHand, judge: Judge) -> None:
+        outcome: list[RowResult] | Exception
+        how: dict[str, Any] = {"sinks": one.sinks, "stop": self.stop}
+        how["progress"] = lambda now: self.progress(one.item.label, now.done, now.total)
+        try:
+            outcome = self.evaluate(one.sequence, one.rows, judge, **how)
+        except BROKEN as error:
+            outcome = error
+        self._finish(one, outcome)
 
     def _finish(self, one: _InHand, outcome: list[RowResult] | Exception) -> None:
         """Store the missing rows of a sequence, or the reason why they cannot be had."""
@@ -273,7 +286,7 @@ class Worker:
         """Store rows with what they were computed from."""
         item, landmarks = one.item, one.landmarks
         common: dict[str, Any] = {"versions": versions(), "machine": hardware(), "device": self.job.device}
-        common |= {"sequence": one.digest, **({"streams": self.job.streams} if self.job.streams > 1 else {})}
+        common |= {"sequence": one.digest}
         for result in results:
             row, network = result.row, self.networks[result.row.method.base]
             made_of = {"network": network.digest, "runtime": network.runtime, "threads": torch.get_num_threads()}

@@ -43,7 +43,7 @@ class WorkItem:
 
     def open(self) -> FrameSequence:
         """Open it. Raises FileNotFoundError, ValueError: it cannot be opened."""
-        from ufmstar_torch.eval.tour.open import open_sequence
+        from ufmstar_torch.eval.sequences.open import open_sequence
 
         return open_sequence(self.path, self.layout, **dict(self.opening))
 

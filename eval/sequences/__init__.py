@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.sequences.frame import Skipped as Skipped
     from ufmstar_torch.eval.sequences.layout import Found as Found
     from ufmstar_torch.eval.sequences.layout import find_sequences as find_sequences
-    from ufmstar_torch.eval.sequences.layout import open_sequence as open_sequence
+    from ufmstar_torch.eval.sequences.open import open_sequence as open_sequence
     from ufmstar_torch.eval.sequences.poses import CONVENTIONS as CONVENTIONS
     from ufmstar_torch.eval.sequences.poses import Trajectory as Trajectory
     from ufmstar_torch.eval.sequences.poses import interpolate_pose as interpolate_pose

@@ -1,20 +1,15 @@
-"""``open_sequence`` detects a dataset's layout from the files on disk and opens it; ``find_sequences`` lists all below
-a folder."""
+"""The layouts of recordings on disk: ``detect_layout`` by their files, ``find_sequences`` lists all below a folder."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ufmstar_torch.eval.sequences import generic, kitti360, nyu, scannet, sens, seven_scenes, tartanair, tum
-from ufmstar_torch.eval.sequences.frame import FrameSequence
-from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
 # Each module has ``detect(path)``, ``read(path, options)`` and LOOKED_FOR, the files that it detects.
-_READERS: dict[str, ModuleType] = {
+READERS: dict[str, ModuleType] = {
     "tum": tum,
     "7scenes": seven_scenes,
     "scannet": scannet,
@@ -24,79 +19,19 @@ _READERS: dict[str, ModuleType] = {
     "nyu": nyu,
     "generic": generic,
 }
-LAYOUTS = ("auto", *_READERS)
-# Options that a layout has no use for, beside those of KITTI-360 alone.
-_REFUSED = {
-    "tum": "images depth depth_intrinsics fps T_color_depth",
-    "7scenes": "images depth",
-    "scannet": "images depth T_color_depth",
-    "sens": "images depth T_color_depth",
-    "tartanair": "images depth depth_intrinsics T_color_depth",
-    "kitti360": "images T_color_depth",
-    "nyu": "trajectory images depth depth_intrinsics fps T_color_depth",
-    "generic": "T_color_depth",
-}
-
+LAYOUTS = ("auto", *READERS)
 # Folders within one another have one name: ROOT/chess/seq-01 is "chess__seq-01".
 _BETWEEN = "__"
 
 
-def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, **options: Any) -> FrameSequence:
-    """Opens a sequence of posed images; nothing but headers and text files is read before it is indexed.
-
-    Args:
-        path: the sequence's folder, or a video file (``ufmstar_torch.eval.tour.open`` also takes rendered tours).
-        layout: ``auto``, ``tum``, ``7scenes``, ``scannet``, ``sens``, ``tartanair``, ``kitti360``, ``nyu`` or
-            ``generic``.
-        poses: how they are written: ``camera-to-world`` (x right, y down, z forward), ``world-to-camera``, ``ned``
-            (camera-to-world, x forward, y right, z down) or ``opengl`` (x right, y up, z backward); what is
-            customary for a layout (TartanAir's NED) is known.
-        **options: by the names of :class:`~ufmstar_torch.eval.sequences.options.Options`, which explains them.
-
-    Returns:
-        The frames with a usable pose; ``skipped`` has the others.
-
-    Raises:
-        FileNotFoundError: ``path`` does not exist.
-        TypeError: an unknown option.
-        ValueError: unknown or ambiguous layout (with what was looked for), an option out of range or of no
-            use for the layout, malformed files (named by file and line), or no usable frame.
-    """
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"path: no such file or folder: {path}")
-    chosen = Options(**options)
-    if poses not in CONVENTIONS:
-        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
-    layout = _chosen(layout, path, explicit=chosen.images is not None or chosen.trajectory is not None)
-    chosen.reject(layout, *_REFUSED[layout].split(), *(("drive", "scans") if layout != "kitti360" else ()))
-    if chosen.trajectory is None and layout != "generic":
-        chosen.reject(layout, "fps")
-    sequence = _READERS[layout].read(path, chosen)
-    return convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), poses)
-
-
-def convert_poses(sequence: FrameSequence, convention: str) -> FrameSequence:
-    """The sequence with its poses, which were written so, as camera-to-world ones with our axes. Raises ValueError: an
-    unknown convention, or a sequence without poses."""
-    if convention not in CONVENTIONS:
-        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {convention!r}")
-    if convention == OURS:
-        return sequence
-    if not sequence.posed:
-        raise ValueError(f"sequence {sequence.name!r} has no poses to convert from {convention}")
-    convert = CONVENTIONS[convention].convert
-    return replace(sequence, entries=tuple(replace(e, T_world_cam=convert(e.T_world_cam)) for e in sequence.entries))
-
-
-def _chosen(layout: str, path: Path, explicit: bool) -> str:
-    """The layout by name, or detected for "auto"."""
+def layout_of(layout: str, path: Path, explicit: bool) -> str:
+    """The layout by name, or detected for "auto". Raises ValueError: unknown, ambiguous, or not that of the path."""
     if layout == "auto":
         layout = detect_layout(path, explicit=explicit)
-    if layout not in _READERS:
+    if layout not in READERS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
-    if layout != "generic" and not _READERS[layout].detect(path):
-        raise ValueError(f"{path} has not the layout {layout!r}: looked for {_READERS[layout].LOOKED_FOR}")
+    if layout != "generic" and not READERS[layout].detect(path):
+        raise ValueError(f"{path} has not the layout {layout!r}: looked for {READERS[layout].LOOKED_FOR}")
     return layout
 
 
@@ -117,14 +52,14 @@ def detect_layout(path: Path, explicit: bool = False) -> str:
         return fitting[0]
     if fitting:
         raise ValueError(f"{path} fits the layouts {', '.join(fitting)}: pass layout")
-    expected = "\n".join(f"  {name}: {reader.LOOKED_FOR}" for name, reader in _READERS.items())
+    expected = "\n".join(f"  {name}: {reader.LOOKED_FOR}" for name, reader in READERS.items())
     inside = sorted(p.name for p in path.iterdir())[:8] if path.is_dir() else [path.name]
     raise ValueError(f"{path} has no known layout. Looked for\n{expected}\nand found {inside}")
 
 
 def layouts_of(path: Path) -> list[str]:
     """The layouts whose files lie in ``path``, all of them; ``generic`` only where no other fits."""
-    fitting = [name for name, reader in _READERS.items() if name != "generic" and reader.detect(path)]
+    fitting = [name for name, reader in READERS.items() if name != "generic" and reader.detect(path)]
     return fitting or (["generic"] if generic.detect(path) else [])
 
 

@@ -92,6 +92,7 @@ def learn(
         distribute: sums values at points by component (:func:`ufmstar_torch.regress.distribute`).
         supported: which anchors their neighbours support (``evidence.inliers``).
     """
+    assert config.anchors is not None
     used = torch.zeros_like(frame.fault)
     if anchors is not None:
         points = unproject_at(anchors.predicted, anchors.index, frame.size[1], frame.intrinsics)
@@ -99,11 +100,11 @@ def learn(
         def by_component(rows: Tensor) -> Tensor:
             return distribute(mixture_cam, points, rows, config)
 
-        memory = 0.5 ** (1 / config.anchor_half_life)
+        memory = 0.5 ** (1 / config.anchors.half_life)
         # A faulty frame's anchors are not valid.
         evidence, each = observe(evidence, anchors, by_component, memory, supported)
         used = each.sum(1)
-    return Learnt(evidence, used, *means(evidence, config.anchor_shrinkage))
+    return Learnt(evidence, used, *means(evidence, config.anchors.shrinkage))
 
 
 def before_regression(
@@ -118,14 +119,14 @@ def before_regression(
 
     Args:
         evidence, mixture_cam, frame, anchors: as :func:`learn`.
-        config: ``anchored`` False = everything is returned as it is.
+        config: ``anchors`` None = everything is returned as it is.
         kernel: an implementation of :func:`learn`.
 
     Returns:
         The evidence, this frame's included; how many anchors were used [B]; the mixture with two more features, the
         components' mean r and e less the stream's; the stream's means [B, 2], for :func:`after_regression`.
     """
-    if not config.anchored:
+    if config.anchors is None:
         return evidence, torch.zeros_like(frame.fault), mixture_cam, None
     learnt = kernel(evidence.padded(mixture_cam.capacity), mixture_cam, frame, anchors, config)
     features = torch.cat([mixture_cam.features, learnt.beyond], dim=-1)

@@ -52,7 +52,7 @@ def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> 
     _check(*given, mask, *maps, FARTHEST_OFF, pixel, index, predicted, depth, variance, valid)
     at, usable = torch.from_numpy(index), torch.from_numpy(valid)
     p, d, g, s2 = (torch.from_numpy(value) for value in (pixel, predicted, depth, variance))
-    return AnchorInput(p, at, d, g, s2, claimed(own, at, usable), usable, anchors.confirmed)
+    return AnchorInput(p, at, d, g, s2, claimed(own, at, usable), usable)
 
 
 @kernel
@@ -133,7 +133,8 @@ def learn_in_view(
         given = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.own_variance)
         fields = [array(anchors.index), *map(array, given), array(anchors.valid)]
     features = [one.features for one in seen]
-    settings = frame.size[1], 0.5 ** (1 / config.anchor_half_life), config.anchor_shrinkage
+    assert config.anchors is not None
+    settings = frame.size[1], 0.5 ** (1 / config.anchors.half_life), config.anchors.shrinkage
     arrays = zip(slots, views, features, *fields, array(frame.intrinsics), before, overall_before, strict=True)
     out = zip(component, overall, used, beyond, stream, strict=True)
     each(_learn, [(*arguments, *settings, *into) for arguments, into in zip(arrays, out, strict=True)])

@@ -93,7 +93,7 @@ def step(
 
     learnt: Learnt | None = None
     views: list[View] | None = None
-    if config.anchored:
+    if config.anchors is not None:
         learnt, views = _learn(state, joined, frame, anchors, config)
     stage("append")
 
@@ -176,7 +176,7 @@ def _match(
     after = tuple(map(np.empty_like, before))
     mixture = tuple(array(value) for value in (state.mean, state.covariance, state.weight))
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
-    least = min(EPSILON[frame.depth.dtype], EPSILON[state.covariance.dtype] if config.anchored else 1.0)
+    least = min(EPSILON[frame.depth.dtype], EPSILON[state.covariance.dtype] if config.anchors is not None else 1.0)
     reach = config.prior_weight, least if config.regression == "exact" else 0.0
     given = (camera, before, after, mixture, segments[:3], frame.size, thresholds, reach)
     return after, [_Pairs(*found) for found in each(match, [(b, *given) for b in range(len(frame.depth))])]
@@ -195,13 +195,12 @@ def _join(
     needed = max(pair.occupied + pair.created for pair in pairs)
     capacity = _capacity(slots[0].shape[1], needed, config.max_components)
     updated = tuple(np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype) for value in slots)
-    stated = config.prior_mean if config.unmeasured == "prior" else -1.0
-    settings = config.overlap_weighted, float(np.finfo(slots[1].dtype).eps), stated
+    settings = config.overlap_weighted, float(np.finfo(slots[1].dtype).eps)
     fused = array(frame.T_world_cam), first, slots, updated, (*segments[:3], segments[5])
     calls = [
         (
             b, *fused, pair[:3], _distance(b, pair, segments, config), pair.new, pair.occupied, pair.near, pair.here,
-            settings, 3 if config.anchored else 1,
+            settings, 3 if config.anchors is not None else 1,
         )
         for b, pair in enumerate(pairs)
     ]  # fmt: skip

@@ -113,7 +113,13 @@ class DeviceStep:
         observer: StepObserver | None = None,
     ) -> tuple[UfMStarState, StepOutput]:
         plain = config.disagreement == "w2" and config.regression == "exact"
-        if config.anchored or config.overlap_weighted or not plain or pixels is not None or observer is not None:
+        if (
+            config.anchors is not None
+            or config.overlap_weighted
+            or not plain
+            or pixels is not None
+            or observer is not None
+        ):
             state = self._with_room(state, config, ahead=most_kept(SegmentInput.of_frame(frame, config)))
             fixed = replace(config, max_components=state.mixture.capacity)
             updated, out = step(

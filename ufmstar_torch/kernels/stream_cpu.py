@@ -96,8 +96,7 @@ def join(b, present, first, before, after, segments, pairs, distance, new, occup
         new: [C] which segments to append, from slot ``occupied`` on.
         near, here: the slots within reach [n], and they by field [13, n + C and more], as :func:`match` returns them;
             what has changed of the latter is written, and what is new behind it.
-        settings: ``weighted`` and ``epsilon`` as :func:`fuse_pairs`; the disagreement [m^2] of what was seen from one
-            view, negative for its own.
+        settings: ``weighted`` and ``epsilon`` as :func:`fuse_pairs`.
         extra: features of the regression behind the mixture's own. The last one is that of
             ``unmeasured.before_regression``, the others are unset.
 
@@ -105,7 +104,7 @@ def join(b, present, first, before, after, segments, pairs, distance, new, occup
         The slots within reach [n], with those of the new components, their disagreement [n] and features [n, F] for the
         regression, and how many components the mixture has.
     """
-    weighted, epsilon, stated = settings
+    weighted, epsilon = settings
     mean_c, cov_c, weight_c, features_c = segments[0][b], segments[1][b], segments[2][b], segments[3][b]
     mean, covariance, weight, disagreement, count, features = (
         after[0][b], after[1][b], after[2][b], after[3][b], after[4][b], after[5][b],
@@ -129,11 +128,10 @@ def join(b, present, first, before, after, segments, pairs, distance, new, occup
     m, more = empty(slots_near.size, np.float64), empty((slots_near.size, features.shape[1] + extra), np.float64)
     for i in range(slots_near.size):
         k = slots_near[i]
-        seen_again = count[k] > 1
-        m[i] = disagreement[k] if seen_again or stated < 0 else stated
+        m[i] = disagreement[k]
         for f in range(features.shape[1]):
             more[i, f] = features[k, f]
-        more[i, more.shape[1] - 1] = 1.0 if seen_again else 0.0
+        more[i, more.shape[1] - 1] = 1.0 if count[k] > 1 else 0.0
     return slots_near, m, more, components
 
 

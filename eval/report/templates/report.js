@@ -38,7 +38,7 @@
     const show = () => {
       const large = picture.cloneNode();
       large.classList.remove("zoom");
-      large.style.width = 1.5 * picture.getAttribute("width") + "px";
+      large.style.width = 1.5 * picture.naturalWidth + "px";
       large.style.height = "auto";
       dialog.replaceChildren(large);
       dialog.showModal();

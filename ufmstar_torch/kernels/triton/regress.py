@@ -28,7 +28,7 @@ from ufmstar_torch.regress import regress_image as reference
 
 _SIDE = 16  # pixels of a tile
 _CHUNK = 32  # components bounded at a time: the bits of a mask
-_UNMEASURED = {"paper": 0, "prior": 1, "relative": 2, "nan": 3}
+_UNMEASURED = {"paper": 0, "relative": 1, "nan": 2}
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def _launch(
         least=math.log2(PRIOR * config.prior_weight), share=math.log2(EPSILON[depth.dtype] / 3) - 0.01,
         slack=16 * torch.finfo(depth.dtype).eps, channels=channels, padded=power_of_two(channels), side=_SIDE,
         chunk=_CHUNK, subset=subset, stepped=stepped is not None, alpha=alpha, mode=_UNMEASURED[config.unmeasured],
-        stated=config.prior_mean, relative=config.unmeasured_relative, half=unmeasured.HALF,
+        relative=config.unmeasured_relative, half=unmeasured.HALF,
     )  # fmt: skip
 
 
@@ -185,7 +185,7 @@ def _regress(
     compared, before, memory, measured, counts, height, width, chosen, capacity, streams,
     prior: tl.constexpr, prior_total: tl.constexpr, least: tl.constexpr, share: tl.constexpr, slack: tl.constexpr,
     channels: tl.constexpr, padded: tl.constexpr, side: tl.constexpr, chunk: tl.constexpr, subset: tl.constexpr,
-    stepped: tl.constexpr, alpha: tl.constexpr, mode: tl.constexpr, stated: tl.constexpr, relative: tl.constexpr,
+    stepped: tl.constexpr, alpha: tl.constexpr, mode: tl.constexpr, relative: tl.constexpr,
     half: tl.constexpr,
 ):  # fmt: skip
     real = depth.dtype.element_ty
@@ -260,13 +260,9 @@ def _regress(
             w = tl.exp2(tl.load(fields + 6 * capacity + j) - (y0 * y0 + y1 * y1 + y2 * y2))
             k = b * capacity + tl.load(index + j)
             evidence += w
-            own = tl.load(m + k).to(real)
             if stepped:
-                twice = tl.load(compared + k) > 1
-                seen += tl.where(twice, w, 0.0)
-                if mode == 1:
-                    own = tl.where(twice, own, stated)
-            total += w * own
+                seen += tl.where(tl.load(compared + k) > 1, w, 0.0)
+            total += w * tl.load(m + k).to(real)
             if channels > 0:
                 value = tl.load(features + k * channels + f, mask=f < channels, other=0.0).to(real)
                 sums += w[:, None] * value[None, :]
@@ -274,10 +270,10 @@ def _regress(
     value = total / evidence
     if stepped:
         known = seen / evidence
-        if mode == 2:
+        if mode == 1:
             size = relative * tl.load(depth + source, mask=ok, other=0.0)
             value += tl.maximum(1 - known, 0.0) * (size * size)
-        if mode == 3:
+        if mode == 2:
             value = tl.where(known < half, nan, value)
         tl.store(measured + target, tl.where(ok, known, nan), mask=inside)
         tl.atomic_add(counts + 6 * streams + b, tl.sum(ok.to(tl.int32), 0))

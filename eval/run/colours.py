@@ -1,0 +1,93 @@
+"""Colours of pictures: perceptually uniform maps, ranges by percentile, grey for what is unknown; writing of PNGs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.eval.run.files import write_atomic
+from ufmstar_torch.optional import optional
+
+# Depth and uncertainty get different maps, so that the two pictures cannot be confused.
+DEPTH_MAP = "viridis"
+ERROR_MAP = "magma"
+INK, FAINT = "#1a1a1a", "#6b6b6b"  # of words
+# In neither map: both are coloured at medium lightness.
+INVALID_GREY = 150
+PERCENTILES = (1.0, 99.0)
+
+
+@dataclass(frozen=True)
+class ColourScale:
+    """A matplotlib map and the values [m] at its dark and its bright end, low < high; values beyond an end get its
+    colour.
+    """
+
+    low: float
+    high: float
+    colour_map: str
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise ValueError(f"low must be less than high, got {self.low} and {self.high}")
+
+    def rgb(self, values: NDArray[Any]) -> NDArray[np.uint8]:
+        """[..., 3] the colours of ``values`` [...] [m]; grey where not finite."""
+        known = np.isfinite(values)
+        shown = np.where(known, values, self.low).astype(np.float64)
+        index = np.clip((shown - self.low) / (self.high - self.low), 0, 1) * 255
+        colours = colour_table(self.colour_map)[np.rint(index).astype(np.intp)]
+        return np.where(known[..., None], colours, np.uint8(INVALID_GREY))
+
+
+@cache
+def colour_table(name: str) -> NDArray[np.uint8]:
+    """[256, 3] the sRGB colours of a matplotlib map, read-only."""
+    table: NDArray[np.uint8] = require_matplotlib().colormaps[name](np.linspace(0, 1, 256), bytes=True)[:, :3].copy()
+    table.setflags(write=False)
+    return table
+
+
+def require_matplotlib() -> Any:
+    """The matplotlib package, without pyplot and so without global state. Raises ImportError: it is missing; names the
+    extra that brings it."""
+    return optional("matplotlib", "pictures need matplotlib", "'ufmstar-torch[viz]'")
+
+
+def plain(text: str) -> str:
+    """Text for matplotlib as it stands: a pair of dollar signs would make a formula of what lies between."""
+    return text.replace("$", r"\$")
+
+
+def save_png(figure: Any, path: Path) -> None:
+    """Write a matplotlib figure as PNG, atomically; the same figure gives the same bytes."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    write_atomic(path, FigureCanvasAgg(figure).print_png)
+
+
+def known_where(condition: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[np.float32]:
+    """The values in float32, NaN where the condition is False."""
+    return np.where(condition, values, np.nan).astype(np.float32)
+
+
+def robust_range(maps: Iterable[NDArray[Any]], *, from_zero: bool) -> tuple[float, float]:
+    """The 1st to 99th percentile [m] over all finite pixels of several maps, low < high; (0, 1) without a pixel.
+
+    ``from_zero`` starts the range at 0, as for a sigma or an error.
+    """
+    kept = [values[np.isfinite(values)] for values in maps]
+    pixels = np.concatenate(kept) if kept else np.zeros(0)
+    if pixels.size == 0:
+        return 0.0, 1.0
+    low, high = (float(x) for x in np.percentile(pixels, PERCENTILES))
+    if from_zero:
+        low = 0.0
+    # One value everywhere, as a disagreement of 0 in the first frame, still needs a range to draw.
+    return (low, high) if high > low else (low, low + max(1e-3, 1e-3 * abs(low)))

@@ -1,0 +1,234 @@
+"""Output folders: which program a folder belongs to, what its work was started with, and which process holds it.
+
+A folder belongs to a program once it contains the manifest of that program's :class:`FolderKind`. Files that the
+program did not make are never touched.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from ufmstar_torch.eval.run.files import remove_temporaries, to_json, write_json_atomic
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
+
+_SHOWN = 5  # differences that a message names
+_POLL_SECONDS = 0.02
+_UNFINISHED = "not finished"
+# What a file system without locks answers.
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+
+Manifest = Mapping[str, Any]
+
+
+class FolderError(ValueError):
+    """The output folder cannot be used as asked; the message names the option that helps."""
+
+
+@dataclass(frozen=True)
+class FolderKind:
+    """The output folder of one program."""
+
+    program: str  # as "ufmstar run"; the manifest contains it
+    noun: str  # for messages: "run", "evaluation", "training", "demo"
+    manifest: str  # path of the manifest below the folder
+    clear: Callable[[Path], None]  # removes what earlier work left in a folder, but for the manifest
+    # of the manifest and the files beside it; None = work of this kind cannot be continued, and its manifest is
+    # replaced by a summary at the end.
+    format: int | None = None
+    lock: str | None = None  # path of the lock file below the folder; None = no lock
+    # "life" = the lock is held until the folder is closed, by one process; "opening" = only while the folder is opened,
+    # since several processes work in it.
+    held: Literal["life", "opening"] = "life"
+    wait: float = 0.0  # longest time [s] to wait for the lock
+    allowed: tuple[str, ...] = ()  # entries that may exist in a folder before its manifest does
+    # glob patterns below the folder of temporary files that a killed process may have left, and that no running process
+    # can own while the lock is held.
+    temporary: tuple[str, ...] = (".*.tmp",)
+    # of (a manifest, another one): the values of the first that must not change.
+    identity: Callable[[Manifest, Manifest], Manifest] = lambda manifest, _: manifest["identity"]
+    # of (the manifest in the folder, the new one): what the folder contains from then on.
+    merge: Callable[[Manifest, Manifest], Manifest] = lambda then, _: then
+
+    def new_manifest(self, content: Manifest) -> dict[str, Any]:
+        """The manifest of new work, as plain values; ``content`` is what the kind keeps beside program and format."""
+        own = {"state": _UNFINISHED} if self.format is None else {"format": self.format}
+        plain: dict[str, Any] = to_json({"program": self.program, **own, **content})
+        return plain
+
+    def read_manifest(self, out: Path) -> dict[str, Any]:
+        """The manifest of a folder. Raises FolderError: it is damaged, or of another program or format."""
+        path = out / self.manifest
+        try:
+            manifest = json.loads(path.read_text(encoding="utf-8"))
+            if manifest["program"] != self.program or manifest["format"] != self.format:
+                raise ValueError(f"made by {manifest['program']}, format {manifest['format']}")
+            return dict(manifest)
+        except (ValueError, KeyError, TypeError) as error:
+            article = "an" if self.noun[0] in "aeiou" else "a"
+            text = f"--resume: {path} is not {article} {self.noun}'s that can be continued ({error})"
+            raise FolderError(text) from error
+
+    def earlier(self, out: Path, *, resume: bool, overwrite: bool) -> bool:
+        """Whether the folder contains earlier work of the program.
+
+        Raises:
+            FolderError: it is a file, contains files that are not the program's, or earlier work and the options do not
+                say what to do with it. Of work that cannot be continued, what was interrupted is of no use to anybody.
+        """
+        if out.exists() and not out.is_dir():
+            raise FolderError(f"--out {out} is a file, expected a folder")
+        known, state = (out / self.manifest).is_file(), ""
+        if known and self.format is None:
+            try:
+                content = json.loads((out / self.manifest).read_text(encoding="utf-8"))
+            except (OSError, ValueError):
+                content = None
+            known = isinstance(content, dict) and content.get("program") == self.program
+            state = content.get("state", "") if known else ""
+        if not known:
+            if out.is_dir() and any(self._foreign(out)):
+                raise FolderError(f"--out {out} holds files of someone else: choose an empty or a new folder")
+            return False
+        if not (resume or overwrite or state == _UNFINISHED):
+            choices = "" if self.format is None else "--resume goes on with it, "
+            raise FolderError(f"--out {out} holds an earlier {self.noun}: {choices}--overwrite replaces it")
+        return True
+
+    def _foreign(self, out: Path) -> list[Path]:
+        """Entries beside those that a process leaves which was killed before it wrote the manifest."""
+        manifest = out / self.manifest
+        own = {manifest, manifest.parent, *(out / name for name in self.allowed)}
+        own |= set() if self.lock is None else {out / self.lock}
+        entries = [path for folder in {out, manifest.parent} if folder.is_dir() for path in folder.iterdir()]
+        return [path for path in entries if path not in own and not path.name.startswith(f".{manifest.name}.")]
+
+
+class OutputFolder:
+    """An output folder that belongs to its program. Use :meth:`open`, and close it, or use it with ``with``.
+
+    Attributes:
+        path: the folder.
+        resumed: whether it contained earlier work that goes on.
+    """
+
+    def __init__(self, path: Path, *, resumed: bool, held: ExitStack) -> None:
+        self.path, self.resumed, self._held = path, resumed, held
+
+    @classmethod
+    def open(
+        cls, out: Path, kind: FolderKind, content: Manifest, *, resume: bool = False, overwrite: bool = False
+    ) -> OutputFolder:
+        """Prepare a folder for new work, or to go on with earlier work.
+
+        Args:
+            out: created if missing.
+            kind: of the folder.
+            content: of the manifest, beside program and format.
+            resume: go on with earlier work in the folder; without any, start.
+            overwrite: remove what earlier work left, and start.
+
+        Raises:
+            FolderError: the folder contains earlier work and neither was asked for; other files; work that was
+                started with other values (the message names them); or another process holds it.
+            OSError: the folder cannot be made or locked.
+        """
+        kind.earlier(out, resume=resume, overwrite=overwrite)
+        out.mkdir(parents=True, exist_ok=True)
+        (out / kind.manifest).parent.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as held:
+            if kind.lock is not None:
+                lock = hold(out / kind.lock, wait=kind.wait)
+                if lock is None:
+                    preparing = f"another process is preparing it for over {kind.wait:g} s"
+                    busy = preparing if kind.held == "opening" else f"another {kind.noun} is writing there now"
+                    raise FolderError(f"--out {out}: {busy}")
+                held.callback(lock.release)
+            # Checked again: another process may have made the folder while this one waited.
+            resumed = kind.earlier(out, resume=resume, overwrite=overwrite) and resume
+            for pattern in kind.temporary:
+                remove_temporaries(out.glob(pattern))
+            manifest = kind.new_manifest(content)
+            if resumed:
+                earlier = kind.read_manifest(out)
+                changed = differences(kind.identity(earlier, manifest), kind.identity(manifest, earlier))
+                if changed:
+                    raise FolderError(f"--resume: the {kind.noun} in {out} was started with other input: {changed}")
+                manifest = dict(kind.merge(earlier, manifest))
+            else:
+                kind.clear(out)
+            if not resumed or manifest != earlier:
+                write_json_atomic(out / kind.manifest, manifest)
+            return cls(out, resumed=resumed, held=held.pop_all() if kind.held == "life" else ExitStack())
+
+    def close(self) -> None:
+        """Release the lock."""
+        self._held.close()
+
+    def __enter__(self) -> OutputFolder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def remover(*patterns: str) -> Callable[[Path], None]:
+    """A ``FolderKind.clear`` that removes the files that match glob patterns below the folder."""
+
+    def clear(out: Path) -> None:
+        for pattern in patterns:
+            for path in list(out.glob(pattern)):
+                path.unlink(missing_ok=True)
+
+    return clear
+
+
+def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
+    """Hold a lock file until it is released or the process ends, however that happens; None where another process, or
+    an earlier call, holds it for more than ``wait`` [s]. On a network file system the lock holds between computers if
+    it passes on ``flock``. Raises OSError: the file cannot be opened, or the file system does not support locks."""
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(path, thread_local=False, fallback_to_soft=False)
+    try:
+        lock.acquire(timeout=wait, poll_interval=_POLL_SECONDS)
+    except Timeout:
+        return None
+    except (NotImplementedError, OSError) as error:
+        code = error.errno if isinstance(error, OSError) else errno.ENOSYS  # filelock's form of it
+        if code not in _NO_LOCKS:
+            raise
+        text = f"the file system does not support locks ({os.strerror(code)}), choose a folder on another one"
+        raise OSError(code, text, str(path)) from error
+    return lock
+
+
+def differences(then: Manifest, now: Manifest) -> str:
+    """What differs between two nested mappings of plain values, by dotted names; "" if nothing does."""
+    before, after = _flat(then), _flat(now)
+    changed = [key for key in sorted(before.keys() | after.keys()) if before.get(key) != after.get(key)]
+    text = "; ".join(f"{key} was {_short(before.get(key))}, now {_short(after.get(key))}" for key in changed[:_SHOWN])
+    return text + (f" and {len(changed) - _SHOWN} more" if len(changed) > _SHOWN else "")
+
+
+def _flat(values: Manifest, prefix: str = "") -> dict[str, Any]:
+    """Nested mappings and lists of them as one level, with dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, list) and value and isinstance(value[0], Mapping):
+            value = {str(i): item for i, item in enumerate(value)}
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else text[:16] + '..."'

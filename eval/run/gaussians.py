@@ -1,0 +1,176 @@
+"""The mixture as files: splat attributes and ellipsoids (binary PLY) for viewers, npz for programs.
+
+Positions are in the frame of the mixture (the first camera: x right, y down, z forward), or in the
+world where ``T_world_first`` is given. Lengths in metres. PLY stores float32, as its viewers expect:
+sub-millimetre up to kilometres from the origin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.lib.recfunctions import unstructured_to_structured
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
+from ufmstar_torch.eval.run.files import write_atomic
+from ufmstar_torch.mixture import GaussianMixture
+
+# Below this standard deviation [m] an axis is drawn as if it had it: log(0) has no place in a file, and
+# a viewer divides by the axes. A micrometre is far below any depth.
+SIGMA_FLOOR = 1e-6
+# The constant spherical harmonic: viewers show the colour 1/2 + SH_DC f_dc.
+SH_DC = 0.5 / np.sqrt(np.pi)
+OPACITY = 0.8
+RADIUS, SUBDIVISIONS = 2.0, 2  # of the ellipsoids, of the icosahedron: 320 triangles each
+_TYPES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
+
+
+def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> int:
+    """Write the occupied components of the first stream as Gaussian splats, atomically; their number.
+
+    Attributes in the order and with the meaning that 3D Gaussian splatting viewers expect: x y z [m],
+    nx ny nz (the shortest axis), f_dc_0..2 (colour, see below), opacity (logit), scale_0..2 = ln sigma
+    [ln m], rot_0..3 = unit quaternion w x y z, so that Sigma = R diag(exp(scale))^2 R^T. WriterThread them our
+    own: weight [px], disagreement [m^2], count.
+    The colour is sqrt(disagreement) in magma from 0 to its 99th percentile, which the header states.
+
+    Args:
+        path: the file; its folder must exist.
+        mixture: B streams of K slots.
+        T_world_first: [4, 4] or [1, 4, 4] rigid, from the mixture's frame to the world; None = stay there.
+
+    Raises:
+        ValueError: ``T_world_first`` has another shape.
+    """
+    parts = _Components(mixture, T_world_first)
+    quaternion = Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True)
+    opacity = np.full(len(parts.mean), np.log(OPACITY / (1 - OPACITY)))
+    columns = (parts.mean, parts.axes[:, :, 0], (parts.colour / 255 - 0.5) / SH_DC, opacity, np.log(parts.sigma))
+    names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+    kinds = dict.fromkeys((*names.split(), "weight", "disagreement"), "<f4") | {"count": "<i4"}
+    table = _table(kinds, *columns, quaternion, parts.weight, parts.disagreement, parts.count)
+    _write_ply(Path(path), {"vertex": table}, [parts.legend])
+    return len(table)
+
+
+def write_ellipsoids_ply(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> int:
+    """Write the occupied components as a triangle mesh of ellipsoids of ``RADIUS`` standard deviations, atomically.
+
+    Opens in MeshLab, Blender and the like. Vertices carry x y z [m], outward normals, red green blue of
+    sqrt(disagreement), disagreement [m^2] and the component's number. Arguments, result and errors as
+    :func:`write_mixture_ply`.
+    """
+    parts = _Components(mixture, T_world_first)
+    sphere, triangles = icosphere(SUBDIVISIONS)
+    k, n = len(parts.mean), len(sphere)
+    # Sigma^(1/2) u: symmetric with a positive determinant, so triangles keep facing outwards.
+    root = np.einsum("kij,kj,klj->kil", parts.axes, parts.sigma, parts.axes)
+    inverse = np.einsum("kij,kj,klj->kil", parts.axes, 1 / parts.sigma, parts.axes)
+    normal = np.einsum("kij,nj->kni", inverse, sphere)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    position = (parts.mean[:, None] + RADIUS * np.einsum("kij,nj->kni", root, sphere)).reshape(-1, 3)
+    kinds = dict.fromkeys(("x", "y", "z", "nx", "ny", "nz"), "<f4")
+    kinds |= dict.fromkeys(("red", "green", "blue"), "|u1") | {"disagreement": "<f4", "component": "<i4"}
+    of_component = (parts.colour, parts.disagreement, np.arange(k))
+    vertices = _table(kinds, position, normal.reshape(-1, 3), *(values.repeat(n, axis=0) for values in of_component))
+    faces = np.zeros(k * len(triangles), dtype=[("sides", "|u1"), ("vertex_indices", "<i4", (3,))])
+    faces["sides"] = 3
+    faces["vertex_indices"] = (triangles + n * np.arange(k)[:, None, None]).reshape(-1, 3)
+    legend = [parts.legend, f"ellipsoids of {RADIUS:g} standard deviations"]
+    _write_ply(Path(path), {"vertex": vertices, "face": faces}, legend)
+    return k
+
+
+def write_mixture_npz(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> None:
+    """Write all streams exactly, atomically: the fields of ``GaussianMixture``, and ``T_world_first`` ([B, 4, 4] or
+    [4, 4]) in float64. Slots behind the last occupied one of all streams are left out.
+    """
+    used = int(mixture.valid.any(0).nonzero().max()) + 1 if bool(mixture.valid.any()) else 0
+    fields = {name: value[:, :used].detach().cpu().numpy() for name, value in mixture.tensors().items()}
+    if T_world_first is not None:
+        fields["T_world_first"] = T_world_first.detach().cpu().double().numpy()
+    write_atomic(Path(path), lambda file: np.savez(file, allow_pickle=False, **fields))
+
+
+def icosphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Unit vectors [10 4^s + 2, 3] and outward triangles [20 4^s, 3] of a divided icosahedron.
+
+    All vertices lie on the sphere, so the triangles are those of their convex hull; dividing adds the hull's edges'
+    middles as vertices.
+    """
+    g = (1 + 5**0.5) / 2
+    base = [(0, a, b * g) for a in (-1, 1) for b in (-1, 1)]
+    vertices = np.array([np.roll(v, shift) for shift in range(3) for v in base]) / np.hypot(1, g)
+    for _ in range(subdivisions):
+        triangles = ConvexHull(vertices).simplices
+        edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+        middle = vertices[edges].sum(1)
+        vertices = np.concatenate([vertices, middle / np.linalg.norm(middle, axis=-1, keepdims=True)])
+    triangles = ConvexHull(vertices).simplices.astype(np.int64)
+    inward = np.linalg.det(vertices[triangles]) < 0
+    triangles[inward] = triangles[inward][:, ::-1]
+    return vertices, triangles
+
+
+class _Components:
+    """The occupied components of the first stream in float64, in the frame asked for.
+
+    Attributes:
+        mean: [K, 3] [m]; axes: [K, 3, 3] rotations, columns = principal axes, shortest first;
+        sigma: [K, 3] standard deviations along them [m]; weight, disagreement, count: [K];
+        colour: [K, 3] uint8; legend: what the colour means.
+    """
+
+    def __init__(self, mixture: GaussianMixture, T_world_first: Tensor | None) -> None:
+        used = mixture.valid[0]
+        mean, covariance, self.weight, self.disagreement, self.count = (
+            value[0][used].detach().cpu().to(torch.float64).numpy()
+            for value in (mixture.mean, mixture.covariance, mixture.weight, mixture.disagreement, mixture.count)
+        )
+        variance, axes = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
+        axes[np.linalg.det(axes) < 0, :, 2] *= -1
+        R, t = _rotation_translation(T_world_first)
+        self.mean: NDArray[np.float64] = mean @ R.T + t
+        self.axes: NDArray[np.float64] = R @ axes
+        self.sigma: NDArray[np.float64] = np.sqrt(np.maximum(variance, SIGMA_FLOOR**2))
+        root = np.sqrt(np.maximum(self.disagreement, 0))
+        scale = ColourScale(*robust_range([root], from_zero=True), ERROR_MAP)
+        self.colour = scale.rgb(root)
+        self.legend = f"colour: sqrt(disagreement), {ERROR_MAP} from 0 to {scale.high:.4g} m"
+
+
+def _rotation_translation(T: Tensor | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    if T is None:
+        return np.eye(3), np.zeros(3)
+    if tuple(T.shape) not in ((4, 4), (1, 4, 4)):
+        raise ValueError(f"T_world_first must have shape (4, 4) or (1, 4, 4), got {tuple(T.shape)}")
+    matrix = T.detach().cpu().to(torch.float64).numpy().reshape(4, 4)
+    return matrix[:3, :3], matrix[:3, 3]
+
+
+def _table(kinds: Mapping[str, str], *columns: NDArray[Any]) -> NDArray[Any]:
+    """A structured array of columns [N] or [N, c] side by side, with the types by name."""
+    return unstructured_to_structured(np.column_stack(columns), np.dtype(list(kinds.items())))
+
+
+def _write_ply(path: Path, elements: Mapping[str, NDArray[Any]], comments: list[str]) -> None:
+    """Binary little-endian PLY; a field of shape (3,) behind ``sides`` is a list property."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
+    for element, table in elements.items():
+        lines.append(f"element {element} {len(table)}")
+        for name in table.dtype.names or ():
+            kind = table.dtype[name]
+            if kind.subdtype is not None:
+                lines.append(f"property list uchar int {name}")
+            elif name != "sides":
+                lines.append(f"property {_TYPES[kind.str]} {name}")
+    content = "\n".join([*lines, "end_header", ""]).encode("ascii")
+    write_atomic(path, lambda file: file.write(content + b"".join(t.tobytes() for t in elements.values())))

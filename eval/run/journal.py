@@ -1,0 +1,153 @@
+"""What a run keeps of its frames: the sink that writes their maps, lines of frames.jsonl, checkpoint and summary."""
+
+from __future__ import annotations
+
+import math
+from time import perf_counter
+from typing import Any
+
+from torch import Tensor
+
+from ufmstar_torch.eval.engine.estimators import Estimate
+from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
+from ufmstar_torch.eval.engine.rows import RowFrame
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
+from ufmstar_torch.eval.run.run_folder import Checkpoint, RunFolder
+from ufmstar_torch.eval.run.run_job import RunJob, saved_state
+from ufmstar_torch.eval.run.summary import GOING_ON, NEAR_ZERO, write_summary
+
+_MAPS = ("depth", "variance", "disagreement", "anchored", "bias", "posterior_depth", "posterior_variance")
+_COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
+_SUMMARY_EVERY = 30.0  # [s] between two updates of the summary of a run that is going on
+
+
+class Journal(FrameSink):
+    """Writes every frame's maps to the run's folder, and commits it with the metrics' sums and the state that the next
+    one depends on (``FrameResult.state``); now and then the summary."""
+
+    def __init__(self, job: RunJob, folder: RunFolder, metrics: RunMetrics) -> None:
+        self._job, self._folder, self._metrics = job, folder, metrics
+        self._earlier = list(folder.checkpoint.sessions)
+        self._saving = 0.0
+
+    def begin(self, stream: FrameStream) -> None:
+        """The clock of this session starts."""
+        self._first, self._started = stream.position, perf_counter()
+        self._summarised = self._started
+
+    def take(self, result: FrameResult) -> None:
+        """Write and commit a frame; raises OSError as ``FrameWriter.write`` and ``RunFolder.commit``."""
+        record, frames = self._written(result), result.number + 1 - self._first
+        session = {"first": self._first, "frames": frames, "seconds": perf_counter() - self._started}
+        checkpoint = Checkpoint(
+            position=result.number + 1,
+            module=saved_state(result.state[UFM], bare=not self._job.source.needs_image),
+            metrics=self._metrics.sums(),
+            sessions=[*self._earlier, session],
+        )
+        before = perf_counter()
+        self._folder.commit(record, checkpoint)
+        after = perf_counter()
+        self._saving = 1000 * (after - before)
+        if after - self._summarised > _SUMMARY_EVERY:
+            write_summary(self._job, self._folder, *GOING_ON)
+            self._summarised = perf_counter()
+
+    def end(self) -> None:
+        """Store the last state, before pictures are drawn."""
+        self._folder.store()
+
+    def _written(self, result: FrameResult) -> dict[str, Any]:
+        """The frame's line of frames.jsonl, once its maps are written."""
+        about = {"index": result.index, "name": result.name}
+        if UFM not in result.rows:
+            return {**about, "state": "skipped", "reason": result.skipped[UFM]}
+        row, before = result.rows[UFM], perf_counter()
+        maps = {name: getattr(row.estimate, name) for name in _MAPS}
+        saturated = {"saturated": self._folder.writer.write(result.name, valid=row.estimate.valid, **maps)}
+        times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
+        return {**about, "state": "done", **_figures(row), **saturated, **times, **_anchor_figures(row)}
+
+
+def _figures(row: RowFrame) -> dict[str, Any]:
+    """Counts and means of a frame."""
+    estimate, prediction = row.estimate, row.prediction
+    statistics, own, K = estimate.statistics, prediction.variance, prediction.intrinsics.tolist()
+    assert statistics is not None
+    assert estimate.variance is not None
+    assert estimate.disagreement is not None
+    std, valid = estimate.variance.sqrt(), estimate.valid
+    return {
+        "size": list(prediction.size),
+        "intrinsics": [K[0][0], K[1][1], K[0][2], K[1][2]],
+        "member": row.member,
+        **{count: int(getattr(statistics, count)[0]) for count in _COUNTS},
+        "rotation_deviation": float(statistics.rotation_deviation[0]),
+        "mean_disagreement": _mean(estimate.disagreement, valid),
+        "mean_sigma": _mean(std, valid),
+        "mean_network_sigma": None if own is None else _mean(own.cpu().sqrt(), valid),
+        "near_zero": int(((std > 0) & (std < NEAR_ZERO)).sum()),
+        "ground_truth": row.truth is not None,
+    }
+
+
+def _times(result: FrameResult, row: RowFrame, writing: float, saving: float) -> dict[str, float]:
+    """By stage [ms]. "prepare" is what a prediction takes beside the network; "save" is that of the frame before, since
+    this frame's is not known yet. "cycle" is the time since the frame before: stages overlap."""
+    ms = result.ms
+    optional: dict[str, float] = {stage: row.ms[stage] for stage in ("network", "anchors") if stage in row.ms}
+    return {
+        "read": ms["read"],
+        **optional,
+        "ufm": row.ms["uncertainty"],
+        "metrics": ms["truth"] + ms["metrics"],
+        "write": writing,
+        "save": saving,
+        "prepare": ms["predict"] - row.ms.get("network", 0.0),
+        "cycle": ms["cycle"],
+    }
+
+
+def _anchor_figures(row: RowFrame) -> dict[str, Any]:
+    """Of a run with anchors: what became of the frame's corners, and the means of B [m^2] and of r.
+
+    ``tracked`` were followed from the frame before, of which ``found`` were triangulated; ``usable`` lie on a pixel
+    with a depth, and ``used`` agree with others. Without any used, ``without`` is the reason. Of a map of landmarks,
+    ``tracked`` counts all, and ``found`` those in view.
+    """
+    anchors, estimate, statistics = row.anchors, row.estimate, row.estimate.statistics
+    if anchors is None or statistics is None or estimate.anchored is None or estimate.bias is None:
+        return {}
+    used, usable = int(statistics.anchors_used[0]), int(statistics.anchors[0])
+    counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
+    return {
+        "anchors": {**counts, "without": None if used else why_none(anchors.triangulated, usable, anchors.none)},
+        "mean_anchored": _mean(estimate.anchored, estimate.valid),
+        "mean_bias": _mean(estimate.bias, estimate.valid),
+        **_posterior_figures(estimate),
+    }
+
+
+def _posterior_figures(estimate: Estimate) -> dict[str, Any]:
+    """Of a run with a posterior: its mean sigma [m], and what held-out anchors say (``FrameStatistics``)."""
+    variance, statistics = estimate.posterior_variance, estimate.statistics
+    if variance is None or statistics is None or statistics.calibration is None or statistics.unseen is None:
+        return {}
+    calibration = float(statistics.calibration[0])
+    figures = {
+        "mean_sigma": _mean(variance.sqrt(), estimate.valid),
+        "calibration": calibration if math.isfinite(calibration) else None,
+        "unseen": float(statistics.unseen[0]),
+    }
+    return {"posterior": figures}
+
+
+def why_none(triangulated: int, usable: int, none: str) -> str:
+    """Why a frame has no anchors, from how many were left at each stage, and the source's reason where it has none."""
+    if not triangulated:
+        return none
+    return "none lies on a pixel with a depth" if not usable else "they contradict each other"
+
+
+def _mean(values: Tensor, valid: Tensor) -> float:
+    return float(values[valid].double().mean()) if bool(valid.any()) else float("nan")

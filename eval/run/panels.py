@@ -1,0 +1,280 @@
+"""Pictures in rows with words at the left, captions above and colour bars below: every sheet and strip is one grid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.eval.run import colours
+from ufmstar_torch.eval.run.colours import FAINT, INK, ColourScale
+
+# (left, top, width, height) in pixels of the map.
+Box = tuple[int, int, int, int]
+_MARK = "#00d5ff"  # in neither depth's nor sigma's colours
+# Inches.
+_GAP, _MARGIN, _CAPTION, _BAR, _BARS, _TITLE = 0.06, 0.08, 0.2, 0.1, 0.62, 0.34
+
+
+class Panel(NamedTuple):
+    """One picture [h, w, 3] uint8 with a caption above and a box outlined in it; None leaves a place with the words
+    ``absent``.
+    """
+
+    rgb: NDArray[np.uint8] | None
+    caption: str = ""
+    box: Box | None = None
+    absent: str = ""
+
+
+class GridRow(NamedTuple):
+    """Pictures side by side, with a bold title and small lines at their left."""
+
+    title: str
+    lines: Sequence[str]
+    panels: Sequence[Panel]
+
+    def captioned(self, captions: Sequence[str]) -> GridRow:
+        """The row with captions above its pictures."""
+        panels = [panel._replace(caption=caption) for panel, caption in zip(self.panels, captions, strict=True)]
+        return self._replace(panels=panels)
+
+
+class Bar(NamedTuple):
+    """A colour bar below ``span`` columns, named by its quantity and unit."""
+
+    label: str
+    scale: ColourScale
+    column: int
+    span: int = 1
+
+
+def draw_grid(
+    path: Path,
+    rows: Sequence[GridRow],
+    bars: Sequence[Bar],
+    *,
+    aspect: float,
+    title: str = "",
+    cell: float = 1.95,
+    words: float = 1.5,
+) -> None:
+    """Draw the rows below each other and write the picture (PNG), atomically.
+
+    ``aspect`` is height by width of a picture, ``cell`` and ``words`` the widths of a picture and of the words at the
+    left [in].
+    """
+    names = [break_name(row.title, max(8, int(12 * words))) for row in rows]
+    named = [0.16 * (name.count("\n") + 1) + 0.05 for name in names]
+    heads = [_CAPTION if any(panel.caption for panel in row.panels) else 0.0 for row in rows]
+    # Pictures of a driving car are flatter than the words beside them.
+    tall = [max(cell * aspect, above + 0.145 * len(row.lines)) for above, row in zip(named, rows, strict=True)]
+    step = cell + _GAP
+    width = _MARGIN + words + max(len(row.panels) for row in rows) * step - _GAP + _MARGIN
+    top = (_TITLE if title else _MARGIN) + len(rows) * _GAP + sum(tall) + sum(heads) + _BARS
+    figure = new_sheet(width, top, title)
+    top -= _TITLE if title else _MARGIN
+    for row, name, above, head, height in zip(rows, names, named, heads, tall, strict=True):
+        top -= head
+        say(figure, _MARGIN, top, name, size=8.5, weight="bold", color=INK, va="top", linespacing=1.15)
+        lines = "\n".join(row.lines)
+        say(figure, _MARGIN, top - above, lines, size=7.5, color=FAINT, va="top", linespacing=1.3)
+        for column, panel in enumerate(row.panels):
+            left = _MARGIN + words + column * step
+            _draw_panel(axes_at(figure, left, top - cell * aspect, cell, cell * aspect), panel)
+        top -= height + _GAP
+    bottom = _BARS - 0.14 - _BAR
+    for bar in bars:
+        left = _MARGIN + words + bar.column * step + 0.12
+        draw_bar(axes_at(figure, left, bottom, bar.span * step - _GAP - 0.24, _BAR), bar)
+    from matplotlib.patches import Rectangle
+
+    grey = (colours.INVALID_GREY / 255,) * 3
+    figure.add_artist(Rectangle((_MARGIN, bottom), 0.12, _BAR, color=grey, transform=figure.dpi_scale_trans))
+    say(figure, _MARGIN + 0.18, bottom + _BAR / 2, "no value, no truth", size=7.5, color=FAINT, va="center")
+    colours.save_png(figure, path)
+
+
+def new_sheet(width: float, height: float, title: str) -> Any:
+    """An empty figure with a title [in]."""
+    colours.require_matplotlib()
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=110, facecolor="white")
+    say(figure, _MARGIN, height - 0.2, title, size=11, weight="bold", color=INK, va="center")
+    return figure
+
+
+def say(figure: Any, x: float, y: float, words: str, **how: Any) -> None:
+    """Words at a place of a sheet [in]."""
+    figure.text(x, y, colours.plain(words), transform=figure.dpi_scale_trans, **how)
+
+
+def axes_at(figure: Any, left: float, bottom: float, width: float, height: float) -> Any:
+    """Axes at a place of a sheet [in]."""
+    wide, high = figure.get_size_inches()
+    return figure.add_axes((left / wide, bottom / high, width / wide, height / high))
+
+
+def break_name(name: str, letters: int) -> str:
+    """The name on as many lines as it needs, broken behind hyphens, underscores and blanks where it can be."""
+    lines, rest = [], name
+    while len(rest) > letters:
+        at = max(rest.rfind(mark, 1, letters) for mark in "-_ ")
+        at = letters - 1 if at < 1 else at
+        lines.append(rest[: at + 1].rstrip())
+        rest = rest[at + 1 :]
+    return "\n".join([*lines, rest])
+
+
+def _draw_panel(axes: Any, panel: Panel) -> None:
+    axes.set_axis_off()
+    if panel.caption:
+        axes.set_title(colours.plain(panel.caption), size=8, color=INK, pad=2.5)
+    if panel.rgb is None:
+        axes.text(0.5, 0.5, panel.absent, color=FAINT, size=8, ha="center", va="center", transform=axes.transAxes)
+        return
+    axes.imshow(panel.rgb, aspect="auto", interpolation="antialiased")
+    if panel.box is not None:
+        from matplotlib.patches import Rectangle
+
+        left, top, width, height = panel.box
+        corner = (left - 0.5, top - 0.5)
+        axes.add_patch(Rectangle(corner, width, height, fill=False, edgecolor=_MARK, linewidth=1.4))
+
+
+def draw_bar(axes: Any, bar: Bar) -> None:
+    """A horizontal colour bar with its label in the axes; an arrow at each end but 0, beyond which nothing lies."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+    from matplotlib.ticker import MaxNLocator
+
+    drawn = axes.figure.colorbar(
+        ScalarMappable(Normalize(bar.scale.low, bar.scale.high), bar.scale.colour_map),
+        cax=axes,
+        orientation="horizontal",
+        extend="max" if bar.scale.low == 0 else "both",
+        extendfrac=0.03,
+        ticks=MaxNLocator(5 * bar.span, steps=[1, 2, 5, 10]),
+    )
+    drawn.ax.tick_params(labelsize=7.5, length=2.5, pad=2, color=INK, labelcolor=INK)
+    drawn.outline.set_linewidth(0.5)
+    drawn.set_label(bar.label, size=7.5, color=INK, labelpad=1)
+
+
+# ---- the contact sheet: image | depth | sigma | error, one row per frame ----
+
+# The maps of a frame, in the order of their columns: the label, and the scale that several of them share.
+MAPS = {
+    "depth": ("depth", "depth"),
+    "posterior": ("posterior", "depth"),
+    "sigma": ("σ", "length"),
+    "anchored": ("√B", "length"),
+    "error": ("|error|", "length"),
+    "posterior_sigma": ("σ, posterior", "length"),
+    "posterior_error": ("|error|, posterior", "length"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FramePanel:
+    """One frame to be shown: its image [H, W, 3] uint8 RGB of any size, and its maps [h, w] [m], NaN where unknown.
+
+    ``maps`` has names of ``MAPS``: "depth" and "sigma" always, "error" with ground truth, "anchored" (the part of
+    sigma that is due to anchors) and those of the posterior of a run with them. ``note`` ("K = 31") stands beside the
+    name.
+
+    Raises:
+        ValueError: shapes or types disagree.
+    """
+
+    name: str
+    image: NDArray[np.uint8]
+    maps: Mapping[str, NDArray[Any]]
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        if self.image.ndim != 3 or self.image.shape[-1] != 3 or self.image.dtype != np.uint8:
+            raise ValueError(f"image must be uint8 [H, W, 3], got {self.image.dtype} {self.image.shape}")
+        for label, value in self.maps.items():
+            if value.shape != self.shape:
+                raise ValueError(f"{label} must have the depth's shape {self.shape}, got {value.shape}")
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(h, w) of the maps."""
+        return self.maps["depth"].shape
+
+
+class PanelScales(NamedTuple):
+    """The colour scales that all frames of a sheet or a video share: of depth, and of sigma and error together."""
+
+    depth: ColourScale
+    length: ColourScale
+
+
+class MapColumn(NamedTuple):
+    """One kind of map: its label, its scale, and its name in ``MAPS``."""
+
+    label: str
+    scale: ColourScale
+    field: str
+
+    def rgb(self, panel: FramePanel) -> NDArray[np.uint8] | None:
+        """[h, w, 3] the coloured map, None if the panel has none."""
+        return self.scale.rgb(panel.maps[self.field]) if self.field in panel.maps else None
+
+
+def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:
+    """The columns right of the image, of all maps that some panel has, on scales that fit all panels."""
+    scales = fit_scales(panels)._asdict()
+    shown = (name for name in MAPS if any(name in panel.maps for panel in panels))
+    return [MapColumn(MAPS[name][0], scales[MAPS[name][1]], name) for name in shown]
+
+
+def fit_scales(panels: Sequence[FramePanel]) -> PanelScales:
+    """Scales over all panels: depths between their 1st and 99th percentile; sigma and error share one, from 0.
+
+    That one ends at the larger of their 99th percentiles, so that a sigma as large as the error has its colour.
+    """
+    of = {name: [panel.maps[name] for panel in panels if name in panel.maps] for name in MAPS}
+    depth = colours.robust_range([*of["depth"], *of["posterior"]], from_zero=False)
+    lengths = (of[name] for name in ("sigma", "error", "posterior_sigma", "posterior_error") if of[name])
+    high = max(colours.robust_range(maps, from_zero=True)[1] for maps in lengths)
+    return PanelScales(ColourScale(*depth, colours.DEPTH_MAP), ColourScale(0.0, high, colours.ERROR_MAP))
+
+
+def contact_sheet(
+    panels: Sequence[FramePanel], path: str | Path, *, title: str = "", columns: Sequence[MapColumn] | None = None
+) -> None:
+    """Draw the frames below each other and write the picture (PNG), atomically; neighbouring ``columns`` (None: of all
+    maps) of one scale share a colour bar.
+
+    Raises:
+        ValueError: there is no panel.
+        ImportError: matplotlib is missing.
+    """
+    if not panels:
+        raise ValueError("panels must hold at least one frame")
+    colours.require_matplotlib()
+    columns = map_columns(panels) if columns is None else columns
+    absent = ["no ground truth" if column.field == "error" else "none" for column in columns]
+    rows = []
+    for p in panels:
+        maps = [Panel(column.rgb(p), absent=words) for column, words in zip(columns, absent, strict=True)]
+        rows.append(GridRow(p.name, p.note.split(", ") if p.note else [], [Panel(p.image), *maps]))
+    rows[0] = rows[0].captioned(["image", *(column.label for column in columns)])
+    bars: list[Bar] = []
+    position = 1
+    for scale, of_scale in groupby(columns, key=lambda column: column.scale):
+        labels = [column.label for column in of_scale]
+        words = f"{', '.join(labels) if len(labels) < 3 else 'σ and |error|'} [m]"
+        bars.append(Bar(words, scale, position, len(labels)))
+        position += len(labels)
+    height, width = panels[0].shape
+    draw_grid(Path(path), rows, bars, aspect=height / width, title=title, cell=2.4, words=1.2)

@@ -1,0 +1,147 @@
+"""What a run and the demo leave to look at: contact sheet, preview video, curves, and the mixture for viewers.
+
+A run's pictures are drawn from its finished frames on disk, so that their scales fit the whole run, and a run that was
+stopped and continued gets the same ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.eval.run.colours import INVALID_GREY, known_where
+from ufmstar_torch.eval.run.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
+from ufmstar_torch.eval.run.panels import FramePanel, MapColumn, contact_sheet, map_columns
+from ufmstar_torch.eval.run.video import preview_frame, write_video
+from ufmstar_torch.eval.run.writers import read_frame
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
+from ufmstar_torch.eval.sequences.intrinsics import pinhole
+from ufmstar_torch.ufmstar import UfMStar
+
+SHEET = "contact_sheet.png"
+PLY, ELLIPSOIDS, NPZ = "mixture.ply", "ellipsoids.ply", "mixture.npz"
+SHEET_ROWS, POSTERIOR_ROWS, SCALE_FRAMES = 6, 3, 12
+# Without timestamps; and the range in which a recording's own rate is kept.
+DEFAULT_FPS, FPS_RANGE = 10.0, (2.0, 30.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """The finished frames of a run in the folder ``out``: their sequence, their lines of frames.jsonl in order, and
+    whether there is a ground truth that the prediction can differ from.
+    """
+
+    out: Path
+    frames: FrameSequence
+    records: Sequence[Mapping[str, Any]]
+    with_error: bool
+
+    def panel(self, number: int) -> FramePanel:
+        """Finished frame ``number``, with square pixels, and the image cut to what the prediction shows."""
+        record = self.records[number]
+        stored = read_frame(self.out / "frames" / f"{record['name']}.npz")
+        K, size = pinhole(*record["intrinsics"]), (record["size"][0], record["size"][1])
+        K_square, size_square = square_pixels(K, size)
+        try:
+            frame: Frame | None = self.frames[record["index"]]
+        except FrameError:  # it can be read no more
+            frame = None
+        maps = {"depth": stored["depth"], "sigma": np.sqrt(stored["variance"])}
+        note = f"K = {record['components']}"
+        if "anchored" in stored:
+            note += f", {record['anchors']['used']} anchors"
+        if "posterior_depth" in stored:
+            maps["posterior"] = stored["posterior_depth"]
+            maps["posterior_sigma"] = np.sqrt(stored["posterior_variance"])
+        elif "anchored" in stored:
+            maps["anchored"] = np.sqrt(stored["anchored"])
+        truth = truth_at(frame, K, size) if self.with_error and frame is not None else None
+        if truth is not None:
+            pairs = {"error": "depth", "posterior_error": "posterior"}
+            maps |= {name: absolute_error(maps[of], truth) for name, of in pairs.items() if of in maps}
+        valid, *square = (resample_nearest(m, K, K_square, size_square) for m in (stored["valid"], *maps.values()))
+        shown = {name: known_where(valid, values) for name, values in zip(maps, square, strict=True)}
+        image = None if frame is None or frame.image is None else field_of_view(frame.image, frame.intrinsics, K, size)
+        if image is None:
+            image = np.full((*size_square, 3), INVALID_GREY, np.uint8)
+        return FramePanel(record["name"], image, shown, note)
+
+    def spread(self, count: int) -> list[int]:
+        """Numbers of at most ``count`` frames spread over the run, the first and the last included."""
+        return sorted(set(np.linspace(0, len(self.records) - 1, count).round().astype(int).tolist()))
+
+    def fps(self) -> float:
+        """Frames per second of the recording, for the video."""
+        times = [self.frames.entries[record["index"]].timestamp for record in self.records]
+        known = np.array([time for time in times if time is not None])
+        if len(known) < 2 or len(known) < len(times) or not np.median(np.diff(known)) > 0:
+            return DEFAULT_FPS
+        return float(np.clip(1 / np.median(np.diff(known)), *FPS_RANGE))
+
+
+def common_columns(finished: Finished) -> list[MapColumn]:
+    """The maps of sheet and video, on scales that fit frames spread over the whole run."""
+    return map_columns([finished.panel(number) for number in finished.spread(SCALE_FRAMES)])
+
+
+def draw_sheet(finished: Finished, columns: Sequence[MapColumn], title: str) -> None:
+    """Write contact_sheet.png: frames spread over the run, the last one included.
+
+    The first is not, unless it is the only one: it was compared with nothing, so its disagreement is 0.
+    """
+    wide = "posterior" in finished.records[-1]  # before and after
+    numbers = finished.spread((POSTERIOR_ROWS if wide else SHEET_ROWS) + 1)
+    panels = [finished.panel(number) for number in numbers[1:] or numbers]
+    contact_sheet(panels, finished.out / SHEET, title=title, columns=columns)
+
+
+def draw_video(finished: Finished, columns: Sequence[MapColumn]) -> Iterator[int]:
+    """Write preview.mp4 frame by frame; yields how many are done, so that the caller can report and stop."""
+    with write_video(finished.out / "preview.mp4", finished.fps()) as add:
+        for number in range(len(finished.records)):
+            add(preview_frame(finished.panel(number), columns))
+            yield number + 1
+
+
+def mixture_writers(ufm: UfMStar) -> dict[str, Callable[[Path], object]]:
+    """By file name, what writes the mixture in world coordinates: as splats, as ellipsoids, and exactly."""
+    mixture, first = ufm.mixture, ufm.T_world_first
+    writers: dict[str, Callable[..., object]] = {
+        PLY: write_mixture_ply,
+        ELLIPSOIDS: write_ellipsoids_ply,
+        NPZ: write_mixture_npz,
+    }
+    return {name: partial(write, mixture=mixture, T_world_first=first) for name, write in writers.items()}
+
+
+def square_pixels(K: NDArray, size: Size) -> tuple[NDArray, Size]:
+    """K [3, 3] and (h, w) of the same view with fx = fy, not smaller than it is.
+
+    Networks that take squares of a wide image predict maps that look squeezed.
+    """
+    f = max(K[0, 0], K[1, 1])
+    new = (round(size[0] * f / K[1, 1]), round(size[1] * f / K[0, 0]))
+    return resize_intrinsics(torch.from_numpy(K), size, new).numpy(), new
+
+
+def field_of_view(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: Size) -> NDArray[np.uint8]:
+    """The part of an image that a map with intrinsics K and size (h, w) shows."""
+    corners = np.array([[-0.5, -0.5, 1.0], [size[1] - 0.5, size[0] - 0.5, 1.0]])
+    (left, top), (right, bottom) = np.rint((corners @ (K_image @ np.linalg.inv(K)).T)[:, :2] + 0.5).astype(int)
+    height, width = image.shape[:2]
+    part = image[max(top, 0) : min(bottom, height), max(left, 0) : min(right, width)]
+    return part if part.size else image
+
+
+def absolute_error(depth: NDArray[Any], truth: NDArray[Any]) -> NDArray[np.float32]:
+    """[h, w] |depth - truth| [m], NaN where there is no truth (0)."""
+    return known_where(truth > 0, np.abs(depth - truth))

@@ -1,0 +1,120 @@
+"""What ``ufmstar run`` runs, and what its results depend on."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ufmstar_torch.anchors.landmarks import LandmarkSource
+from ufmstar_torch.anchors.tracker import LandmarkTracker
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
+from ufmstar_torch.eval.engine.estimators import Gaussians
+from ufmstar_torch.eval.engine.judge import UFM
+from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.rows import RowRunner
+from ufmstar_torch.eval.methods.setting import TRACKED, Setting
+from ufmstar_torch.eval.run.run_folder import Checkpoint
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.recalibrate import read_recalibration, split_name
+from ufmstar_torch.ufmstar import UfMStar
+
+# A run on maps saves UfM*'s tensors under their own names, and no turn: its files have done so since the first version.
+_TURN, _UFM = "image_index", "ufm."
+
+
+@dataclass(frozen=True, eq=False)
+class RunJob:
+    """What to run."""
+
+    sequence: FrameSequence  # the posed frames
+    indices: range  # which of them, in order
+    source: DepthSource  # of the depth
+    config: UfMStarConfig  # of UfM*
+    device: torch.device  # of UfM*
+    settings: Mapping[str, Any]  # everything the user chose, as plain values, for the summary
+    recalibration: str = ""  # FILE@DIGEST of a map of the variance; "" = none
+    every: bool = False  # all members predict on every image, instead of one in turn
+    video: bool = True  # whether to make preview.mp4
+    sheet: bool = True  # whether to make contact_sheet.png
+    # makes the source of the anchors, in its initial state; for ``config.anchors``.
+    landmarks: Callable[[], LandmarkSource] = LandmarkTracker
+
+    def row(self, checkpoint: Checkpoint) -> RowRunner:
+        """UfM* on the source, in the state of a checkpoint."""
+        mapped = read_recalibration(self.recalibration) if self.recalibration else None
+        row = RowRunner(
+            UFM,
+            self.source,
+            Gaussians(self.config, self.device, recalibration=mapped),
+            every=self.every,
+            anchors=AnchorSource(Setting(anchors=TRACKED), Tracks(self.landmarks()))
+            if self.config.anchors is not None
+            else None,
+            skips_faults=True,
+            device=self.device,
+        )
+        if checkpoint.module:
+            images = torch.tensor(checkpoint.position)
+            row.load_state(row_state(checkpoint.module, bare=not self.source.needs_image, images=images))
+        return row
+
+    def ufm(self, checkpoint: Checkpoint) -> UfMStar:
+        """UfM* in the state of a checkpoint. A frame in hand may have changed the running one already."""
+        estimator = self.row(checkpoint).estimator
+        assert isinstance(estimator, Gaussians)
+        return estimator.ufm
+
+    @property
+    def source_identity(self) -> dict[str, Any]:
+        """Plain values on which depth and anchors depend."""
+        return {**self.source.identity, **(self.landmarks().identity if self.config.anchors is not None else {})}
+
+    def identity(self) -> dict[str, Any]:
+        """Plain values on which the results depend: a run can only go on with the same ones."""
+        sequence, digest = self.sequence, hashlib.sha256()
+        for index in self.indices:
+            entry = sequence.entries[index]
+            digest.update(entry.name.encode() + entry.T_world_cam.tobytes())
+        return {
+            "sequence": {
+                "name": sequence.name,
+                "layout": sequence.layout,
+                "frames": len(self.indices),
+                "names_and_poses": digest.hexdigest(),
+                "intrinsics": sequence.intrinsics,
+                "depth_intrinsics": sequence.depth_intrinsics,
+                "first_frame": self._first_frame(),
+            },
+            "ufm": self.config.to_dict(),
+            "source": self.source_identity,
+            "device": self.device.type,
+            **({"recalibration": split_name(self.recalibration)[1]} if self.recalibration else {}),
+        }
+
+    def _first_frame(self) -> str | None:
+        """A digest of the first frame's pixels, which other data under the same names would not have."""
+        try:
+            frame = self.sequence[self.indices[0]]
+        except FrameError:
+            return None
+        maps = [array for array in (frame.image, frame.depth) if array is not None]
+        return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in maps)).hexdigest()
+
+
+def saved_state(state: Mapping[str, Tensor], *, bare: bool) -> dict[str, Tensor]:
+    """The state of a run's row as state.pt holds it; ``bare``: of a run on maps."""
+    return {k.removeprefix(_UFM): v for k, v in state.items() if k != _TURN} if bare else dict(state)
+
+
+def row_state(saved: Mapping[str, Tensor], *, bare: bool, images: Tensor) -> dict[str, Tensor]:
+    """The row's state from what :func:`saved_state` returned; ``images`` that a run on maps has seen."""
+    if not bare:
+        return dict(saved)
+    return {_TURN: images, **{k if k.startswith("tracker.") else _UFM + k: v for k, v in saved.items()}}

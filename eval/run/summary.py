@@ -1,0 +1,179 @@
+"""The data of a run's summary.json: results, where they come from, settings and versions."""
+
+from __future__ import annotations
+
+import platform
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from statistics import mean, median
+from typing import Any
+
+from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM, RunMetrics
+from ufmstar_torch.eval.run import machine
+from ufmstar_torch.eval.run.files import to_json
+from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
+from ufmstar_torch.eval.run.run_job import RunJob
+from ufmstar_torch.eval.sequences import FrameSequence
+from ufmstar_torch.mixture import GaussianMixture
+
+FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
+# [m] A sigma below it claims more than any depth network can measure.
+NEAR_ZERO = 1e-3
+STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "save")
+_PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")
+
+
+# How a run ended, or not: the state, and why.
+GOING_ON = INTERRUPTED, "no orderly end: the program was killed, or is still running"
+
+
+def write_summary(
+    job: RunJob, folder: RunFolder, state: str, reason: str, outputs: Mapping[str, str | None] | None = None
+) -> dict[str, Any]:
+    """Write summary.json from what is on disk, so that a continued run has the same, and return its content as plain
+    values. ``state`` and ``reason``: how the run ended; ``outputs`` holds for each file None if it exists, or why it
+    does not."""
+    checkpoint, records = folder.checkpoint, folder.records
+    done = [record for record in records if record["state"] == "done"]
+    figures = RunMetrics(UFM, checkpoint.metrics).figures()
+    summary = {
+        "program": RUN.program,
+        "state": state,
+        "reason": reason,
+        "sequence": _sequence(job.sequence),
+        "frames": _frames(records, len(job.indices)),
+        "source": job.source_identity,
+        "runtime": job.source.runtime,
+        "prediction": {key: done[-1][key] for key in ("size", "intrinsics")} if done else None,
+        "metrics": figures.get(UFM),
+        "metrics_reason": None if UFM in figures else "no ground truth",
+        "network_alone": figures.get(ALONE),
+        "network_alone_reason": None if ALONE in figures else _why_not_alone(done, UFM in figures),
+        **_posterior(done, figures.get(POSTERIOR)),
+        "uncertainty": _uncertainty(done),
+        "anchors": _anchors(done),
+        "mixture": _mixture(done, job.ufm(checkpoint).mixture),
+        "rotation_deviation_max": max((record["rotation_deviation"] for record in done), default=None),
+        "time": _time(done, checkpoint.sessions),
+        "outputs": outputs or {},
+        "settings": job.settings,
+        "versions": versions(),
+    }
+    plain: dict[str, Any] = to_json(summary)
+    folder.write_summary(plain)
+    return plain
+
+
+def _posterior(done: Sequence[Mapping[str, Any]], figures: Mapping[str, float] | None) -> dict[str, Any]:
+    """Of a run with a posterior: its metrics, and what held-out anchors said in the end; {} of another run."""
+    records = [record["posterior"] for record in done if "posterior" in record]
+    if not records:
+        return {}
+    sigma = mean(record["mean_sigma"] for record in records)
+    return {"posterior": {**records[-1], "mean_sigma": sigma, "metrics": figures}}
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of the packages that a run depends on (None = not installed) and of Python, and the platform."""
+    return {**machine.versions({name: name for name in _PACKAGES}), "platform": platform.platform()}
+
+
+def _sequence(sequence: FrameSequence) -> dict[str, Any]:
+    return {
+        "name": sequence.name,
+        "layout": sequence.layout,
+        "frames": len(sequence),
+        "image_size": sequence.image_size,
+        "intrinsics": sequence.intrinsics,
+        "depth_intrinsics": sequence.depth_intrinsics,
+        "without_depth": len(sequence.without_depth),
+        "left_out": dict(Counter(frame.reason for frame in sequence.skipped)),
+    }
+
+
+def _frames(records: Sequence[Mapping[str, Any]], selected: int) -> dict[str, Any]:
+    skipped = [record for record in records if record["state"] == "skipped"]
+    return {
+        "selected": selected,
+        "done": len(records) - len(skipped),
+        "skipped": dict(Counter(record["reason"] for record in skipped)),
+        "skipped_frames": [{"name": record["name"], "reason": record["reason"]} for record in skipped],
+        "with_ground_truth": sum(record.get("ground_truth", False) for record in records),
+    }
+
+
+def _why_not_alone(done: Sequence[Mapping[str, Any]], judged: bool) -> str:
+    if any(record["mean_network_sigma"] is not None for record in done):
+        return "no ground truth" if not judged else "no variance where there is ground truth"
+    return "the depth comes without a variance of its own"
+
+
+def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over all valid pixels of all frames. With perfect depth, they are the method's floor."""
+    pixels = sum(record["valid_pixels"] for record in done)
+    saturated = {kind: sum(record["saturated"][kind] for record in done) for kind in ("depth", "sigma")}
+    return {
+        "mean_disagreement": _pixel_mean(done, "mean_disagreement"),
+        "mean_sigma": _pixel_mean(done, "mean_sigma"),
+        "mean_network_sigma": _pixel_mean(done, "mean_network_sigma"),
+        "units": "disagreement m^2, sigma m",
+        # Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component, where the prior is 0.
+        "near_zero_share": sum(record["near_zero"] for record in done) / pixels if pixels else None,
+        "valid_pixels": pixels,
+        "saturated_png_pixels": saturated,
+    }
+
+
+def _anchors(done: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """What anchors did over all frames, the first ones included; None of a run without."""
+    records = [record["anchors"] for record in done if "anchors" in record]
+    if not records:
+        return None
+    first = next((number for number, record in enumerate(records) if record["used"]), None)
+    means = {f"{key}_per_frame": mean(r[key] for r in records) for key in ("tracked", "found", "usable", "used")}
+    return {
+        **means,
+        "frames_before_the_first": len(records) if first is None else first,
+        "frames_without": dict(Counter(record["without"] for record in records if record["without"] is not None)),
+        "mean_anchored": _pixel_mean(done, "mean_anchored"),
+        "mean_bias": _pixel_mean(done, "mean_bias"),
+        "units": "mean_anchored m^2 (B), mean_bias 1 (r: true depth over predicted, less 1)",
+    }
+
+
+def _pixel_mean(done: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    """Mean over pixels; a frame without a valid pixel has no mean of its own."""
+    known = [(record[key], record["valid_pixels"]) for record in done if record[key] is not None]
+    pixels = sum(count for _, count in known)
+    return sum(mean * count for mean, count in known) / pixels if pixels else None
+
+
+def _mixture(done: Sequence[Mapping[str, Any]], mixture: GaussianMixture) -> dict[str, Any]:
+    last = done[-1]["components"] if done else 0
+    counts = {key: sum(record[key] for record in done) for key in ("segments", "matched", "pairs", "new", "dropped")}
+    size = mixture.bytes_per_component()
+    return {
+        "components": last,
+        "components_over_time": [record["components"] for record in done],
+        **counts,
+        "bytes_in_use": last * size,
+        "bytes_allocated": mixture.capacity * size,
+    }
+
+
+def _time(done: Sequence[Mapping[str, Any]], sessions: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """Medians by stage; "prepare" is preprocessing, or reading the predicted map, and "frame" the time from a frame to
+    the next, which is shorter than the sum of the stages: frames are read ahead and written behind in threads.
+
+    The rate is that of the median frame: the first one also loads libraries and compiled kernels.
+    """
+    seconds = sum(session["seconds"] for session in sessions)
+    stages = {stage: [record["ms"][stage] for record in done if stage in record["ms"]] for stage in STAGES}
+    total = median(record["ms"]["cycle"] for record in done) if done else None
+    return {
+        "median_ms": {stage: median(times) if times else None for stage, times in stages.items()} | {"frame": total},
+        "frames_per_second": 1000 / total if total else None,
+        "frames_per_second_with_start": len(done) / seconds if seconds else None,
+        "wall_seconds": seconds,
+        "sessions": list(sessions),
+    }

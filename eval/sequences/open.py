@@ -1,0 +1,83 @@
+"""``open_sequence``: recordings on disk in any layout, and rendered tours, ``tour:SEED?style=mixed&frames=150``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from ufmstar_torch.eval.sequences.frame import FrameSequence
+from ufmstar_torch.eval.sequences.layout import READERS, layout_of
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
+
+# By prefix of the path, the module and function that render such a sequence; imported on use, since that package
+# imports this one.
+_RENDERED = {"tour:": ("ufmstar_torch.eval.tour.sequence", "open_tour")}
+# Options that a layout has no use for, beside those of KITTI-360 alone.
+_REFUSED = {
+    "tum": "images depth depth_intrinsics fps T_color_depth",
+    "7scenes": "images depth",
+    "scannet": "images depth T_color_depth",
+    "sens": "images depth T_color_depth",
+    "tartanair": "images depth depth_intrinsics T_color_depth",
+    "kitti360": "images T_color_depth",
+    "nyu": "trajectory images depth depth_intrinsics fps T_color_depth",
+    "generic": "T_color_depth",
+}
+
+
+def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, **options: Any) -> FrameSequence:
+    """Opens a sequence of posed images; nothing but headers and text files is read before it is indexed.
+
+    Args:
+        path: the sequence's folder, a video file, or ``tour:SEED`` with the options of a rendered tour in its name.
+        layout: ``auto``, ``tum``, ``7scenes``, ``scannet``, ``sens``, ``tartanair``, ``kitti360``, ``nyu`` or
+            ``generic``.
+        poses: how they are written: ``camera-to-world`` (x right, y down, z forward), ``world-to-camera``, ``ned``
+            (camera-to-world, x forward, y right, z down) or ``opengl`` (x right, y up, z backward); what is
+            customary for a layout (TartanAir's NED) is known.
+        **options: by the names of :class:`~ufmstar_torch.eval.sequences.options.Options`, which explains them.
+
+    Returns:
+        The frames with a usable pose; ``skipped`` has the others.
+
+    Raises:
+        FileNotFoundError: ``path`` does not exist.
+        TypeError: an unknown option.
+        ValueError: unknown or ambiguous layout (with what was looked for), an option out of range or of no
+            use for the layout, malformed files (named by file and line), or no usable frame.
+    """
+    for prefix, (module, name) in _RENDERED.items():
+        if str(path).startswith(prefix):
+            if layout != "auto":
+                raise ValueError(f"layout must be auto for {path!r}, got {layout!r}")
+            if options:
+                raise ValueError(f"{path!r} takes no {', '.join(options)}: a tour's options stand in its name")
+            return convert_poses(getattr(import_module(module), name)(str(path)), poses)
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"path: no such file or folder: {path}")
+    chosen = Options(**options)
+    if poses not in CONVENTIONS:
+        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
+    layout = layout_of(layout, path, explicit=chosen.images is not None or chosen.trajectory is not None)
+    chosen.reject(layout, *_REFUSED[layout].split(), *(("drive", "scans") if layout != "kitti360" else ()))
+    if chosen.trajectory is None and layout != "generic":
+        chosen.reject(layout, "fps")
+    sequence = READERS[layout].read(path, chosen)
+    return convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), poses)
+
+
+def convert_poses(sequence: FrameSequence, convention: str) -> FrameSequence:
+    """The sequence with its poses, which were written so, as camera-to-world ones with our axes. Raises ValueError: an
+    unknown convention, or a sequence without poses."""
+    if convention not in CONVENTIONS:
+        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {convention!r}")
+    if convention == OURS:
+        return sequence
+    if not sequence.posed:
+        raise ValueError(f"sequence {sequence.name!r} has no poses to convert from {convention}")
+    convert = CONVENTIONS[convention].convert
+    return replace(sequence, entries=tuple(replace(e, T_world_cam=convert(e.T_world_cam)) for e in sequence.entries))

@@ -1,0 +1,163 @@
+"""Tours as sequences, by name: ``tour:SEED?style=mixed&frames=150&size=160x224``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, make_sequence, parse_size
+from ufmstar_torch.eval.tour.box_room import intrinsics
+from ufmstar_torch.eval.tour.path import tour_path
+from ufmstar_torch.eval.tour.style import STYLES, TourStyle
+from ufmstar_torch.eval.tour.tour import Tour, make_tour
+from ufmstar_torch.eval.tour.view import TourView, render
+
+PREFIX = "tour:"
+_FORM = "tour:SEED or tour:SEED?option=value&..., with the options style, frames, size, fov, path and sensor"
+FPS = 15.0  # of the timestamps
+_KEPT = 4  # rendered frames kept, so that a frame's image and depth come from one rendering
+
+
+def open_tour(name: str) -> FrameSequence:
+    """The tour of a name.
+
+    Options: ``style`` (home, hall, mixed), ``frames``, ``size`` (HxW), ``fov`` (degrees), ``path`` (seed of the way)
+    and ``sensor`` (1, or 0 for a perfect camera).
+
+    Raises:
+        ValueError: another form, an unknown option, or a value that it does not take.
+    """
+    seed, _, query = name.removeprefix(PREFIX).partition("?")
+    if not name.startswith(PREFIX) or not seed.isdecimal():
+        raise ValueError(f"a tour is named {_FORM}; got {name!r}")
+    options: dict[str, Any] = {}
+    for word in query.split("&") if query else []:
+        key, _, value = word.partition("=")
+        if key not in _OPTIONS:
+            raise ValueError(f"{name!r}: unknown option {key!r}; a tour is named {_FORM}")
+        argument, parse, expected = _OPTIONS[key]
+        if argument in options:
+            raise ValueError(f"{name!r}: the option {key} is given twice")
+        try:
+            options[argument] = parse(value)
+        except (ValueError, KeyError) as error:
+            raise ValueError(f"{name!r}: {key} must be {expected}, got {value!r}") from error
+    return tour_sequence(int(seed), **options)
+
+
+def tour_sequence(
+    seed: int,
+    *,
+    frames: int = 150,
+    size: Size = (160, 224),
+    style: str | TourStyle = "home",
+    fov: float = 70.0,
+    path_seed: int | None = None,
+    sensor: bool = True,
+    device: torch.device | str = "cpu",
+) -> FrameSequence:
+    """A tour as a sequence; frames are rendered when they are asked for.
+
+    Args:
+        seed: of the rooms, see :func:`make_tour`.
+        frames: at least 1.
+        size: (H, W) of images and depth maps.
+        style: ``home``, ``hall``, ``mixed``, or one's own.
+        fov: horizontal field of view [degrees], 20 to 120.
+        path_seed: see :func:`tour_path`.
+        sensor: whether images have a sensor's exposure, vignetting and noise.
+        device: where it is rendered.
+
+    Raises:
+        ValueError: a value is out of its range.
+    """
+    if len(size) != 2 or min(size) < 8:
+        raise ValueError(f"size must be (H, W) of at least 8 px each, got {size}")
+    if not 20 <= fov <= 120:
+        raise ValueError(f"fov must be 20 to 120 degrees, got {fov}")
+    tour = make_tour(seed, style)
+    poses = tour_path(tour, frames, path_seed)
+    K = intrinsics(size[0], size[1], fov)
+    renderer = _Renderer(tour.to(device), poses, K, size, sensor)
+    entries = [
+        Entry(f"{i:06d}", poses[i].numpy(), partial(renderer.image, i), partial(renderer.depth, i), timestamp=i / FPS)
+        for i in range(frames)
+    ]
+    named = style if isinstance(style, str) else "own"
+    return make_sequence(f"tour-{seed}-{named}", "tour", entries, K, image_size=size, depth_size=size)
+
+
+class _Renderer:
+    """Renders the frames of one path and keeps the last few."""
+
+    def __init__(self, tour: Tour, poses: torch.Tensor, K: np.ndarray, size: Size, sensor: bool) -> None:
+        self._tour, self._poses, self._K, self._size, self._sensor = tour, poses, torch.from_numpy(K), size, sensor
+        self._kept: dict[int, TourView] = {}
+
+    def image(self, index: int) -> np.ndarray:
+        """[H, W, 3] uint8 RGB."""
+        return self._view(index).image.cpu().numpy()
+
+    def depth(self, index: int) -> np.ndarray:
+        """[H, W] float32 [m]."""
+        return self._view(index).depth.float().cpu().numpy()
+
+    def _view(self, index: int) -> TourView:
+        if index not in self._kept:
+            seed = self._tour.seed * 1_000_003 + index if self._sensor else None
+            self._kept[index] = render(self._tour, self._poses[index], self._K, *self._size, frame_seed=seed)
+            if len(self._kept) > _KEPT:
+                del self._kept[next(iter(self._kept))]
+        return self._kept[index]
+
+
+def export_tour(sequence: FrameSequence, folder: str | Path) -> Path:
+    """Writes a sequence into the generic layout: images/, depth/ (float32 npy [m]), poses.txt and K.txt.
+
+    Args:
+        sequence: from :func:`tour_sequence`.
+        folder: new or empty.
+
+    Raises:
+        FileExistsError: the folder holds something.
+        ValueError: a frame has no image or no depth.
+    """
+    from PIL import Image
+
+    folder = Path(folder)
+    if folder.exists() and any(folder.iterdir()):
+        raise FileExistsError(f"folder must be new or empty: {folder}")
+    for name in ("images", "depth"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    rows = []
+    for frame in sequence:
+        if frame.image is None or frame.depth is None:
+            raise ValueError(f"sequence must have an image and a depth map for every frame, {frame.name} has not")
+        Image.fromarray(frame.image).save(folder / "images" / f"{frame.name}.png")
+        np.save(folder / "depth" / f"{frame.name}.npy", frame.depth)
+        rows.append(frame.T_world_cam[:3].flatten())
+    np.savetxt(folder / "poses.txt", np.array(rows))
+    np.savetxt(folder / "K.txt", sequence.intrinsics)
+    return folder
+
+
+def _whole(text: str, least: int = 0) -> int:
+    if not text.isdecimal() or int(text) < least:
+        raise ValueError(text)
+    return int(text)
+
+
+# By option: the argument of ``tour_sequence``, what reads it (ValueError or KeyError where it cannot), and its form.
+_OPTIONS: dict[str, tuple[str, Callable[[str], Any], str]] = {
+    "style": ("style", {style: style for style in STYLES}.__getitem__, f"one of {', '.join(STYLES)}"),
+    "frames": ("frames", partial(_whole, least=1), "a number of at least 1"),
+    "size": ("size", parse_size, "HxW in pixels, 160x224 say"),
+    "fov": ("fov", float, "a number of degrees, 20 to 120"),
+    "path": ("path_seed", _whole, "a number of at least 0"),
+    "sensor": ("sensor", {"0": False, "1": True}.__getitem__, "0 or 1"),
+}
