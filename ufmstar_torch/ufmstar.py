@@ -429,7 +429,7 @@ class UfMStar(StatefulModule):
         if self.recalibration is not None:
             claimed = self.recalibration(claimed)
         update = select_posterior(self.config.backend, frame.depth.device.type)
-        learnt, posterior = update(state.posterior, frame, anchors, claimed)
+        learnt, posterior = update(state.posterior, frame, anchors, claimed, self.config.posterior)
         posterior = replace(posterior, variance=posterior.variance.clamp_min(self.config.variance_floor))
         statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
         return replace(state, posterior=learnt), replace(out, statistics=statistics), posterior
