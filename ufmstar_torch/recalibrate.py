@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +18,6 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.stateful import flat
 
 SCALAR, ISOTONIC = "scalar", "isotonic"
-_SHOWN = 12  # digits of a digest
 # Settings of UfM* that do not change what V means.
 _HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
 
@@ -38,9 +36,8 @@ class Recalibration(Checked):
         kind: "isotonic", or "scalar" with a single knot.
         row: name of the method that it was fitted to, as "UfM*-Anchored-DepthOnly".
         ufm: settings of UfM* that it was fitted to (``UfMStarConfig.to_dict``); {} = unknown.
-        weights: SHA-256 of the network's files, in hex; () = unknown.
-        sequences: names of the sequences that it was fitted to.
-        digests: of these sequences: the map must not be judged on them.
+        network: names of the files of its network's weights, separated by commas; "" = unknown.
+        sequences: names of the sequences that it was fitted to: it must not be judged on them.
 
     Raises:
         ValueError: knots that are not such numbers.
@@ -51,9 +48,8 @@ class Recalibration(Checked):
     kind: str = choice(ISOTONIC, SCALAR)
     row: str = ""
     ufm: Mapping[str, Any] = field(default_factory=dict)
-    weights: tuple[str, ...] = ()
+    network: str = ""
     sequences: tuple[str, ...] = ()
-    digests: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,12 +82,12 @@ class Recalibration(Checked):
         beyond = (position - v[-1]).clamp_min(0)
         return torch.where(variance.isnan(), variance, (inside + beyond).exp().to(variance.dtype))
 
-    def require(self, config: UfMStarConfig, weights: Iterable[str] | None = None) -> None:
+    def require(self, config: UfMStarConfig, network: str = "") -> None:
         """Check that V means what it meant when the map was fitted.
 
         Args:
             config: of the UfM* whose variance is to be mapped.
-            weights: SHA-256 of the network's files; None = unknown.
+            network: names of the files of the network's weights, separated by commas; "" = unknown.
 
         Raises:
             ValueError: the map was fitted under other settings of UfM*, or to another network.
@@ -104,8 +100,8 @@ class Recalibration(Checked):
         ]
         if changed:
             raise ValueError(f"the recalibration was fitted to UfM* with {', '.join(changed)}")
-        if weights is not None and self.weights and set(weights) != set(self.weights):
-            raise ValueError("the recalibration was fitted to a network with other weights")
+        if network and self.network and network != self.network:
+            raise ValueError(f"the recalibration was fitted to the network {self.network}, not {network}")
 
     def save(self, path: str | Path) -> None:
         """Write it as JSON, which :meth:`from_json` reads."""
@@ -115,40 +111,6 @@ class Recalibration(Checked):
         """At least two knots: a single one is doubled with the same ratio above."""
         v, r = self.variance, self.recalibrated
         return (v, r) if len(v) > 1 else ((v[0], 2 * v[0]), (r[0], 2 * r[0]))
-
-
-def read_recalibration(name: str) -> Recalibration:
-    """From FILE, or from FILE@DIGEST, which refuses a file that has changed since it was named.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no recalibration, or another one than was named.
-    """
-    file, digest = split_name(name)
-    if digest and not file_digest(file).startswith(digest):
-        raise ValueError(f"{file} has changed since it was chosen for this evaluation: use another output folder")
-    return Recalibration.from_json(file)
-
-
-def split_name(name: str) -> tuple[str, str]:
-    """(FILE, DIGEST) of FILE@DIGEST; the digest is "" without one."""
-    file, mark, digest = name.rpartition("@")
-    named = mark and len(digest) == _SHOWN and all(c in "0123456789abcdef" for c in digest)
-    return (file, digest) if named else (name, "")
-
-
-def named(file: str | Path) -> str:
-    """FILE@DIGEST.
-
-    Raises:
-        FileNotFoundError: no such file.
-    """
-    return f"{file}@{file_digest(file)[:_SHOWN]}"
-
-
-def file_digest(file: str | Path) -> str:
-    """Hex digest of a file's content."""
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest()
 
 
 def beside(weights: str | Path) -> Path:

@@ -25,10 +25,10 @@ from ufmstar_torch.eval.bench.timing import pinned_threads
 from ufmstar_torch.eval.engine.clock import paired_ratio, spread, synchronize
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.results.work import EvalJob
 from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.run.machine import available_cores, device_of, hardware, load_average, versions
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.suite.job import EvalJob
 
 EFFICIENCY = "efficiency.json"
 NETWORK = "network_uncertainty"

@@ -1,4 +1,4 @@
-"""What ``ufmstar run`` runs, and what its results depend on."""
+"""A job of ``ufmstar run``, and its identity: the values on which the results depend."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.setting import TRACKED, Setting
 from ufmstar_torch.eval.run.run_folder import Checkpoint
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
-from ufmstar_torch.recalibrate import read_recalibration, split_name
+from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
 
 
@@ -35,7 +35,7 @@ class RunJob:
     config: UfMStarConfig  # of UfM*
     device: torch.device  # of UfM*
     settings: Mapping[str, Any]  # everything the user chose, as plain values, for the summary
-    recalibration: str = ""  # FILE@DIGEST of a map of the variance; "" = none
+    recalibration: Recalibration | None = None  # of the variance
     every: bool = False  # all members predict on every image, instead of one in turn
     video: bool = True  # whether to make preview.mp4
     sheet: bool = True  # whether to make contact_sheet.png
@@ -44,11 +44,10 @@ class RunJob:
 
     def row(self, checkpoint: Checkpoint) -> RowRunner:
         """UfM* on the source, in the state of a checkpoint."""
-        mapped = read_recalibration(self.recalibration) if self.recalibration else None
         row = RowRunner(
             UFM,
             self.source,
-            Gaussians(self.config, self.device, recalibration=mapped),
+            Gaussians(self.config, self.device, recalibration=self.recalibration),
             every=self.every,
             anchors=AnchorSource(Setting(anchors=TRACKED), Tracks(self.landmarks()))
             if self.config.anchors is not None
@@ -72,7 +71,7 @@ class RunJob:
         return {**self.source.identity, **(self.landmarks().identity if self.config.anchors is not None else {})}
 
     def identity(self) -> dict[str, Any]:
-        """Plain values on which the results depend: a run can only go on with the same ones."""
+        """Plain values on which the results depend. A run is only continued with the same ones."""
         sequence, digest = self.sequence, hashlib.sha256()
         for index in self.indices:
             entry = sequence.entries[index]
@@ -90,7 +89,7 @@ class RunJob:
             "ufm": self.config.to_dict(),
             "source": self.source_identity,
             "device": self.device.type,
-            **({"recalibration": split_name(self.recalibration)[1]} if self.recalibration else {}),
+            **({"recalibration": self.recalibration.to_dict()} if self.recalibration else {}),
         }
 
     def _first_frame(self) -> str | None:

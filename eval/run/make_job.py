@@ -20,7 +20,7 @@ from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.recalibrate import beside, named, read_recalibration
+from ufmstar_torch.recalibrate import Recalibration, beside
 
 _OWN_DEPTH = ("self", "ground-truth")
 
@@ -60,8 +60,8 @@ def make_job(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameS
     )
 
 
-def _recalibration(options: Mapping[str, Any], config: UfMStarConfig, source: DepthSource) -> str:
-    """FILE@DIGEST of the map that is named or lies beside the weights; "" = none.
+def _recalibration(options: Mapping[str, Any], config: UfMStarConfig, source: DepthSource) -> Recalibration | None:
+    """The map that is named or lies beside the weights; None = none.
 
     Raises:
         FileNotFoundError: the named file does not exist.
@@ -69,14 +69,14 @@ def _recalibration(options: Mapping[str, Any], config: UfMStarConfig, source: De
     """
     name, weights = options["recalibration"], options["weights"]
     if name == "none" or (name is None and not (weights and beside(weights[0]).is_file())):
-        return ""
+        return None
     file = beside(weights[0]) if name is None else Path(name)
     try:
-        files = source.identity.get("weights", ())
-        read_recalibration(str(file)).require(config, [one["sha256"] for one in files])
+        recalibration = Recalibration.from_json(file)
+        recalibration.require(config, ", ".join(one["name"] for one in source.identity.get("weights", ())))
     except ValueError as error:
         raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
-    return named(file)
+    return recalibration
 
 
 def _landmarks(value: str | bool, sequence: FrameSequence) -> Callable[[], LandmarkSource]:
