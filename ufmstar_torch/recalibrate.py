@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ufmstar_torch.checked import Checked, choice
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.extension import Extension
 from ufmstar_torch.stateful import flat
 
 SCALAR, ISOTONIC = "scalar", "isotonic"
@@ -25,7 +26,7 @@ _HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
 
 
 @dataclass(frozen=True)
-class Recalibration(Checked):
+class Recalibration(Checked, Extension):
     """V -> V', the same at every pixel.
 
     Between two knots log V' is linear in log V. Above the last knot V' / V is that of the last knot. Below the first
@@ -85,6 +86,10 @@ class Recalibration(Checked):
         inside = r[upper - 1] + share * (r[upper] - r[upper - 1])
         beyond = (position - v[-1]).clamp_min(0)
         return torch.where(variance.isnan(), variance, (inside + beyond).exp().to(variance.dtype))
+
+    def map_variance(self, variance: Tensor) -> Tensor:
+        """V' of V."""
+        return self(variance)
 
     def require(self, config: UfMStarConfig, weights: Iterable[str] | None = None) -> None:
         """Check that V means what it meant when the map was fitted.

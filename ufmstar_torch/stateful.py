@@ -41,9 +41,9 @@ class StatefulModule(nn.Module):
         config: of the module.
     """
 
-    STATE: ClassVar[tuple[str, ...]]
+    STATE: tuple[str, ...]
     CONFIG: ClassVar[type[Config]]
-    ALWAYS_FLOAT64: ClassVar[tuple[str, ...]] = ("T_world_first",)
+    ALWAYS_FLOAT64: tuple[str, ...] = ("T_world_first",)
     config: Config
 
     if TYPE_CHECKING:

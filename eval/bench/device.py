@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.capture import Captured
 from ufmstar_torch.eval.bench.frames import PosedDepth, RenderedRoom
 from ufmstar_torch.eval.bench.settings import BenchSettings
 from ufmstar_torch.output import UfMStarOutput
@@ -80,7 +81,7 @@ def _measure(given: list[PosedDepth], frames: int, bandwidth: float) -> dict[str
         out = ufm(*frame)
     launches = _launches(lambda: ufm(*next(turn)))
     step = _time(lambda: ufm(*next(turn)), frames)
-    captured = ufm.capture(*given[0])
+    captured = Captured(ufm, *given[0])
     graph = _time(lambda: captured(*next(turn)), frames)
     components = sum(v.nbytes for v in ufm.mixture.tensors().values())
     return {

@@ -7,7 +7,7 @@ found none, before anything else: the next frame matches what it would have matc
 only the map of the frame before was regressed without it. Growth starts before the last slot is taken, so that this is
 rare.
 
-What the paper's step does not have (anchors, a subset of pixels, ``config.disagreement == "overlap"``,
+What the paper's step does not have (columns of extensions, a subset of pixels, ``config.disagreement == "overlap"``,
 ``config.overlap_weighted``, the neighbourhood) runs as ``step.step`` with the GPU's kernels. It grows one frame ahead
 instead: to slots for all that a frame can segment, so that it reads nothing but the count of the frame before.
 """
@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.hook import AnchorInput
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.extension import NONE, FrameExtensions
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.triton import append as ends
 from ufmstar_torch.kernels.triton.append import append, cameras
@@ -109,7 +109,7 @@ class DeviceStep:
         *,
         pixels: Tensor | None = None,
         smooth: bool = True,
-        anchors: AnchorInput | None = None,
+        extensions: FrameExtensions = NONE,
         observer: StepObserver | None = None,
     ) -> tuple[UfMStarState, StepOutput]:
         plain = config.disagreement == "w2" and config.regression == "exact"
@@ -123,7 +123,7 @@ class DeviceStep:
             state = self._with_room(state, config, ahead=most_kept(SegmentInput.of_frame(frame, config)))
             fixed = replace(config, max_components=state.mixture.capacity)
             updated, out = step(
-                state, frame, fixed, pixels=pixels, smooth=smooth, anchors=anchors, observer=observer,
+                state, frame, fixed, pixels=pixels, smooth=smooth, extensions=extensions, observer=observer,
                 kernels=self._kernels,
             )  # fmt: skip
             waiting = None if _full(state.mixture.capacity, config) else Waiting.after(out.statistics.components)
@@ -134,7 +134,7 @@ class DeviceStep:
             dropped = out.statistics.dropped + self._lost
             out = replace(out, statistics=replace(out.statistics, dropped=dropped))
         self._waiting, self._of, self._lost = waiting, updated.mean, None
-        return updated, out
+        return self.settled(updated, config) if extensions.changes_mixture else updated, out
 
     def settled(self, state: UfMStarState, config: UfMStarConfig) -> UfMStarState:
         """The state with everything appended that was waiting; waits for the device."""
@@ -212,8 +212,6 @@ def device_step(
         unmeasured=counts[ends.UNMEASURED],
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
-        anchors=torch.zeros_like(frame.fault),
-        anchors_used=torch.zeros_like(frame.fault),
     )
     updated = replace(
         state,
@@ -224,7 +222,7 @@ def device_step(
         skipped=here.skipped,
         smoothed=result.memory,
     )
-    out = StepOutput(result.disagreement, result.features, None, result.measured, read_labels, current, statistics)
+    out = StepOutput(result.disagreement, result.features, result.measured, read_labels, current, statistics)
     return updated, out, waiting
 
 
