@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from ufmstar_torch import UncertainDepth
-from ufmstar_torch.eval.commands.run import job_from, run
-from ufmstar_torch.eval.commands.run_command import read
+from ufmstar_torch.eval.commands.run import job_from, read
 from ufmstar_torch.eval.engine.progress import Progress
-from ufmstar_torch.eval.run.run_job import RunJob
+from ufmstar_torch.eval.run.job import RunJob
+from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models import Preprocess
 

@@ -2,12 +2,12 @@
 
 Every round streams the walk through the network(s) and UfM*, averages the variance of each image over 1,000 of its
 pixels (section "Compute- and memory efficiency"), picks the most uncertain images under a budget, takes their ground
-truth as labels and fine-tunes. Random picks, picks by the network's own variance and picks by the true error do
-the same, from the same weights and with as many steps; views of the same rooms from another walk judge them all.
+truth as labels and fine-tunes. Random picks, picks by the network's own variance and picks by the true error do the
+same, from the same weights and with as many steps; views of the same rooms from another walk judge them all.
 
-    python examples/active_learning.py --out out/active_learning
+    python examples/active_learning.py --out results.json
 
-Read `run_strategy` first. What came out of it: docs/results/active_learning.md.
+`ufmstar_torch.train` trains networks; `examples/pool_to_csv.py` scores your own images.
 """
 
 from __future__ import annotations
@@ -15,71 +15,84 @@ from __future__ import annotations
 import argparse
 import copy
 import math
-import time
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from statistics import fmean, stdev
 from typing import Any
 
 import numpy as np
 import torch
-from active_learning_data import Environment, View, open_environment
-from active_learning_measure import judge, measure_cost, predict
-from active_learning_report import draw, report, summarise
 from torch import Tensor
 
-from ufmstar_torch import UfMStar
+from ufmstar_torch import DepthPrediction, UfMStar
+from ufmstar_torch.eval.metrics import NLL, RMSE, Delta1
 from ufmstar_torch.eval.run.files import write_json_atomic
-from ufmstar_torch.eval.run.machine import hardware
-from ufmstar_torch.models import DepthNetwork, load_trained, read_info
+from ufmstar_torch.eval.sequences import Frame, open_sequence
+from ufmstar_torch.eval.sequences.ground_truth import truth_at
+from ufmstar_torch.eval.sequences.images import image_tensor
+from ufmstar_torch.eval.tour import make_tour, tour_sequence
+from ufmstar_torch.models import DepthNetwork, Preprocess, load_trained, read_info
 from ufmstar_torch.regress import sample_pixels
 from ufmstar_torch.train.losses import loss_of
 
-# What an image's score is: nothing; mean A; mean V = M + A; mean M alone; the true mean squared error, which nobody
-# knows before labelling; and, beyond any budget, all labels at once.
+# An image's score: none; mean A; mean V = M + A; mean M alone; the true mean squared error, which is unknown before
+# labelling; and, beyond any budget, all labels at once.
 STRATEGIES = ("random", "aleatoric", "ufmstar", "disagreement", "oracle", "everything")
-QUICK = {"seeds": 2, "frames": 24, "held_back": 8, "budget": 2, "steps": 2, "pixels": 200}
+# Rooms by the style of a tour's; the shipped networks were trained in homes and saw no hall.
+ROOMS = {"home": "seen", "hall": "unseen"}
 
 
-@dataclass(frozen=True)
-class Settings:
-    """One experiment.
+@dataclass(frozen=True, eq=False)
+class View:
+    """A posed frame as the network sees it."""
 
-    Attributes:
-        budget: labels in all, divided among the rounds.
-        rounds: of scoring, picking and fine-tuning.
-        spacing: picked frames are at least this far apart, so that no budget goes into near-duplicates.
-        pixels: that the average of an image is taken over.
-        steps: of fine-tuning per network, divided among the rounds.
-        batch: images per step.
-        learning_rate: of Adam at the start of each round; falls to 0 by its end.
-        strategies: which are compared.
+    image: Tensor  # [3, h, w] float32, the network's input
+    depth: Tensor  # [h, w] float32 ground truth [m], 0 = none: the label, if it is asked for
+    T_world_cam: Tensor  # [4, 4] float64 [m]
+    intrinsics: Tensor  # [3, 3] float64 of the network's input [px]
+    room: str = ""  # "seen", "unseen", or "" where it is not known
 
-    Raises:
-        ValueError: a number that cannot be.
+
+def views(frames: Iterable[Frame], preprocess: Preprocess, tour: Any = None) -> list[View]:
+    """Frames with image and depth as views. Raises ValueError: a frame lacks one of the two."""
+    result = []
+    for frame in frames:
+        if frame.image is None or frame.depth is None:
+            raise ValueError(f"frame {frame.name} has no {'image' if frame.image is None else 'depth'}: it needs both")
+        x, K = preprocess(image_tensor(frame), torch.from_numpy(frame.intrinsics)[None])
+        truth, pose = truth_at(frame, K[0].numpy(), (x.shape[-2], x.shape[-1])), torch.from_numpy(frame.T_world_cam)
+        assert truth is not None
+        room = "" if tour is None else ROOMS[tour.style_at(pose[:3, 3])]
+        result.append(View(x[0], torch.from_numpy(truth), pose, K[0], room))
+    return result
+
+
+def open_place(options: argparse.Namespace, repetition: int, preprocess: Preprocess, size: tuple[int, int]) -> Any:
+    """The pool, of which some views may be labelled, and the held-back views that judge.
+
+    Of a tour, the two are walks through the same rooms with another start, direction, sway and glances; of a recording,
+    its first 60 % and its last 35 %, so that no neighbour of a labelled frame is judged.
     """
+    if options.sequence is not None:
+        sequence = open_sequence(options.sequence)
+        pool = range(0, int(0.6 * len(sequence)), options.stride)[: options.frames]
+        judged = sorted({*np.linspace(int(0.65 * len(sequence)), len(sequence) - 1, options.held_back).round()})
+        return [views((sequence[int(i)] for i in part), preprocess) for part in (pool, judged)]
+    seed, parts = options.tour + repetition, []
+    for path, count, stride in ((0, options.frames, options.stride), (1, options.held_back, 5)):
+        walk = tour_sequence(seed, frames=count * stride, size=size, style="mixed", path_seed=path)
+        frames = (walk[i] for i in range(0, count * stride, stride))
+        parts.append(views(frames, preprocess, make_tour(seed, "mixed")))
+    return parts
 
-    budget: int = 12
-    rounds: int = 2
-    spacing: int = 4
-    pixels: int = 1000
-    steps: int = 30
-    batch: int = 4
-    learning_rate: float = 3e-4
-    strategies: tuple[str, ...] = STRATEGIES
 
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name != "strategies" and not value > 0:
-                raise ValueError(f"{field.name} must be positive, got {value}")
-        if self.budget % self.rounds or self.steps % self.rounds:
-            raise ValueError(
-                f"budget and steps must be multiples of rounds, got {self.budget}, {self.steps}, {self.rounds}"
-            )
-        if unknown := sorted(set(self.strategies) - set(STRATEGIES)):
-            raise ValueError(f"strategies must be some of {', '.join(STRATEGIES)}, got {unknown}")
+def predict(members: Sequence[DepthNetwork], view: View, index: int) -> DepthPrediction:
+    """One inference, as `UncertainDepth` alternates them: image i by member i mod N."""
+    with torch.no_grad():
+        prediction: DepthPrediction = members[index % len(members)](view.image[None])
+    return prediction
 
 
 def score_pool(members: Sequence[DepthNetwork], pool: Sequence[View], pixels: int) -> dict[str, list[float]]:
@@ -102,25 +115,24 @@ def score_pool(members: Sequence[DepthNetwork], pool: Sequence[View], pixels: in
         total = float(ufm.mean_uncertainty(*stream, valid, pixels=pixels, seed=i).mean)
         index, used = sample_pixels(valid, pixels, seed=i)  # the pixels that mean_uncertainty has taken
         truth = view.depth[None]
+        labelled = used & torch.gather((truth > 0).flatten(1), 1, index)
         scores["ufmstar"].append(total)
         scores["aleatoric"].append(_mean_at(p.aleatoric_variance, index, used))
         scores["disagreement"].append(total - _mean_at(p.variance, index, used))
-        labelled = used & torch.gather((truth > 0).flatten(1), 1, index)
         scores["oracle"].append(_mean_at((p.depth - truth).square(), index, labelled))
     return scores
 
 
 def select(scores: Sequence[float], budget: int, spacing: int, taken: Collection[int] = ()) -> list[int]:
-    """Greedy picks: the highest score first, no two closer than ``spacing`` frames, nor to one that is taken already.
+    """Greedy picks: the highest score first, no two closer than ``spacing`` frames, nor to one that is ``taken``.
 
     Of equal scores the earlier frame wins; frames without a score (NaN) are never picked.
 
     Raises:
         ValueError: the pool is too short for the budget.
     """
-    order = sorted((i for i, s in enumerate(scores) if not math.isnan(s)), key=lambda i: (-scores[i], i))
     picks: list[int] = []
-    for i in order:
+    for i in sorted((i for i, s in enumerate(scores) if not math.isnan(s)), key=lambda i: (-scores[i], i)):
         if len(picks) < budget and all(abs(i - j) >= spacing for j in (*taken, *picks)):
             picks.append(i)
     if len(picks) < budget:
@@ -129,7 +141,7 @@ def select(scores: Sequence[float], budget: int, spacing: int, taken: Collection
 
 
 def fine_tune(
-    start: Sequence[DepthNetwork], labelled: Sequence[View], settings: Settings, rng: np.random.Generator
+    start: Sequence[DepthNetwork], labelled: Sequence[View], options: argparse.Namespace, rng: np.random.Generator
 ) -> list[DepthNetwork]:
     """Copies of the networks, trained with the likelihood of the labels; mirrored images half of the time.
 
@@ -137,12 +149,12 @@ def fine_tune(
     """
     members = copy.deepcopy(list(start))
     parameters = list({id(p): p for member in members for p in member.parameters()}.values())  # shared ones once
-    steps = settings.steps // settings.rounds
-    optimizer = torch.optim.Adam(parameters, settings.learning_rate)
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1 - step / (steps * len(members)))
-    for step in range(steps * len(members)):
-        few = len(labelled) < settings.batch
-        batch = [labelled[i] for i in rng.choice(len(labelled), settings.batch, replace=few)]
+    steps = options.steps // options.rounds * len(members)
+    optimizer = torch.optim.Adam(parameters, options.learning_rate)
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1 - step / steps)
+    for step in range(steps):
+        few = len(labelled) < options.batch
+        batch = [labelled[i] for i in rng.choice(len(labelled), options.batch, replace=few)]
         image, depth = torch.stack([v.image for v in batch]), torch.stack([v.depth for v in batch])
         if rng.random() < 0.5:
             image, depth = image.flip(-1), depth.flip(-1)
@@ -154,100 +166,110 @@ def fine_tune(
     return members
 
 
+def judge(members: Sequence[DepthNetwork], held_back: Sequence[View]) -> dict[str, dict[str, float]]:
+    """delta1, RMSE [m] and NLL [nats, with the network's own variance] of all views and by kind of room."""
+    parts = ["all", *sorted({view.room for view in held_back} - {""})]
+    metrics = {part: (Delta1(), RMSE(), NLL()) for part in parts}
+    for i, view in enumerate(held_back):
+        p = predict(members, view, i)
+        for part in {"all", view.room} - {""}:
+            for metric in metrics[part]:
+                metric.update(p.depth, p.variance, view.depth[None])
+    figures = {part: {k: float(v) for m in metrics[part] for k, v in m.compute().items()} for part in parts}
+    return {part: {name: figures[part][name] for name in ("delta1", "rmse", "nll")} for part in parts}
+
+
+def run_strategy(
+    strategy: str, start: Sequence[DepthNetwork], pool: Sequence[View], options: argparse.Namespace, seed: int
+) -> tuple[list[int], list[DepthNetwork]]:
+    """The loop: score, pick, label, fine-tune, and again; ``seed``: of random picks and of the order of training.
+
+    Returns:
+        The frames picked, in this order, and the networks that were trained on them.
+    """
+    chance = np.random.default_rng([seed, 1]).random(len(pool)).tolist()
+    members, picks = list(start), list(range(len(pool))) if strategy == "everything" else []
+    for number in range(options.rounds):
+        if strategy != "everything":
+            scores = chance if strategy == "random" else score_pool(members, pool, options.pixels)[strategy]
+            picks += select(scores, options.budget // options.rounds, options.spacing, picks)
+        rng = np.random.default_rng([seed, 2, number])
+        members = fine_tune(members, [pool[i] for i in picks], options, rng)
+    return picks, members
+
+
+def gap(values: Sequence[float]) -> str:
+    """Mean and half width of its 95 % confidence interval (Student's t)."""
+    from scipy.stats import t
+
+    n = len(values)
+    half = float(t.ppf(0.975, n - 1)) * stdev(values) / math.sqrt(n) if n > 1 else math.nan
+    return f"{fmean(values):+.3f} ± {half:.3f}"
+
+
+def report(results: dict[str, Any]) -> str:
+    """A table for each part of the held-back views: RMSE [m] before, after, and less that of random picks.
+
+    Rooms differ more than strategies do: the difference within a seed tells more than two means side by side.
+    """
+    lines, places = [], results["places"]
+    for part in places[0]["before"]:
+        before = fmean(place["before"][part]["rmse"] for place in places)
+        lines += [f"\n{part} ({len(places)} seeds; RMSE before: {before:.3f} m)\n"]
+        lines += ["| picks by | RMSE [m] | less random's [m] |", "|---|---|---|"]
+        for strategy in places[0]["after"]:
+            after = [place["after"][strategy][part]["rmse"] for place in places]
+            chance = [place["after"].get("random", place["after"][strategy])[part]["rmse"] for place in places]
+            less = gap([a - b for a, b in zip(after, chance, strict=True)])
+            lines.append(f"| {strategy} | {fmean(after):.3f} | {'-' if strategy == 'random' else less} |")
+    return "\n".join(lines)
+
+
 def _mean_at(values: Tensor, index: Tensor, used: Tensor) -> float:
     """Mean of a map [1, H, W] over sampled pixels [1, n]; NaN without any."""
     return float(torch.gather(values.flatten(1), 1, index)[used].mean())
 
 
-def run_strategy(
-    strategy: str, start: Sequence[DepthNetwork], place: Environment, first: Mapping[str, list[float]],
-    settings: Settings, seed: int,
-) -> tuple[list[int], dict[str, dict[str, float]]]:  # fmt: skip
-    """The loop: score, pick, label, fine-tune, and again.
-
-    Args:
-        strategy: one of `STRATEGIES`.
-        start: the networks that all strategies start from; they stay as they are.
-        place: where.
-        first: `score_pool` of ``start``, which all strategies share.
-        settings: of the experiment.
-        seed: of random picks, and of the order of training.
-
-    Returns:
-        The frames picked, in this order, and `judge` of the held-back part.
-    """
-    chance = np.random.default_rng([seed, 1]).random(len(place.pool)).tolist()
-    members, picks = list(start), []
-    for number in range(settings.rounds):
-        if strategy == "everything":
-            picks = list(range(len(place.pool)))
-        else:
-            scores = {"random": chance} if strategy == "random" else first
-            if number > 0 and strategy != "random":
-                scores = score_pool(members, place.pool, settings.pixels)
-            picks += select(scores[strategy], settings.budget // settings.rounds, settings.spacing, picks)
-        rng = np.random.default_rng([seed, 2, number])
-        members = fine_tune(members, [place.pool[i] for i in picks], settings, rng)
-    return picks, judge(members, place.held_back)
-
-
-def experiment(options: argparse.Namespace, settings: Settings) -> dict[str, Any]:
-    """All strategies in all environments."""
-    info, start = read_info(options.weights), load_trained(options.weights)
-    places, runs = [], []
-    for seed in range(options.seeds):
-        place = open_environment(
-            options.sequence, seed, frames=options.frames, stride=options.stride, held_back=options.held_back,
-            size=info.spec.size, preprocess=start[0].preprocess,
-        )  # fmt: skip
-        cost = measure_cost(start, place.pool, settings.pixels)
-        dense, sample = (set(select(m, settings.budget, settings.spacing)) for m in cost["means"].values())
-        cost["picks_agree"] = len(dense & sample)
-        first, before = score_pool(start, place.pool, settings.pixels), judge(start, place.held_back)
-        rooms = [view.room for view in place.pool]
-        places.append({"name": place.name, "rooms": rooms, "scores": first, "before": before, "cost": cost})
-        for strategy in settings.strategies:
-            picks, after = run_strategy(strategy, start, place, first, settings, seed)
-            runs.append({"seed": seed, "strategy": strategy, "picks": picks, "after": after})
-            shown = ", ".join(f"{part} {before[part]['rmse']:.3f} -> {after[part]['rmse']:.3f}" for part in after)
-            print(f"{place.name}, {strategy}: RMSE [m] {shown}", flush=True)
-    return {"weights": info.path.name, "networks": len(start), "places": places, "runs": runs}
-
-
-def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """The command line; ``--quick`` sets small numbers where others are not given."""
+def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
+    """The command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     shipped = Path(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))
-    defaults = {f.name: f.default for f in fields(Settings)} | {"seeds": 5, "frames": 160, "stride": 2, "held_back": 64}
-    parser.add_argument("--out", type=Path, required=True, help="folder for results.json and active_learning.png")
-    parser.add_argument("--sequence", default="tour:200001?style=mixed", help="tour:SEED?style=STYLE, or a recording")
+    parser.add_argument("--out", type=Path, default=Path("active_learning.json"))
     parser.add_argument("--weights", type=Path, default=shipped, help="of `ufmstar train` (default: the shipped ones)")
-    parser.add_argument("--quick", action="store_true", help="a few frames and steps, to see it run")
-    parser.add_argument("--seeds", type=int, help="repetitions: other rooms, random picks and order of training")
-    parser.add_argument("--frames", type=int, help="of the pool")
-    parser.add_argument("--stride", type=int, help="steps of the walk from one frame of the pool to the next")
-    parser.add_argument("--held-back", type=int, help="frames that judge")
-    parser.add_argument("--strategies", nargs="+", choices=STRATEGIES)
-    for name in ("budget", "rounds", "spacing", "pixels", "steps", "batch"):
-        parser.add_argument(f"--{name}", type=int, help="see Settings")
-    parser.add_argument("--learning-rate", type=float, help="see Settings")
-    given = vars(parser.parse_args(arguments))
-    chosen = {name: value for name, value in given.items() if value is not None}
-    return argparse.Namespace(**{**defaults, **(QUICK if given["quick"] else {}), **chosen})
+    parser.add_argument("--sequence", help="a recording with depth; without it, tours are walked through")
+    parser.add_argument("--tour", type=int, default=200001, help="first seed; every repetition has other rooms")
+    parser.add_argument("--strategies", nargs="+", choices=STRATEGIES, default=STRATEGIES)
+    for name, default, text in (
+        ("seeds", 4, "repetitions"),
+        ("frames", 160, "of the pool"),
+        ("stride", 2, "steps of the walk from one frame of the pool to the next"),
+        ("held-back", 64, "frames that judge"),
+        ("budget", 12, "labels in all, divided among the rounds"),
+        ("rounds", 2, "of scoring, picking and fine-tuning"),
+        ("spacing", 4, "least distance of two picked frames, so that no budget goes into near-duplicates"),
+        ("pixels", 1000, "that the mean of an image is taken over"),
+        ("steps", 30, "of fine-tuning per network, divided among the rounds"),
+        ("batch", 4, "images per step"),
+    ):
+        parser.add_argument(f"--{name}", type=int, default=default, help=text)
+    parser.add_argument("--learning-rate", type=float, default=3e-4, help="of Adam; falls to 0 in each round")
+    return parser.parse_args(words)
 
 
-def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
-    """Run the experiment and leave results.json and active_learning.png in a folder."""
-    options = parse(arguments)
-    values = {f.name: getattr(options, f.name) for f in fields(Settings)}
-    settings = Settings(**{**values, "strategies": tuple(values["strategies"])})
-    options.out.mkdir(parents=True, exist_ok=True)
-    wall, processor = time.perf_counter(), time.process_time()
-    results = {"sequence": options.sequence, "settings": asdict(settings)} | experiment(options, settings)
-    results |= {"seconds": time.perf_counter() - wall, "processor_seconds": time.process_time() - processor}
-    results |= {"summary": summarise(results), "hardware": hardware()}
-    write_json_atomic(options.out / "results.json", results)
-    draw(options.out / "active_learning.png", results)
+def main(words: Sequence[str] | None = None) -> dict[str, Any]:
+    """Run all strategies in all places, print the tables, and write every pick and figure as JSON."""
+    options = parse(words)
+    start, size = load_trained(options.weights), read_info(options.weights).spec.size
+    places = []
+    for seed in range(options.seeds):
+        pool, held_back = open_place(options, seed, start[0].preprocess, size)
+        place: dict[str, Any] = {"before": judge(start, held_back), "picks": {}, "after": {}}
+        for strategy in options.strategies:
+            place["picks"][strategy], members = run_strategy(strategy, start, pool, options, seed)
+            place["after"][strategy] = judge(members, held_back)
+        places.append(place)
+    results = {"settings": vars(options), "places": places}
+    write_json_atomic(options.out, results)
     print(report(results))
     return results
 

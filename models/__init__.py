@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.any_network import wrap_network as wrap_network
     from ufmstar_torch.models.batch_ensemble import BatchEnsemble as BatchEnsemble
     from ufmstar_torch.models.batch_ensemble import convert as convert
-    from ufmstar_torch.models.camera_height import GroundFit as GroundFit
-    from ufmstar_torch.models.camera_height import align_to_camera_height as align_to_camera_height
     from ufmstar_torch.models.checkpoints import CheckpointError as CheckpointError
     from ufmstar_torch.models.checkpoints import load_state_dict_file as load_state_dict_file
     from ufmstar_torch.models.checkpoints import load_weights as load_weights

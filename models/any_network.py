@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
-from zipfile import BadZipFile, ZipFile
+from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 import torch
 from torch import Tensor, nn
@@ -116,22 +116,30 @@ def load_exported(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
     than tensors beside its graph is refused."""
     declared = ProgramSpec.required(spec)
     try:
-        _require_tensors(_existing(path))
-        program = torch.export.load(str(path))
-    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, BadZipFile) as error:
-        raise ValueError(f"{path} is not a readable torch.export file: {error}") from error
-    return _wrapped(_Exported(program.module()), declared)
+        program = torch.export.load(_checked_copy(_existing(path))).module()
+    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, NotImplementedError, BadZipFile) as error:
+        raise ValueError(
+            f"{path} is not a readable torch.export file: {error}; expected what torch.export.save of a compatible "
+            f"torch writes (this one is {torch.__version__}): export the network again"
+        ) from error
+    return _wrapped(_Exported(program, str(path)), declared)
 
 
 def _wrapped(program: nn.Module, spec: ProgramSpec) -> WrappedNetwork:
     return WrappedNetwork(program, spec.outputs, spec.preprocess or Preprocess(), spec.takes_intrinsics)
 
 
-def _require_tensors(path: str) -> None:
-    """Raises ValueError (CheckpointError) if an archive holds anything but JSON, short texts, tensors and plain
-    values."""
-    with ZipFile(path) as archive:
+def _checked_copy(path: str) -> io.BytesIO:
+    """An archive in memory of the members that were checked: JSON, short texts, tensors and plain values. A file can
+    have two directories, of which Python's reader sees one and torch's the other. Raises ValueError (CheckpointError):
+    the file holds anything else."""
+    copied = io.BytesIO()
+    with ZipFile(path) as archive, ZipFile(copied, "w") as copy:
         names = archive.namelist()
+        if any(entry.compress_type != ZIP_STORED for entry in archive.infolist()):
+            raise ValueError(
+                "it has compressed files, which may expand without limit; torch.export.save compresses none"
+            )
         if len({name.casefold() for name in names}) != len(names):
             raise ValueError("it has two files of one name")
         configs = [name for name in names if name.endswith("_config.json")]
@@ -142,6 +150,9 @@ def _require_tensors(path: str) -> None:
             raw = _RAW.fullmatch(name) and last not in pickled
             if last not in _TEXTS and not raw and not _is_json(content):
                 read_tensors(io.BytesIO(content), name)
+            copy.writestr(name, content)
+    copied.seek(0)
+    return copied
 
 
 def _is_json(content: bytes) -> bool:
@@ -156,13 +167,20 @@ def _is_json(content: bytes) -> bool:
 class _Exported(nn.Module):
     """An exported program, which keeps the mode it was exported in; torch's own refuses even ``eval()``."""
 
-    def __init__(self, program: nn.Module) -> None:
+    def __init__(self, program: nn.Module, path: str) -> None:
         super().__init__()
-        self.program = program
+        self.program, self.path = program, path
         self.training = False
 
     def forward(self, *inputs: Tensor) -> Any:
-        return self.program(*inputs)
+        try:
+            return self.program(*inputs)
+        except AssertionError as error:  # how an exported program refuses an input
+            shapes = ", ".join(f"{value.dtype} {tuple(value.shape)}" for value in inputs)
+            raise ValueError(
+                f"{self.path} was exported for another input than {shapes}: {error}; declare its size in the spec's "
+                "preprocess, or export it with dynamic shapes"
+            ) from error
 
     def train(self, mode: bool = True) -> _Exported:
         return self

@@ -7,9 +7,7 @@ pickled module, as older repositories publish them, is refused with an explanati
 from __future__ import annotations
 
 import json
-import os
 import pickle
-import secrets
 import struct
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -18,6 +16,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.models.atomic import write_atomic
 from ufmstar_torch.optional import optional
 
 # Where training programs put the weights inside a checkpoint, and what wrappers put before every key.
@@ -128,16 +127,7 @@ def save_checkpoint(
     state = weights.state_dict() if isinstance(weights, nn.Module) else dict(weights)
     state = {key: value.detach().cpu().contiguous() for key, value in state.items()}
     text = json.dumps(dict(metadata or {}))
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")  # same folder: renaming is atomic
-    try:
-        with temporary.open("xb") as file:
-            _write(file, path, state, text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    write_atomic(path, lambda file: _write(file, path, state, text), durable=True)
 
 
 def _write(file: Any, path: Path, state: dict[str, Tensor], metadata: str) -> None:

@@ -17,8 +17,7 @@ import torch
 from ufmstar_torch.checked import Checked
 from ufmstar_torch.models.alignment import Alignment
 from ufmstar_torch.models.checkpoints import CheckpointError
-from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec, patch_size, with_alignment
-from ufmstar_torch.models.hugging_face_files import read_checkpoint
+from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
 from ufmstar_torch.models.network import DepthNetwork
 
 SIZES = ("small", "base", "large")
@@ -81,7 +80,7 @@ class DepthAnything(HuggingFaceDepth):
                 f"{checkpoint.name} is a {checkpoint.config.get('model_type')!r} model, expected 'depth_anything'; "
                 "other depth models: from_hugging_face"
             )
-        multiple = patch_size(checkpoint)
+        multiple = checkpoint.patch
         if len(size) != 2 or any(side < 1 or side % multiple for side in size):
             raise ValueError(f"size must be (height, width) in multiples of the patch, {multiple} px, got {size}")
         if not checkpoint.processor:
@@ -105,4 +104,5 @@ def load_depth_anything(weights: Path, spec: Mapping[str, Any] | str | Path | No
     :meth:`DepthAnything.from_pretrained`."""
     declared = DepthAnythingSpec.read(spec or {})
     network = DepthAnything.from_pretrained(weights, size=declared.size, keep_aspect=declared.keep_aspect)
-    return with_alignment(network, declared.alignment)
+    metric: DepthNetwork = network.aligned(declared.alignment)
+    return metric

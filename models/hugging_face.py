@@ -1,50 +1,46 @@
 """Depth models of Hugging Face's ``transformers``, from a hub name or a local directory.
 
 Few configurations state what the model's numbers mean ("depth_estimation_type"). The others need a declaration, as
-every network here; where both exist, they have to agree.
+every network here; where both exist, they have to agree. ``transformers`` fills weights that a file lacks with random
+numbers and goes on; here that is an error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, Self
 
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
 
 from ufmstar_torch.checked import Checked
 from ufmstar_torch.models.aligned import AlignedNetwork
 from ufmstar_torch.models.alignment import KINDS, Alignment
-from ufmstar_torch.models.checkpoints import CheckpointError
-from ufmstar_torch.models.hugging_face_files import Checkpoint, load_model, read_checkpoint
-from ufmstar_torch.models.hugging_face_raw import CanonicalInverseDepth, PaddedDepth, RawDepth
-from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.outputs import METRIC
+from ufmstar_torch.models.checkpoints import DAMAGE, CheckpointError, some
+from ufmstar_torch.models.network import DepthNetwork, require_image
+from ufmstar_torch.models.outputs import METRIC, as_map
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
-# Pillow's numbers, which the configurations use.
-_LINEAR, _CUBIC = 2, 3
-# The architectures whose output is covered, and how it is read. Others, such as models that need a second input or
-# predict no depth, are refused by name.
-_ARCHITECTURES: dict[str, type[RawDepth]] = {
-    "depth_anything": RawDepth,
-    "depth_pro": CanonicalInverseDepth,
-    "dpt": RawDepth,
-    "glpn": RawDepth,
-    "zoedepth": PaddedDepth,
-}
-# Architectures that always predict metric depth.
-_METRIC = ("depth_pro", "zoedepth")
+_LINEAR, _CUBIC = 2, 3  # Pillow's numbers, which the configurations use
+# The covered architectures, and whether they always predict metric depth. Others, such as models that need a second
+# input, are refused by name.
+_ALWAYS_METRIC = {"depth_anything": False, "depth_pro": True, "dpt": False, "glpn": False, "zoedepth": True}
 # "depth_estimation_type" in the terms of this package; "relative" is inverse depth in all of them.
 _DECLARED = {"metric": METRIC, "relative": "inverse"}
+# [1/m] Depth Pro's inverse depth is kept between these: 0.1 mm and 10 km.
+_INVERSE_RANGE = (1e-4, 1e4)
+_PADDING = 3.0  # [sqrt(px)] ZoeDepth pads each border by this times the square root of half the side
 
 
 @dataclass(frozen=True)
 class HuggingFaceSpec(Checked):
-    """What is declared about a checkpoint: arguments of :func:`from_hugging_face` for configuration files.
+    """What is declared about a checkpoint.
 
     Attributes:
         kind: what it predicts: "metric" (GLPN, DPT trained on NYU or KITTI; Depth Pro and ZoeDepth always), "inverse"
@@ -56,7 +52,7 @@ class HuggingFaceSpec(Checked):
         preprocess: instead of the checkpoint's own; excludes ``size`` and ``keep_aspect``.
         allow_missing: beginnings of weights that the checkpoint may lack (and that stay random), as the unused
             "neck.fusion_stage.layers.0.residual_layer1" of Intel/dpt-large.
-        alignment: of a relative network, in configuration files only.
+        alignment: of a relative network; for :func:`load_hugging_face`.
     """
 
     kind: str | None = None
@@ -68,8 +64,70 @@ class HuggingFaceSpec(Checked):
     alignment: Alignment | None = None
 
 
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint whose configuration has been read."""
+
+    name: str  # directory or hub name
+    config: dict[str, Any]  # config.json
+    processor: dict[str, Any]  # preprocessor_config.json, empty if there is none
+    options: dict[str, Any]  # keyword arguments of every call of ``transformers``
+
+    @property
+    def model_type(self) -> str:
+        """As "depth_anything", "dpt"."""
+        return str(self.config.get("model_type"))
+
+    @property
+    def patch(self) -> int:
+        """[px] what an input's sides have to be multiples of: the patch of a vision transformer, otherwise 1."""
+        value: Any = self.config.get("patch_size", 14 if self.model_type == "depth_anything" else 1)
+        return int(max(value)) if isinstance(value, (list, tuple)) else int(value or 1)
+
+
+class RawDepth(nn.Module):
+    """A model of ``transformers`` as an image-to-map network: its own units, the input's resolution.
+
+    What a model's ``predicted_depth`` is, ``transformers`` states in the image processor's
+    ``post_process_depth_estimation``; the same is computed here. Depth Pro (Bochkovskii et al. 2025) predicts inverse
+    depth for a focal length of one image width, which its field of view makes metric; ZoeDepth (Bhat et al. 2023) sees
+    the image with reflected borders, which are cut off its depth.
+
+    Args:
+        model: has ``predicted_depth`` [B, h, w] in what it returns for ``pixel_values``.
+        multiple: [px] what the input's sides have to be multiples of.
+        canonical: whether the output is Depth Pro's.
+        padded: whether the model expects ZoeDepth's borders.
+    """
+
+    def __init__(self, model: nn.Module, multiple: int = 1, *, canonical: bool = False, padded: bool = False) -> None:
+        super().__init__()
+        self.model, self.multiple, self.canonical, self.padded = model, multiple, canonical, padded
+
+    def forward(self, image: Tensor) -> Tensor:
+        """[B, H, W], at least in single precision, of ``image`` [B, 3, H, W]; a smaller output is enlarged. Raises
+        ValueError: the image has another shape, or sides that are no multiples of ``multiple``."""
+        height, width = require_image(image, self.multiple)
+        down, right = (int(math.sqrt(side / 2) * _PADDING) if self.padded else 0 for side in (height, width))
+        if self.padded:
+            padded = F.pad(image, (right, right, down, down), mode="reflect")
+            image = F.interpolate(padded, (height, width), mode="bilinear", align_corners=True)
+        outputs = self.model(pixel_values=image.to(next(self.model.parameters()).dtype))
+        depth = as_map(outputs.predicted_depth, "predicted_depth")
+        depth = depth if depth.dtype == torch.float64 else depth.float()
+        if self.canonical:
+            width_per_focal = 2 * (outputs.field_of_view.to(depth) * (math.pi / 360)).tan()
+            depth = depth * width_per_focal.reshape(-1, 1, 1)
+        size = (height + 2 * down, width + 2 * right)
+        if depth.shape[-2:] != size:
+            mode = "bicubic" if self.padded else "bilinear"
+            depth = F.interpolate(depth[:, None], size, mode=mode, align_corners=False)[:, 0]
+        depth = depth[:, down : down + height, right : right + width]
+        return 1 / depth.clamp(*_INVERSE_RANGE) if self.canonical else depth
+
+
 class HuggingFaceDepth(DepthNetwork):
-    """A transformers depth model; made by :func:`from_hugging_face`.
+    """A depth model of ``transformers``; made by :func:`from_hugging_face`.
 
     Attributes:
         raw: the :class:`RawDepth`; ``raw(image)`` is what alignments are fitted to.
@@ -98,13 +156,12 @@ class HuggingFaceDepth(DepthNetwork):
         """From a checkpoint that was read, in eval mode; errors as :func:`from_hugging_face`."""
         kind, preprocess = _kind(checkpoint, spec.kind), spec.preprocess
         if preprocess is None:
-            preprocess = own_preprocess(checkpoint, spec.size, spec.keep_aspect)
+            preprocess = _preprocess(checkpoint, spec.size, spec.keep_aspect)
         elif spec.size is not None or spec.keep_aspect is not None:
             raise ValueError("preprocess excludes size and keep_aspect, which it contains")
-        model, reading = load_model(checkpoint, dtype, spec.allow_missing), _ARCHITECTURES[checkpoint.model_type]
-        if reading is PaddedDepth and not checkpoint.processor.get("do_pad", True):
-            reading = RawDepth
-        raw = reading(model, patch_size(checkpoint))
+        padded = checkpoint.model_type == "zoedepth" and checkpoint.processor.get("do_pad", True)
+        model, canonical = _load_model(checkpoint, dtype, spec.allow_missing), checkpoint.model_type == "depth_pro"
+        raw = RawDepth(model, checkpoint.patch, canonical=canonical, padded=padded)
         network = cls(raw, preprocess, kind, scale=spec.scale, source=checkpoint.name)
         if checkpoint.config.get("depth_estimation_type") == METRIC:
             network.max_depth = spec.scale * float(checkpoint.config["max_depth"])
@@ -116,55 +173,47 @@ class HuggingFaceDepth(DepthNetwork):
         return self.kind == METRIC
 
     def forward(self, image: Tensor) -> DepthPrediction:
-        """Depth [B, H, W] [m], float32, of ``image`` [B, 3, H, W] as ``preprocess`` returns it. Raises ValueError: the
-        network is relative, or the image does not fit."""
-        return DepthPrediction(self.required().raw(image) * self.scale)
+        """Depth [B, H, W] [m], at least in single precision, of ``image`` [B, 3, H, W] as ``preprocess`` returns it.
+        Raises ValueError: the network is relative, or the image does not fit."""
+        return DepthPrediction(self.aligned(None).raw(image) * self.scale)
 
-    def required(self) -> Self:
-        """This network. Raises ValueError: it is relative."""
+    def aligned(self, alignment: Alignment | None) -> Any:
+        """The metric network that a relative one becomes by a fixed alignment; the weights are shared. None: this
+        network, if it is metric. Raises ValueError: a relative network without an alignment, or an alignment for
+        another kind of output."""
+        if alignment is not None:
+            if alignment.kind != self.kind:
+                raise ValueError(f"alignment must be of the network's kind {self.kind!r}, got {alignment.kind!r}")
+            return AlignedNetwork(self.raw, alignment, self.preprocess)
         if not self.is_metric:
             what = "inverse depth" if self.kind == "inverse" else "depth"
+            example = f'{{"alignment": {{"kind": "{self.kind}", "scale": ..., "shift": ...}}}}'
             raise ValueError(
                 f"{self.source or 'this network'} predicts relative depth ({what} up to scale and shift), not metres: "
-                "give it an Alignment, fitted to measured depth (fit_inverse_depth, fit_affine_depth) or to the "
-                "camera's height (align_to_camera_height), by network.aligned(alignment); or use a metric checkpoint"
+                "give it an Alignment, fitted to measured depth (fit_inverse_depth, fit_affine_depth), by "
+                f"network.aligned(alignment), or in a spec: {example}; or use a metric checkpoint"
             )
         return self
-
-    def aligned(self, alignment: Alignment) -> AlignedNetwork:
-        """The metric network that a relative one becomes by a fixed alignment; the weights are shared. Raises
-        ValueError: this network is metric, or the alignment is for the other kind of output."""
-        if alignment.kind != self.kind:
-            raise ValueError(f"alignment must be of the network's kind {self.kind!r}, got {alignment.kind!r}")
-        return AlignedNetwork(self.raw, alignment, self.preprocess)
 
 
 def from_hugging_face(
     name_or_dir: str | Path,
     *,
-    kind: str | None = None,
-    scale: float = 1.0,
-    size: tuple[int, int] | None = None,
-    keep_aspect: bool | None = None,
-    preprocess: Preprocess | None = None,
-    allow_missing: Sequence[str] = (),
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
     revision: str | None = None,
     local_files_only: bool = False,
+    **declared: Any,
 ) -> HuggingFaceDepth:
     """A depth model of ``AutoModelForDepthEstimation`` in eval mode: DPT, GLPN, Depth Anything, Depth Pro, ZoeDepth.
 
-    Its depth is what the image processor's ``post_process_depth_estimation`` makes of its output: Depth Pro's inverse
-    depth becomes metric by the field of view that it estimates, ZoeDepth's padding is done and cut off again.
-
     Args:
         name_or_dir: "owner/name" on the hub, or a directory with config.json and weights.
-        kind, scale, size, keep_aspect, preprocess, allow_missing: see :class:`HuggingFaceSpec`.
         dtype: of the weights; what comes out is float32 in any case (float64 for float64).
         device: where they go; None = the CPU.
         revision: branch, tag or commit on the hub.
         local_files_only: do not access the hub.
+        declared: kind, scale, size, keep_aspect, preprocess and allow_missing: see :class:`HuggingFaceSpec`.
 
     Raises:
         ValueError: the kind is declared nowhere or contradicts the configuration, a Depth Pro without the part that
@@ -173,9 +222,8 @@ def from_hugging_face(
         FileNotFoundError, OSError: there is no such directory, or the hub cannot be reached.
         ModuleNotFoundError: transformers is missing.
     """
-    spec = HuggingFaceSpec(kind, scale, size, keep_aspect, preprocess, tuple(allow_missing))
     checkpoint = read_checkpoint(name_or_dir, revision, local_files_only)
-    return HuggingFaceDepth.of_checkpoint(checkpoint, spec, dtype).to(device)
+    return HuggingFaceDepth.of_checkpoint(checkpoint, HuggingFaceSpec(**declared), dtype).to(device)
 
 
 def load_hugging_face(weights: Path, spec: Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
@@ -183,25 +231,75 @@ def load_hugging_face(weights: Path, spec: Mapping[str, Any] | str | Path | None
     JSON file. Raises ValueError: an unknown option, or a relative network without an alignment; others as
     :func:`from_hugging_face`."""
     declared = HuggingFaceSpec.read(spec or {})
-    network = HuggingFaceDepth.of_checkpoint(read_checkpoint(weights), declared)
-    return with_alignment(network, declared.alignment)
+    network: DepthNetwork = HuggingFaceDepth.of_checkpoint(read_checkpoint(weights), declared).aligned(
+        declared.alignment
+    )
+    return network
 
 
-def with_alignment(network: HuggingFaceDepth, alignment: Alignment | None) -> DepthNetwork:
-    """The aligned network, or without an alignment the network itself. Raises ValueError: the network is relative and
-    has no alignment, or is metric and has one."""
-    if alignment is not None:
-        return network.aligned(alignment)
+def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_files_only: bool = False) -> Checkpoint:
+    """The configuration of a checkpoint; arguments as :func:`from_hugging_face`. Raises FileNotFoundError: a directory
+    is missing, or lacks config.json; CheckpointError: config.json or preprocessor_config.json cannot be read; OSError:
+    the hub cannot be reached, or has nothing of that name; ModuleNotFoundError: transformers is missing."""
+    from transformers import PreTrainedConfig
+    from transformers.image_processing_base import ImageProcessingMixin
+
+    path = Path(name_or_dir).expanduser()
+    # A directory is meant where one exists, and by what no "owner/name" looks like.
+    given = str(name_or_dir)
+    local = path.is_dir() or path.is_absolute() or given.startswith(".") or len(path.parts) != 2
+    if local and not (path / "config.json").is_file():
+        what = f"{path} has no config.json" if path.is_dir() else f"no such directory: {path}"
+        raise FileNotFoundError(f"{what}; a checkpoint of transformers is a directory with config.json and weights")
+    name, processor_file = path.as_posix(), "preprocessor_config.json"
+    options = {"local_files_only": local_files_only or local, "revision": revision or "main"}
+    readers: dict[str, Any] = {"config.json": PreTrainedConfig.get_config_dict}
+    if not local or any((path / file).is_file() for file in (processor_file, "processor_config.json")):
+        readers[processor_file] = ImageProcessingMixin.get_image_processor_dict
+    read: dict[str, dict[str, Any]] = {}
+    for file, reader in readers.items():
+        try:
+            read[file] = reader(name, **options)[0]
+            if not isinstance(read[file], dict):
+                raise TypeError("it must hold a JSON object")
+        except (OSError, ValueError, TypeError, AttributeError) as error:
+            if not local and file == "config.json":
+                raise OSError(
+                    f"{name} is no directory and cannot be had from the Hugging Face hub: {error}; with a connection, "
+                    "`hf download NAME --local-dir DIR` fetches it; a directory needs no connection"
+                ) from error
+            raise CheckpointError(f"{name}: {file} cannot be read: {error}") from error
+    return Checkpoint(name, read["config.json"], read.get(processor_file, {}), options)
+
+
+def _load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: tuple[str, ...]) -> nn.Module:
+    """The model with every weight from the checkpoint, on the CPU. Raises CheckpointError: not a depth model, damaged,
+    or with missing, misshapen or non-finite weights; the message names the directory."""
+    from huggingface_hub.errors import StrictDataclassError
+    from safetensors import SafetensorError
+    from transformers import AutoModelForDepthEstimation
+
     try:
-        return network.required()
-    except ValueError as error:
-        example = f'{{"alignment": {{"kind": "{network.kind}", "scale": ..., "shift": ...}}}}'
-        raise ValueError(f"{error}. In a spec: {example}") from error
+        model, report = AutoModelForDepthEstimation.from_pretrained(
+            checkpoint.name, dtype=dtype, output_loading_info=True, **checkpoint.options
+        )
+    except (*DAMAGE, UnpicklingError, SafetensorError, StrictDataclassError) as error:
+        raise CheckpointError(
+            f"{checkpoint.name} ({checkpoint.model_type}) cannot be loaded as a depth model: {error}"
+        ) from error
+    missing = sorted(key for key in report["missing_keys"] if not key.startswith(tuple(allow_missing)))
+    if missing:
+        raise CheckpointError(
+            f"{checkpoint.name} lacks weights, which would stay random: {some(missing)}; where the model does not use "
+            "them, name them in allow_missing"
+        )
+    if broken := [key for key, value in model.state_dict().items() if not value.isfinite().all()]:
+        raise CheckpointError(f"{checkpoint.name} has weights that are not finite: {some(broken)}")
+    network: nn.Module = model.eval()
+    return network
 
 
-def own_preprocess(
-    checkpoint: Checkpoint, size: tuple[int, int] | None = None, keep_aspect: bool | None = None
-) -> Preprocess:
+def _preprocess(checkpoint: Checkpoint, size: tuple[int, int] | None, keep_aspect: bool | None) -> Preprocess:
     """The preprocessing that a checkpoint's image processor describes. Raises ValueError: the description lacks what is
     needed, or contains what ``Preprocess`` cannot do."""
     processor, name = checkpoint.processor, checkpoint.name
@@ -229,7 +327,7 @@ def own_preprocess(
     factor = float(processor.get("rescale_factor", 1 / 255)) if processor.get("do_rescale", True) else 1.0
     return Preprocess(
         size=(size[0], size[1]),
-        aspect_multiple=max(patch_size(checkpoint), divisor) if keep else None,
+        aspect_multiple=max(checkpoint.patch, divisor) if keep else None,
         value_range=255 * factor,
         mean=tuple(mean),
         std=tuple(std),
@@ -238,32 +336,26 @@ def own_preprocess(
     )
 
 
-def patch_size(checkpoint: Checkpoint) -> int:
-    """[px] what an input's sides have to be multiples of: the patch of a vision transformer, otherwise 1."""
-    value: Any = checkpoint.config.get("patch_size", 14 if checkpoint.model_type == "depth_anything" else 1)
-    return int(max(value)) if isinstance(value, (list, tuple)) else int(value or 1)
-
-
 def _kind(checkpoint: Checkpoint, kind: str | None) -> str:
     """The kind of depth, from the configuration, the architecture and the declaration."""
     config, name, model_type = checkpoint.config, checkpoint.name, checkpoint.model_type
-    if model_type not in _ARCHITECTURES:
-        known = ", ".join(_ARCHITECTURES)
+    if model_type not in _ALWAYS_METRIC:
+        known = ", ".join(_ALWAYS_METRIC)
         raise CheckpointError(f"{name} ({model_type}) cannot be loaded as a depth model: covered are {known}")
     if model_type == "depth_pro" and not config.get("use_fov_model"):
         raise ValueError(f"{name} predicts inverse depth per focal length, but not the field of view (use_fov_model)")
     stated = config.get("depth_estimation_type", "relative" if model_type == "depth_anything" else None)
-    if stated is None and kind is None and model_type not in _METRIC:
+    if stated not in (None, *_DECLARED):
+        raise ValueError(f"{name}: depth_estimation_type must be one of {list(_DECLARED)}, got {stated!r}")
+    if stated == METRIC and "max_depth" not in config:
+        raise ValueError(f"{name} states metric depth, but not the max_depth [m] that its output is a share of")
+    own = METRIC if _ALWAYS_METRIC[model_type] else _DECLARED.get(str(stated))
+    if own is None and kind is None:
         raise ValueError(
             f"{name} ({model_type}) does not say whether its depth is metric: declare kind='metric', 'inverse' "
             "(inverse depth up to scale and shift) or 'affine' (depth up to scale and shift)"
         )
-    if stated not in (None, *_DECLARED):
-        raise ValueError(f"{name}: depth_estimation_type must be one of {list(_DECLARED)}, got {stated!r}")
-    own = METRIC if model_type in _METRIC else _DECLARED.get(str(stated))
     if own is not None and kind not in (None, own):
-        said = f"depth_estimation_type {stated!r}" if stated else f"the architecture {model_type}"
-        raise ValueError(f"kind={kind!r}, but {name} states {said}, which is {own!r}")
-    if stated == METRIC and "max_depth" not in config:
-        raise ValueError(f"{name} states metric depth, but not the max_depth [m] that its output is a share of")
+        source = f"depth_estimation_type {stated!r}" if stated else f"the architecture {model_type}"
+        raise ValueError(f"kind={kind!r}, but {name} states {source}, which is {own!r}")
     return own or str(kind)

@@ -207,7 +207,14 @@ class OnnxNetwork(DepthNetwork):
         feeds = {self.input: array.astype(dtype, copy=False)}
         if self.K_input is not None and K is not None:
             feeds[self.K_input[0]] = K.numpy().astype(self.K_input[1])
-        results = self.session.run(self.fetched, feeds)
+        try:
+            results = self.session.run(self.fetched, feeds)
+        except _runtime_errors() as error:
+            shapes = {name: value.shape for name, value in feeds.items()}
+            raise ValueError(
+                f"{self.path}: a node fails when ONNX Runtime runs the graph on {shapes}: {error}; if the graph is "
+                "made for another size of image, declare it as the spec's preprocess.size"
+            ) from error
         return [torch.from_numpy(np.asarray(value)).to(torch.float32) for value in results]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -222,8 +229,6 @@ class OnnxNetwork(DepthNetwork):
 def open_session(path: str, threads: int, providers: tuple[str, ...]) -> InferenceSession:
     """A session on a file; arguments and errors as :class:`OnnxNetwork`."""
     ort = _onnxruntime()
-    from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
-
     if not Path(path).is_file():
         raise FileNotFoundError(f"no ONNX file {path}")
     if absent := [p for p in providers if p not in ort.get_available_providers()]:
@@ -233,10 +238,9 @@ def open_session(path: str, threads: int, providers: tuple[str, ...]) -> Inferen
     # Threads that wait by spinning would take the cores from what comes between two runs.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = _ERRORS_ONLY
-    names = ("InvalidProtobuf", "InvalidGraph", "InvalidArgument", "Fail", "NotImplemented")
     try:
         return ort.InferenceSession(path, options, providers=list(providers))
-    except tuple(getattr(ort_errors, name) for name in names) as error:
+    except _runtime_errors() as error:
         raise ValueError(f"{path} is not an ONNX file that ONNX Runtime can run: {error}") from error
 
 
@@ -250,6 +254,14 @@ def providers_for(device: torch.device) -> tuple[str, ...]:
 def _onnxruntime() -> Any:
     need = "running an ONNX network needs the package onnxruntime"
     return optional("onnxruntime", need, "'ufmstar-torch[models]'")
+
+
+def _runtime_errors() -> tuple[type[Exception], ...]:
+    """What ONNX Runtime raises for a graph that it cannot load or run; its classes have no common base."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as state
+
+    names = ("InvalidProtobuf", "InvalidGraph", "InvalidArgument", "Fail", "NotImplemented", "RuntimeException")
+    return tuple(getattr(state, name) for name in names)
 
 
 def _fixed(node: NodeArg) -> list[int | None]:

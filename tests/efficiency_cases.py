@@ -1,6 +1,8 @@
-"""A rendered room and networks that see its depth, for the tests of what uncertainty costs."""
+"""A short tour and networks that see its depth, for the tests of what uncertainty costs."""
 
 from __future__ import annotations
+
+import functools
 
 import numpy as np
 import torch
@@ -8,13 +10,13 @@ from tiny_networks import Linear
 
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, make_sequence
-from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models.heads import UncertaintyNetwork, with_head
 from ufmstar_torch.models.network import Backbone
 from ufmstar_torch.models.preprocess import Preprocess
 
-SIZE = (96, 128)
+SIZE = (64, 96)
 
 
 def rows_of(*names: str) -> list[Row]:
@@ -31,15 +33,17 @@ def network(
     return with_head(inside, head).eval()
 
 
+@functools.cache
 def room_sequence(frames: int = 8) -> FrameSequence:
     """Views of a room whose depth [5 m] is the red of the image."""
-    room, K = synthetic.BoxRoom.furnished(10, 0), synthetic.intrinsics(*SIZE)
+    height, width = SIZE
+    rendered = open_sequence(f"tour:1?frames=150&size={height}x{width}&sensor=0")
+    tour = [rendered[index] for index in range(frames)]
 
-    def entry(n: int, T: np.ndarray) -> Entry:
-        depth = synthetic.render(room, T, K, *SIZE)
-        image = np.zeros((*SIZE, 3), np.uint8)
-        image[..., 0] = np.clip(51 * depth, 1, 255)
-        return Entry(f"{n:03d}", T, lambda: image)
+    def image(depth: np.ndarray) -> np.ndarray:
+        red = np.zeros((*SIZE, 3), np.uint8)
+        red[..., 0] = np.clip(51 * depth, 1, 255)
+        return red
 
-    entries = [entry(n, T) for n, T in enumerate(synthetic.walk(frames, 100))]
-    return make_sequence("room", "rendered", entries, K, image_size=SIZE)
+    entries = [Entry(frame.name, frame.T_world_cam, functools.partial(image, frame.depth)) for frame in tour]
+    return make_sequence("room", "rendered", entries, tour[0].intrinsics, image_size=SIZE)

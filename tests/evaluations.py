@@ -18,9 +18,9 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.metrics.packed_sums import pack
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.results.record import Record
-from ufmstar_torch.eval.results.worklist import WorkItem
 from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.suite.record import Record
+from ufmstar_torch.eval.suite.work_items import WorkItem
 
 Maps = tuple[Tensor, Tensor | None, Tensor]
 # How far sigma falls short of the error: 1 is calibrated.

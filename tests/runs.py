@@ -11,7 +11,7 @@ from torch import nn
 from ufmstar_torch import DepthPrediction, UfMStarConfig
 from ufmstar_torch.eval.engine.maps import own_depth
 from ufmstar_torch.eval.engine.networks import NetworkSource
-from ufmstar_torch.eval.run.run_job import RunJob
+from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
 from ufmstar_torch.pipeline import NetworksInTurn
@@ -89,3 +89,19 @@ def read_summary(out):
         raise AssertionError(f"summary.json holds {constant}")
 
     return json.loads((out / "summary.json").read_text(), parse_constant=refuse)
+
+
+class Recorder:
+    """A stream that remembers what was written, for fixtures of a module; capfd has function scope."""
+
+    encoding = "utf-8"
+
+    def __init__(self, parts):
+        self.parts = parts
+
+    def write(self, text):
+        self.parts.append(text)
+        return len(text)
+
+    def flush(self):
+        pass

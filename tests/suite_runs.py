@@ -16,9 +16,9 @@ from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.work import EvalJob, Worker, WorkerTask
-from ufmstar_torch.eval.results.worklist import find_work
+from ufmstar_torch.eval.suite.job import EvalJob
+from ufmstar_torch.eval.suite.shards import evaluate_suite
+from ufmstar_torch.eval.suite.work_items import ALL, find_work
 
 TRUTH = "depth_only=ground-truth:24x32"
 NAMES = ("ash", "birch", "cedar")
@@ -78,14 +78,12 @@ def _drawn(sequence, row):
     return RowResult(row, counts, metrics.compute(), metrics.curves(), {}, {}, {"metrics": metrics.state_dict()})
 
 
-def go(job, evaluate=None, *, resume=False, overwrite=False, stop=lambda: False, progress=lambda *_: None, **part):
-    """Open the folder and go through the sequences: (came to the end, lines that were reported). ``part``: of the
-    ``WorkerTask``."""
+def go(job, evaluate=None, **how):
+    """Evaluate in this process by a judge of one sequence (None: :class:`Stub`): (outcome, lines that were
+    reported)."""
     lines: list[str] = []
-    networks = job.load(torch.device("cpu"))
-    folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=overwrite)
-    how = {"stop": stop, "report": lines.append, "progress": progress, "evaluate": evaluate or Stub()}
-    return Worker(WorkerTask(job, **part), folder, networks, **how).run(), lines
+    outcome = evaluate_suite(job, **{"shard": ALL, **how}, report=lines.append, evaluate=evaluate or Stub())
+    return outcome, lines
 
 
 def kept(out):

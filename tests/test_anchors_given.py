@@ -9,10 +9,8 @@ from torch import nn
 
 import scenes
 from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.anchors.given import Anchors, check_anchors
-from ufmstar_torch.anchors.tracker import Landmarks
+from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.frame import check_frame
 
 H, W = 48, 64
 ON = UfMStarConfig(anchors=AnchorConfig())
@@ -237,40 +235,3 @@ def test_kept_evidence_survives_saving_and_needs_anchors():
     model.ufm.load_state_dict(ufm.state_dict())
     model.reset(keep_evidence=True)
     assert torch.equal(model.ufm.overall_evidence, ufm.overall_evidence)
-
-
-# ---- confirmations ----
-
-
-def with_confirmed(confirmed):
-    one = torch.ones(1, 3)
-    return Anchors(torch.tensor([[[10.0, 10.0], [20.0, 20.0], [30.0, 30.0]]]), 2 * one, 0.01 * one, None, confirmed)
-
-
-def test_confirmations_accompany_the_anchors():
-    depth, count = torch.full((1, H, W), 2.0), torch.tensor([[0, 1, 3]], dtype=torch.int32)
-    options = {"feature_count": 0, "rotation_tolerance": 1e-4}
-    frame = check_frame(depth, torch.eye(4)[None], K[None], None, None, None, None, **options)
-    other = resize_intrinsics(K, (H, W), (2 * H, 2 * W))
-    given = with_confirmed(count).moved(other, K).to("cpu")
-    assert check_anchors(given, frame).confirmed.tolist() == [[0, 1, 3]]
-    assert check_anchors(with_confirmed(None), frame).confirmed is None
-    landmarks = Landmarks(np.zeros((2, 2)), np.ones(2), np.ones(2), 2, np.array([4, 7]))
-    assert landmarks.anchors(K.numpy(), K, capacity=3).confirmed.tolist() == [[4, 7, 0]]
-
-
-@pytest.mark.parametrize(
-    ("confirmed", "error", "told"),
-    [
-        (torch.zeros(1, 3), TypeError, "anchors.confirmed must be a torch.int32 or torch.int64 tensor, got"),
-        (
-            np.zeros((1, 3), int),
-            TypeError,
-            "anchors.confirmed must be a torch.int32 or torch.int64 tensor, got ndarray",
-        ),
-        (torch.zeros(1, 2).long(), ValueError, r"anchors.confirmed must have shape \(1, 3\), got \(1, 2\)"),
-    ],
-)
-def test_confirmations_of_another_kind_are_named(confirmed, error, told):
-    with pytest.raises(error, match=told):
-        UfMStar(ON)(torch.full((1, H, W), 2.0), torch.eye(4)[None], K[None], anchors=with_confirmed(confirmed))

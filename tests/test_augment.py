@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageEnhance
 from torch import Tensor
 
-from ufmstar_torch.eval.tour import box_room as synthetic
+import scenes
 from ufmstar_torch.train import Augmentation, AugmentationConfig
 from ufmstar_torch.train.augment import Change, apply_colour, apply_geometry, camera_change, draw
 
@@ -77,11 +77,11 @@ def test_a_point_is_seen_where_the_new_intrinsics_project_it(pixel, change, zoom
 def test_a_rendered_room_is_the_room_seen_by_the_rolled_camera(zoom):
     """Ray-cast again with K' and the rolled pose, an exact depth image agrees off the edges (no flip: a mirrored
     room is another room)."""
-    room, pose = synthetic.BoxRoom.furnished(25, 3), synthetic.look((0.2, 0.0, -0.1), 0.6, 0.1)
+    pose = scenes.look((0.2, 0.0, -0.1), 0.6, 0.1)
     change = Change(scale=1.3, angle=0.08, shift=(5.0, 3.0))
     camera = K.clone()
     camera[0, 1] = 0.0  # the renderer knows no skew
-    depth = torch.from_numpy(synthetic.render(room, pose, camera.numpy(), *SIZE))
+    depth = torch.from_numpy(scenes.render(pose, camera.numpy(), *SIZE))
     _, new_depth, new_K = apply_geometry(torch.zeros(3, *SIZE, dtype=torch.float64), depth, camera, change, zoom)
     # Columns of the new camera's axes in the old one: points turn by +angle, so the axes turn by -angle.
     roll = np.eye(4)
@@ -90,7 +90,7 @@ def test_a_rendered_room_is_the_room_seen_by_the_rolled_camera(zoom):
     optics = new_K.clone()
     if zoom == "depth":  # the same pixels with the camera that explains them without moving points
         optics[:2, :2] *= change.scale
-    exact = torch.from_numpy(synthetic.render(room, pose @ roll, optics.numpy(), *SIZE))
+    exact = torch.from_numpy(scenes.render(pose @ roll, optics.numpy(), *SIZE))
     expected = exact / change.scale if zoom == "depth" else exact
     valid = new_depth > 0
     error = (new_depth - expected).abs()[valid] / expected[valid]

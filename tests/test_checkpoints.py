@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from shared_data import require_shared
 from torch import Tensor, nn
 
-from ufmstar_torch.models import CheckpointError, checkpoints, load_state_dict_file, load_weights, save_checkpoint
+from ufmstar_torch.models import CheckpointError, atomic, load_state_dict_file, load_weights, save_checkpoint
 
 FORMATS = ["w.pth", "w.pt", "w.safetensors"]
 
@@ -258,7 +258,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, name: str, monkeypat
     def full_disk(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(checkpoints.os, "fsync", full_disk)
+    monkeypatch.setattr(atomic.os, "fsync", full_disk)
     with pytest.raises(OSError, match="No space left"):
         save_checkpoint(tmp_path / name, Small())
     assert [p.name for p in tmp_path.iterdir()] == [name]

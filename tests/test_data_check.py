@@ -16,7 +16,6 @@ from shared_data import require_shared
 from ufmstar_torch.cli import main
 from ufmstar_torch.eval.check.data_check import check_data
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
-from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS
 from ufmstar_torch.eval.tour import export_tour
 from ufmstar_torch.eval.tour.sequence import open_tour
@@ -256,10 +255,3 @@ def test_the_page_names_every_layout():
     from ufmstar_torch.eval.sequences.layout import LAYOUTS
 
     assert set(re.findall(r"^\| `(\w+)` \|", PAGE.read_text(), re.M)) == set(LAYOUTS) - {"auto"}
-
-
-def test_tours_are_checked_without_files():
-    result = check_data("tour:7?frames=3&size=48x64", pairs=1)
-    assert (result.layout, result.frames) == ("tour", 3)
-    with pytest.raises(ValueError, match="poses must be one of"):
-        open_sequence("tour:7", poses="x")

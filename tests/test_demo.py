@@ -1,4 +1,4 @@
-"""``ufmstar demo``: its rows against the pipeline and independent sums, its outputs, and what goes wrong."""
+"""``ufmstar demo``: its rows against the pipeline and independent sums, its outputs, and refusals."""
 
 from __future__ import annotations
 
@@ -12,32 +12,39 @@ import numpy as np
 import pytest
 import torch
 from demo_networks import SIZE, SPEC, members, write_members
-from runs import read_summary
+from runs import Recorder, read_summary
 
 from ufmstar_torch import UncertainDepth, cli
 from ufmstar_torch.eval.commands import demo
-from ufmstar_torch.eval.commands.demo import DEMO, demo_rows, sheet_rows, surface_kinds
-from ufmstar_torch.eval.commands.demo_command import DemoOptions
-from ufmstar_torch.eval.engine.judge import RegionMetrics
+from ufmstar_torch.eval.commands.demo import DemoOptions
+from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
 from ufmstar_torch.eval.engine.networks import NetworkSource
-from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream
+from ufmstar_torch.eval.engine.stream import FrameSink
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
+from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.methods.ufm import UfM
-from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.report.demo import (
+    DEMO_FILES,
+    ENSEMBLE,
+    NETWORK,
+    POSTERIOR,
+    ROWS,
+    DemoFrames,
+    sheet_rows,
+    surface_kinds,
+)
 from ufmstar_torch.eval.report.figures_curves import write_curves
-from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, POSTERIOR
 from ufmstar_torch.eval.report.text import demo_explanation, demo_table
 from ufmstar_torch.eval.run.colours import colour_table
-from ufmstar_torch.eval.run.folder import FolderError, OutputFolder
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import make_tour, render, tour_sequence
 from ufmstar_torch.models import NetworkSpec, save_trained
 from ufmstar_torch.pipeline import NetworksInTurn
 
-METHODS = (NETWORK, UFM, UFM_STAR, POSTERIOR, ENSEMBLE)
 CPU = torch.device("cpu")
 FRAMES, SEED = 7, 5
 SHIPPED = Path(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))
+NAMES = dict(zip((row.slug for row in suite_named("demo").rows), ROWS, strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +60,7 @@ def sequence():
 
 @pytest.fixture(scope="module")
 def done(weights, tmp_path_factory):
-    """One demo through the command line: (folder, exit code, stdout, stderr). Nobody may change the folder."""
+    """One demo through the command line: (folder, exit code, stdout, stderr). No test may change the folder."""
     out = tmp_path_factory.mktemp("demo") / "out"
     words = ["--weights", weights, "--out", out, "--frames", FRAMES, "--seed", SEED]
     with pytest.MonkeyPatch.context() as patch:
@@ -64,40 +71,35 @@ def done(weights, tmp_path_factory):
     return out, code, "".join(message["out"]), "".join(message["err"])
 
 
-class Recorder:
-    """A stream that remembers; capfd is of function scope."""
-
-    encoding = "utf-8"
-
-    def __init__(self, parts):
-        self.parts = parts
-
-    def write(self, text):
-        self.parts.append(text)
-        return len(text)
-
-    def flush(self):
-        pass
+# ---- the command ----
 
 
-# ---- the whole command ----
-
-
-def test_the_command_prints_one_table_and_says_where_everything_is(done):
-    out, code, message, _ = done
+def test_the_command_prints_its_tables_and_where_everything_is(done):
+    out, code, message, progress = done
     assert code == 0
-    lines = message.splitlines()
+    lines, summary = message.splitlines(), read_summary(out)
     for name in ("delta1", "NLL", "ECE_delta", "ECE_q", "AUSE [m]", "network ms", "+ ms", "state kB"):
         assert name in lines[0]
     assert [line[:26].strip() for line in lines[1:6]] == [
         "3 members in turn, alone", "with UfM", "with UfM*", "posterior", "all 3 members per image",
     ]  # fmt: skip
+    assert max(map(len, lines)) <= 130 + len(str(out))
+    assert message == f"{demo_table(summary)}\n\n{demo_explanation(summary)}\n"
     for name in ("contact_sheet.png", "calibration.png", "mixture.ply", "summary.json"):
         assert f"{out}/{name}: " in message
-    assert max(map(len, lines)) <= 130 + len(str(out))
+    for line, method in zip(lines[1:6], ROWS, strict=True):
+        figures = summary["methods"][method]["figures"]
+        assert line[26:].split()[:5] == [
+            f"{figures[key]:.3g}" for key in ("delta1", "nll", "ece_delta", "ece_q", "ause_rmse")
+        ]
+        for kind in ("familiar", "unfamiliar"):
+            assert f"{summary['surfaces'][kind][method]['rms_sigma']:.3g}" in message
+    for stage in ("rooms", "kernels", "frames", "pictures"):
+        assert f"{stage}: 100%" in progress
+        assert f"{stage}: 100%" not in message
 
 
-def test_everything_is_there_and_complete(done):
+def test_files_and_summary(done, weights):
     out, *_ = done
     assert sorted(p.name for p in out.iterdir()) == sorted([*DEMO_FILES, "summary.json"])
     summary = read_summary(out)
@@ -107,20 +109,13 @@ def test_everything_is_there_and_complete(done):
     header = (out / "mixture.ply").read_bytes().split(b"end_header")[0].decode()
     assert f"element vertex {summary['components']}\n" in header
     curves = json.loads((out / "curves.json").read_text())
-    assert len(curves) == 5
-    assert all(len(values["ece_q_observed"]) == 10 for values in curves.values())
-
-
-def test_the_summary_says_what_made_it(done, weights):
-    out, *_ = done
-    summary = read_summary(out)
+    assert [len(values["ece_q_observed"]) for values in curves.values()] == [10] * 5
     assert summary["program"] == "ufmstar demo"
     assert summary["tour"] == {"seed": SEED, "style": "mixed", "frames": FRAMES, "size": list(SIZE)}
     network = summary["network"]
-    assert (network["file"], network["members"]) == (weights.name, 3)
+    assert (network["file"], network["members"], len(network["sha256"])) == (weights.name, 3, 64)
     assert network["training"] == {"note": "a test"}
     assert NetworkSpec.from_dict(network["spec"]) == SPEC
-    assert len(network["sha256"]) == 64
     assert torch.__version__.startswith(summary["versions"]["torch"])
     assert summary["seconds"] > 0
 
@@ -128,12 +123,11 @@ def test_the_summary_says_what_made_it(done, weights):
 def test_times_and_memory_of_every_row(done):
     summary = read_summary(done[0])
     rows = summary["methods"]
-    assert list(rows) == list(METHODS)
+    assert list(rows) == list(ROWS)
     assert all(rows[m]["network_ms"] == rows[NETWORK]["network_ms"] > 0 for m in (UFM, UFM_STAR, POSTERIOR))
     assert rows[ENSEMBLE]["network_ms"] > rows[NETWORK]["network_ms"], "three inferences take longer than one"
+    assert rows[POSTERIOR]["uncertainty_ms"] > rows[UFM_STAR]["uncertainty_ms"] > 0
     assert rows[UFM]["uncertainty_ms"] > 0
-    assert rows[UFM_STAR]["uncertainty_ms"] > 0
-    assert rows[POSTERIOR]["uncertainty_ms"] > rows[UFM_STAR]["uncertainty_ms"]
     assert rows[NETWORK]["uncertainty_ms"] is rows[ENSEMBLE]["uncertainty_ms"] is None
     assert rows[UFM]["state_bytes"] == 40 * summary["points"] > 0
     assert rows[UFM_STAR]["state_bytes"] == 64 * summary["components"] > 0
@@ -141,14 +135,7 @@ def test_times_and_memory_of_every_row(done):
     assert rows[NETWORK]["state_bytes"] == rows[ENSEMBLE]["state_bytes"] == 0
 
 
-def test_progress_goes_to_stderr(done):
-    _, _, message, progress = done
-    for stage in ("rooms", "kernels", "frames", "pictures"):
-        assert f"{stage}: 100%" in progress
-        assert f"{stage}: 100%" not in message
-
-
-# ---- the rows are what they say ----
+# ---- the rows ----
 
 
 class Collected(FrameSink):
@@ -161,13 +148,14 @@ class Collected(FrameSink):
         self.results.append(result)
 
 
-def walked(networks, frames, indices=None, sinks=(), keys=METHODS):
-    """The frames through the demo's rows: their results."""
+def walked(networks, frames, count=FRAMES, sinks=(), names=ROWS):
+    """The first frames through rows of the suite: (frame, results by the row's name) of each."""
     source = NetworkSource(NetworksInTurn(networks, preprocess=networks[0].preprocess), CPU, {}, seeding=None)
+    rows = [row for row in suite_named("demo").rows if NAMES[row.slug] in names]
     collected = Collected()
-    rows = [row for row in demo_rows(source, CPU) if row.key in keys]
-    FrameStream(frames, indices or range(FRAMES), rows).drive([collected, *sinks])
-    return collected.results
+    judge = Judge({"aleatoric": source, "ensemble": source}, CPU, limit=slice(count))
+    evaluate_sequence(frames, rows, judge, sinks=[collected, *sinks])
+    return [(r.frame, {NAMES[slug]: row for slug, row in r.rows.items()}) for r in collected.results]
 
 
 @pytest.fixture(scope="module")
@@ -180,61 +168,33 @@ def inputs(frame):
     return image, torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None]
 
 
-def test_ufm_star_is_the_pipeline_with_members_in_turn(compared):
-    networks = members()
-    pipeline, added = UncertainDepth(networks, preprocess=networks[0].preprocess), 0.0
-    for index, result in enumerate(compared):
-        want, got = pipeline(*inputs(result.frame)), result.rows
-        assert want.member == index % 3
+def test_the_rows_are_one_member_in_turn_ufm_ufm_star_and_all_members(compared):
+    networks, ufm, added = members(), UfM(), 0.0
+    pipeline = UncertainDepth(networks, preprocess=networks[0].preprocess)
+    for index, (frame, got) in enumerate(compared):
+        image, pose, K = inputs(frame)
+        want = pipeline(image, pose, K)
         for method in (NETWORK, UFM, UFM_STAR):
-            assert got[method].member == want.member
+            assert got[method].member == want.member == index % 3
             assert torch.equal(got[method].estimate.depth, want.depth[0])
-        star, own = got[UFM_STAR].estimate.variance, got[NETWORK].estimate.variance
+        star, alone = got[UFM_STAR].estimate.variance, got[NETWORK].estimate.variance
         assert torch.equal(star.nan_to_num(-1), want.variance[0].nan_to_num(-1))
-        assert torch.equal(own, want.prediction.variance[0])
-        added += float((star - own).nanmean())
+        assert torch.equal(alone, want.prediction.variance[0])
+        added += float((star - alone).nanmean())
+        with torch.no_grad():
+            x, K = networks[0].preprocess(image, K)
+            predictions = [network(x) for network in networks]
+        points = ufm(want.depth, pose, K, predictions[index % 3].aleatoric_variance)
+        assert torch.equal(got[UFM].estimate.variance, points.variance[0])
+        d = torch.stack([p.depth[0] for p in predictions]).double()
+        a = torch.stack([p.aleatoric_variance[0] for p in predictions]).double()
+        mixed = got[ENSEMBLE].estimate
+        assert torch.allclose(mixed.depth.double(), d.mean(0), atol=1e-6)
+        assert torch.allclose(mixed.variance.double(), a.mean(0) + d.var(0, correction=0), rtol=1e-5)
     assert added > 0, "the members disagree"
 
 
-def test_ufm_judges_the_same_predictions(compared):
-    networks, ufm = members(), UfM()
-    for index, result in enumerate(compared):
-        image, pose, K = inputs(result.frame)
-        with torch.no_grad():
-            x, K = networks[0].preprocess(image, K)
-            prediction = networks[index % 3](x)
-        want = ufm(prediction.depth, pose, K, prediction.aleatoric_variance)
-        assert torch.equal(result.rows[UFM].estimate.variance, want.variance[0])
-
-
-def test_the_ensemble_row_is_the_mixture_of_all_members(sequence, compared):
-    networks, frame = members(), sequence[3]
-    image, _, K = inputs(frame)
-    with torch.no_grad():
-        predictions = [network(network.preprocess(image, K)[0]) for network in networks]
-    d = torch.stack([p.depth[0] for p in predictions]).double()
-    a = torch.stack([p.aleatoric_variance[0] for p in predictions]).double()
-    got = compared[3].rows[ENSEMBLE].estimate
-    assert torch.allclose(got.depth.double(), d.mean(0), atol=1e-6)
-    assert torch.allclose(got.variance.double(), a.mean(0) + d.var(0, correction=0), rtol=1e-5)
-
-
-def test_one_network_is_no_ensemble(sequence):
-    [result] = walked(members(1), sequence, range(1))
-    assert tuple(result.rows) == (NETWORK, UFM, UFM_STAR, POSTERIOR)
-
-
-def test_networks_without_a_variance_are_refused(ufmstar, tmp_path):
-    save_trained(
-        tmp_path / "plain.safetensors", members(1, replace(SPEC, method="depth")), replace(SPEC, method="depth")
-    )
-    words = ["--weights", tmp_path / "plain.safetensors", "--frames", 2, "--seed", SEED]
-    code, _, err = ufmstar("demo", "--out", tmp_path / "out", *words)
-    assert code == 1
-    assert "a variance of their own" in err
-
-
-# ---- the figures ----
+# ---- the figures by kind of room ----
 
 
 def test_pixels_belong_to_the_room_they_show():
@@ -244,9 +204,8 @@ def test_pixels_belong_to_the_room_they_show():
     both = 0
     for entry in frames.entries[::3]:
         view = render(tour, torch.from_numpy(entry.T_world_cam), torch.from_numpy(frames.intrinsics), *SIZE)
-        result = surface_kinds(
-            tour, Frame(0, "", None, view.depth.float().numpy(), entry.T_world_cam, frames.intrinsics)
-        )
+        frame = Frame(0, "", None, view.depth.float().numpy(), entry.T_world_cam, frames.intrinsics)
+        result = surface_kinds(tour, frame)
         rooms = tour.surfaces.rooms[view.surface].numpy()
         only = rooms[..., 1] < 0  # not the frame of a door, which belongs to two rooms
         hall = np.array([style == "hall" for style in tour.room_styles])
@@ -255,45 +214,22 @@ def test_pixels_belong_to_the_room_they_show():
     assert both >= 2, "some frames must show both kinds through a door"
 
 
-def test_figures_by_kind_and_overall(sequence):
-    tour = make_tour(SEED, "mixed")
-
-    def region_of(result, row):
-        kinds = surface_kinds(tour, result.frame)
-        kinds[:, : SIZE[1] // 3] = 1  # so that there are both kinds in every frame
-        return torch.from_numpy(kinds)
-
-    regions, metrics = RegionMetrics(METHODS, ("a", "b"), region_of), SequenceMetrics()
-    squares, spread = {"a": [], "b": []}, {"a": [], "b": []}
-    for result in walked(members(), sequence, sinks=[regions]):
-        frame, estimate = result.frame, result.rows[UFM_STAR].estimate
-        kinds = region_of(result, None).numpy()
-        metrics.update(estimate.depth, estimate.variance, torch.from_numpy(frame.depth), estimate.valid)
-        for number, kind in enumerate("ab"):
-            use = (kinds == number) & (frame.depth > 0) & estimate.valid.numpy()
-            squares[kind].append((estimate.depth.numpy()[use].astype(float) - frame.depth[use]) ** 2)
-            spread[kind].append(estimate.variance.numpy()[use].astype(float))
-    by_kind, whole = regions.by_region(), regions.overall()[UFM_STAR].compute()
-    for kind in "ab":
-        figures = by_kind[kind][UFM_STAR]
-        assert figures["rmse"] == pytest.approx(np.concatenate(squares[kind]).mean() ** 0.5, rel=1e-6)
-        assert figures["rms_sigma"] == pytest.approx(np.concatenate(spread[kind]).mean() ** 0.5, rel=1e-6)
-    expected = metrics.compute()
-    assert whole.keys() == expected.keys()
-    for name, value in expected.items():
-        assert whole[name] == pytest.approx(value, rel=1e-9, nan_ok=True), name
-
-
-def test_the_table_shows_the_figures_of_the_summary(done):
-    summary = read_summary(done[0])
-    text = demo_table(summary)
-    for method in METHODS:
-        for key in ("delta1", "nll", "ece_delta", "ece_q", "ause_rmse"):
-            assert f"{summary['methods'][method]['figures'][key]:.3g}" in text
-        for kind in ("familiar", "unfamiliar"):
-            assert f"{summary['surfaces'][kind][method]['rms_sigma']:.3g}" in text
-    assert done[2].startswith(text)
-    assert demo_explanation(summary) in done[2]
+def test_figures_by_kind(sequence):
+    kinds = [np.zeros(SIZE, np.int64) for _ in range(FRAMES)]
+    for kind in kinds:
+        kind[:, : SIZE[1] // 3] = 1
+    frames = DemoFrames(NAMES, kinds)
+    squares, spread = ([], []), ([], [])
+    for (frame, rows), kind in zip(walked(members(), sequence, sinks=[frames]), kinds, strict=True):
+        estimate = rows[UFM_STAR].estimate
+        for number in (0, 1):
+            use = (kind == number) & (frame.depth > 0) & estimate.valid.numpy()
+            squares[number].append((estimate.depth.numpy()[use].astype(float) - frame.depth[use]) ** 2)
+            spread[number].append(estimate.variance.numpy()[use].astype(float))
+    for number, figures in enumerate(frames.by_kind().values()):
+        assert figures[UFM_STAR]["rmse"] == pytest.approx(np.concatenate(squares[number]).mean() ** 0.5, rel=1e-6)
+        assert figures[UFM_STAR]["rms_sigma"] == pytest.approx(np.concatenate(spread[number]).mean() ** 0.5, rel=1e-6)
+    assert len(frames.panels) == len(sheet_rows([False] * FRAMES))
 
 
 @pytest.mark.parametrize(
@@ -315,89 +251,66 @@ def test_rows_of_the_sheet(unfamiliar, expected):
     assert rows == sorted(rows, key=lambda row: (unfamiliar[row], row))
 
 
-# ---- what goes wrong ----
+# ---- refusals ----
+
+REFUSED = {
+    "frames": (("--frames", 1), 2, "--frames must be at least 2"),
+    "seed": (("--seed", -1), 2, "--seed must be at least 0"),
+    "device": (("--device", "cuda:99"), 2, "--device cuda:99 is not available"),
+    "threads": (("--threads", 0), 2, "--threads must be at least 1"),
+    "unknown": (("--frame-rate", 3), 2, "--frame-rate"),
+    "no weights": (("--weights", "none.safetensors"), 2, "no such file: none.safetensors"),
+    "no networks": (("--weights", "{tmp}/bad.safetensors"), 1, "bad.safetensors"),
+    "no variance": (("--weights", "{tmp}/plain.safetensors", "--frames", 2), 1, "a variance of their own"),
+    "a file": (("--out", "{tmp}/bad.safetensors"), 2, "is a file"),
+    "other files": (("--out", "{tmp}/other", "--overwrite"), 2, "holds files of someone else"),
+    "earlier": (("--out", "{tmp}/earlier"), 2, "holds an earlier demo: --overwrite replaces it"),
+}
 
 
-def test_a_folder_of_someone_else_is_left_alone(ufmstar, weights, tmp_path):
-    (tmp_path / "summary.json").write_text('{"program": "ufmstar run"}')
-    (tmp_path / "contact_sheet.png").write_text("mine")
-    code, _, err = ufmstar("demo", "--out", tmp_path, "--weights", weights, "--overwrite")
-    assert code == 2
-    assert "holds files of someone else" in err
-    assert (tmp_path / "contact_sheet.png").read_text() == "mine"
-    (tmp_path / "file").write_text("")
-    assert "is a file" in ufmstar("demo", "--out", tmp_path / "file", "--weights", weights)[2]
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusals(ufmstar, tmp_path, weights, case):
+    (tmp_path / "bad.safetensors").write_bytes(b"not this")
+    plain = replace(SPEC, method="depth")
+    save_trained(tmp_path / "plain.safetensors", members(1, plain), plain)
+    for name, program in (("other", "ufmstar run"), ("earlier", "ufmstar demo")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "summary.json").write_text(json.dumps({"program": program}))
+        (tmp_path / name / "contact_sheet.png").write_text("mine")
+    words, code, reason = REFUSED[case]
+    words = [str(word).format(tmp=tmp_path) for word in words]
+    got, _, err = ufmstar("demo", "--out", tmp_path / "out", "--weights", weights, "--seed", SEED, *words)
+    assert got == code
+    assert reason in err.splitlines()[-1]
+    assert (tmp_path / "other" / "contact_sheet.png").read_text() == "mine"
 
 
-def test_an_earlier_demo_is_replaced_only_when_asked(done, tmp_path):
-    for name in ("summary.json", "mixture.ply"):
-        (tmp_path / name).write_bytes((done[0] / name).read_bytes())
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(FolderError, match="--overwrite replaces it"):
-        OutputFolder.open(tmp_path, DEMO, {})
-    assert (tmp_path / "mixture.ply").exists()
-    OutputFolder.open(tmp_path, DEMO, {}, overwrite=True)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["notes.txt", "summary.json"]
-    OutputFolder.open(tmp_path, DEMO, {})  # one that was interrupted needs no permission
-
-
-def test_missing_weights_are_named(ufmstar, tmp_path, monkeypatch):
-    code, _, err = ufmstar("demo", "--out", tmp_path / "out", "--weights", tmp_path / "none.safetensors")
-    assert (code, "no such file" in err, "none.safetensors" in err) == (2, True, True)
+def test_a_package_without_weights(ufmstar, tmp_path, monkeypatch):
     monkeypatch.setattr(demo, "_WEIGHTS", ("weights", "gone.safetensors"))
     code, _, err = ufmstar("demo", "--out", tmp_path / "out")
-    assert code == 2
-    assert "weights/gone.safetensors" in err
-    assert "--weights FILE" in err
+    assert (code, "weights/gone.safetensors; --weights FILE" in err) == (2, True)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_file_that_holds_no_networks_is_named(ufmstar, tmp_path):
-    bad = tmp_path / "bad.safetensors"
-    bad.write_bytes(b"not this")
-    code, _, err = ufmstar("demo", "--out", tmp_path / "out", "--weights", bad)
-    assert code != 0
-    assert "bad.safetensors" in err
-    assert len(err.strip().splitlines()) == 1
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("--frames", 1), "--frames must be at least 2"),
-        (("--seed", -1), "--seed must be at least 0"),
-        (("--device", "cuda:99"), "--device cuda:99 is not available"),
-        (("--threads", 0), "--threads must be at least 1"),
-    ],
-    ids=str,
-)
-def test_impossible_options_are_named(ufmstar, weights, tmp_path, words, told):
-    code, _, err = ufmstar("demo", "--out", tmp_path / "out", "--weights", weights, *words)
-    assert code == 2
-    assert told in err
-
-
-def test_an_unknown_option_is_refused(capfd):
-    assert cli.main(["demo", "--frame-rate", "3"]) == 2
-    assert "--frame-rate" in capfd.readouterr().err
-
-
-def test_without_matplotlib_there_is_still_the_same_table(weights, tmp_path, monkeypatch, ufmstar, done):
+def test_an_earlier_demo_is_replaced_and_without_matplotlib_the_figures_are_the_same(
+    weights, tmp_path, monkeypatch, ufmstar, done
+):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     colour_table.cache_clear()
-    out = tmp_path / "out"
-    code, message, _ = ufmstar("demo", "--out", out, "--weights", weights, "--frames", FRAMES, "--seed", SEED)
+    for name, text in (("summary.json", '{"program": "ufmstar demo"}'), ("notes.txt", "mine"), ("mixture.npz", "old")):
+        (tmp_path / name).write_text(text)
+    words = ("--weights", weights, "--frames", FRAMES, "--seed", SEED, "--overwrite")
+    code, message, _ = ufmstar("demo", "--out", tmp_path, *words)
     assert code == 0
-    again, before = (read_summary(folder)["methods"] for folder in (out, done[0]))
-    assert all(again[method]["figures"] == before[method]["figures"] for method in METHODS)
-    assert message.splitlines()[3].startswith("  with UfM*")
+    again, before = (read_summary(folder)["methods"] for folder in (tmp_path, done[0]))
+    assert all(again[method]["figures"] == before[method]["figures"] for method in ROWS)
     assert "no contact_sheet.png: pictures need matplotlib" in message
-    assert (out / "mixture.npz").exists()
-    assert not (out / "contact_sheet.png").exists()
-    assert read_summary(out)["outputs"]["curves.json"] is None
+    assert (tmp_path / "mixture.npz").read_bytes() == (done[0] / "mixture.npz").read_bytes()
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert not (tmp_path / "contact_sheet.png").exists()
 
 
-def test_ctrl_c_is_told_as_such(monkeypatch, ufmstar):
+def test_ctrl_c(monkeypatch, ufmstar):
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -405,20 +318,15 @@ def test_ctrl_c_is_told_as_such(monkeypatch, ufmstar):
     assert ufmstar("demo") == (130, "", "ufmstar demo: interrupted\n")
 
 
-# ---- the calibration picture ----
-
-
 def test_the_calibration_picture_needs_something_to_draw(tmp_path):
     with pytest.raises(ValueError, match="1 to 6 methods"):
         write_curves(tmp_path / "x.png", {})
-    assert not (tmp_path / "x.png").exists()
 
 
-# ---- what the package brings ----
+# ---- the networks of the package ----
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not SHIPPED.is_file(), reason="the checkpoint has not been trained yet")
 def test_the_shipped_networks_are_small_and_several():
     from ufmstar_torch.models.trained import load_trained, read_info
 
@@ -426,13 +334,13 @@ def test_the_shipped_networks_are_small_and_several():
     info = read_info(SHIPPED)
     assert info.members >= 3
     assert "command" in json.dumps(info.info), "a checkpoint says which command trained it"
-    frames = tour_sequence(DemoOptions().seed, frames=40, size=info.spec.size, style="mixed")
-    tour = make_tour(DemoOptions().seed, "mixed")
-    kinds = ("familiar", "unfamiliar")
-    shown = (NETWORK, UFM_STAR)
-    regions = RegionMetrics(shown, kinds, lambda result, _: torch.from_numpy(surface_kinds(tour, result.frame)))
-    walked(load_trained(SHIPPED), frames, range(0, 40, 2), [regions], shown)
-    outcome = regions.by_region()
-    assert outcome["familiar"][UFM_STAR]["delta1"] > 0.6
-    assert outcome["unfamiliar"][UFM_STAR]["rms_sigma"] > outcome["familiar"][UFM_STAR]["rms_sigma"]
-    assert outcome["unfamiliar"][UFM_STAR]["nll"] < outcome["unfamiliar"][NETWORK]["nll"]
+    seed = DemoOptions().seed
+    frames = tour_sequence(seed, frames=40, size=info.spec.size, style="mixed")
+    tour = make_tour(seed, "mixed")
+    every_other = replace(frames, entries=frames.entries[::2])
+    by_kind = DemoFrames(NAMES, [surface_kinds(tour, frame) for frame in every_other])
+    walked(load_trained(SHIPPED), every_other, 20, [by_kind], (NETWORK, UFM_STAR, POSTERIOR))
+    familiar, unfamiliar = by_kind.by_kind().values()
+    assert familiar[UFM_STAR]["rmse"] < unfamiliar[UFM_STAR]["rmse"]
+    assert unfamiliar[UFM_STAR]["rms_sigma"] > familiar[UFM_STAR]["rms_sigma"]
+    assert unfamiliar[UFM_STAR]["rms_sigma"] > unfamiliar[NETWORK]["rms_sigma"]

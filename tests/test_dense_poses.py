@@ -159,14 +159,6 @@ def test_nothing_measured_leaves_what_is_believed_of_the_poses():
     np.testing.assert_allclose(errors.positions(K, 320, 2.0), before, rtol=1e-6)
 
 
-def test_a_saved_state_is_the_same():
-    one, *_ = known(3, turned=0.001)
-    other = PoseErrors(3, 0.8)
-    other.load_state(one.state())
-    for name, value in one.state().items():
-        np.testing.assert_array_equal(other.state()[name], value)
-
-
 def around(rho_right, rho_here):
     """A gray step down the middle; anchors on a grid, the one in the middle on the step."""
     image = np.full((120, 120), 60, np.uint8)

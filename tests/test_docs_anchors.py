@@ -11,7 +11,7 @@ import torch
 
 import scenes
 from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.eval.commands.run_command import read
+from ufmstar_torch.eval.commands.run import read
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "anchors.md"
 H, W = 48, 64

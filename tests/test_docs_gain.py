@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from ufmstar_torch.eval.results.record import Record
+from ufmstar_torch.eval.suite.record import Record
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 

@@ -11,7 +11,7 @@ from onnx_files import small_network, write_fastdepth
 
 from ufmstar_torch.eval.bench.memory import overhead_percent, weight_bytes
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, depth_alone, timed_networks
-from ufmstar_torch.eval.bench.race import MultiviewStep
+from ufmstar_torch.eval.bench.parts import MultiviewStep, StepInput
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.efficiency import megabytes
@@ -29,10 +29,10 @@ from ufmstar_torch.prediction import DepthPrediction
 def step_memory(name, size, K):
     """What the table counts for the multiview step of a row after one frame."""
     step = MultiviewStep(Row(Method.parse(name)), torch.device("cpu"))
-    depth, variance = torch.full((1, *size), 2.0), torch.full((1, *size), 0.01)
+    depth, variance, K = torch.full((1, *size), 2.0), torch.full((1, *size), 0.01), torch.tensor([K]).double()
     prediction = DepthPrediction(depth, aleatoric_variance=variance)
-    step(prediction, torch.eye(4, dtype=torch.float64)[None], torch.tensor([K]).double())
-    step.note()
+    image = torch.zeros(1, 3, *size)
+    step(StepInput((image, K), torch.eye(4, dtype=torch.float64)[None], (image, K), prediction), first=True)
     return step.memory()
 
 

@@ -16,10 +16,10 @@ from runs import job_of, outputs, read_summary
 from shared_data import require_shared
 from torch import Tensor
 
-from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.engine.load import NetworkChoice, network_source
 from ufmstar_torch.eval.run import machine
 from ufmstar_torch.eval.run.folder import FolderError
+from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.models import (

@@ -13,11 +13,11 @@ from tiny_suite import Biased, evaluate, in_memory, row
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig, UncertainDepth, cli
 from ufmstar_torch.anchors import Anchors, LandmarkMap, LandmarkTracker, landmark_source
 from ufmstar_torch.anchors.dense import DenseEvidence
-from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.engine.anchors import landmark_digests, landmarks_of
 from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
 from ufmstar_torch.eval.methods.setting import setting_from
 from ufmstar_torch.eval.report.text import run_table
+from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.tour.sequence import open_tour
 from ufmstar_torch.models import Preprocess
 

@@ -77,7 +77,7 @@ EVAL_ORDER = (
     ("tour", "methods"),
     ("engine",),
     ("run",),
-    ("results",),
+    ("suite",),
     ("bench", "check", "report"),
     ("commands",),
 )

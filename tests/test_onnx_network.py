@@ -344,3 +344,18 @@ def test_missing_packages_name_the_extra(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ModuleNotFoundError, match=r"needs the package onnx: .*ufmstar-torch\[models\]"):
         FastDepth.from_onnx(path)
+
+
+def test_a_node_that_fails_at_run_time_names_the_file(tmp_path: Path) -> None:
+    """A graph whose reshape fits images of 8 x 8 only, although its input is open."""
+    red = numpy_helper.from_array(np.array([[[[1]], [[0]], [[0]]]], np.float32), "red")
+    shape = numpy_helper.from_array(np.array([1, 1, 8, 8], np.int64), "shape")
+    nodes = [
+        helper.make_node("Conv", ["image", "red"], ["channel"]),
+        helper.make_node("Reshape", ["channel", "shape"], ["depth"]),
+    ]
+    path = save(tmp_path / "n.onnx", nodes, [red, shape], [("image", ["n", 3, "h", "w"])], [("depth", None)])
+    network = OnnxNetwork(path, OnnxSpec(METRIC))
+    assert network(torch.rand(1, 3, 8, 8)).depth.shape == (1, 8, 8)
+    with pytest.raises(ValueError, match=r"(?s)n.onnx: a node fails when .*\(1, 3, 16, 16\).*preprocess.size"):
+        network(torch.rand(1, 3, 16, 16))

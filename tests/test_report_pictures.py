@@ -52,10 +52,10 @@ from ufmstar_torch.eval.report.rooms import (
     project,
 )
 from ufmstar_torch.eval.report.write import write_report
-from ufmstar_torch.eval.results.record import Record
-from ufmstar_torch.eval.results.worklist import WorkItem
 from ufmstar_torch.eval.run.colours import INVALID_GREY
 from ufmstar_torch.eval.run.panels import break_name
+from ufmstar_torch.eval.suite.record import Record
+from ufmstar_torch.eval.suite.work_items import WorkItem
 
 UP = np.array([0.0, 0.0, 1.0])
 K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])

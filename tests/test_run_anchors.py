@@ -12,14 +12,14 @@ from runs import Brightness, job_of, networks, outputs, read_summary
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig, UncertainDepth, cli
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
-from ufmstar_torch.eval.commands.run import job_from, run
-from ufmstar_torch.eval.commands.run_command import read
+from ufmstar_torch.eval.commands.run import job_from, read
 from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
 from ufmstar_torch.eval.report.text import run_table
 from ufmstar_torch.eval.run.folder import FolderError
-from ufmstar_torch.eval.run.journal import why_none
 from ufmstar_torch.eval.run.panels import map_columns
 from ufmstar_torch.eval.run.pictures import Finished
+from ufmstar_torch.eval.run.recorder import why_none
+from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.video import preview_frame
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.open import open_sequence
@@ -297,11 +297,11 @@ def test_images_and_opencv_are_needed(tour, monkeypatch, tmp_path):
     words = [TOUR, "--depth", "self", "--anchors", "--out", str(tmp_path / "out")]
     options = read(words)
     blind = with_entries(tour, lambda _, e: dataclasses.replace(e, load_image=None))
-    monkeypatch.setattr("ufmstar_torch.eval.commands.run.open_sequence", lambda *_, **__: blind)
+    monkeypatch.setattr("ufmstar_torch.eval.sequences.open.open_sequence", lambda *_, **__: blind)
     with pytest.raises(ValueError, match=r"--anchors tracks corners of images, of which the sequence .* has none"):
         job_from(options)
-    monkeypatch.setattr("ufmstar_torch.eval.commands.run.open_sequence", lambda *_, **__: tour)
-    monkeypatch.setattr("ufmstar_torch.eval.commands.run.find_spec", lambda _: None)
+    monkeypatch.setattr("ufmstar_torch.eval.sequences.open.open_sequence", lambda *_, **__: tour)
+    monkeypatch.setattr("ufmstar_torch.eval.run.make_job.find_spec", lambda _: None)
     with pytest.raises(ModuleNotFoundError, match=r"--anchors needs OpenCV: pip install 'ufmstar-torch\[eval\]'"):
         job_from(options)
 

@@ -102,19 +102,6 @@ def test_reference_partitions(name, tier):
     assert jittered == JITTERED[name]
 
 
-def test_pruning_of_the_reference_in_both_readings():
-    """Also that the number of merged segments is the authors'; the other tier prunes as the oracle does (below)."""
-    r = reference("spgf_224_tartanair_indoor")
-    r = replace(r, depth=r.depth[:1], intrinsics=r.intrinsics[:1], frames=r.frames[:1])
-    for prune, rule in (("both", np.logical_or), ("either", np.logical_and)):
-        mixture, labels = TIERS["numba"](r.depth, r.intrinsics, replace(r.config, prune=prune))
-        for b, expected in enumerate(r.frames):
-            keep = rule(expected["n_pixels"] >= 200, expected["n_segments"] >= 8)
-            slot = np.append(np.where(keep, keep.cumsum() - 1, -1), -1)
-            assert np.array_equal(labels[b].numpy(), slot[expected["labels"]])
-            assert np.array_equal(occupied(mixture, b)[2], expected["n_pixels"][keep])
-
-
 @given(st.integers(0, 10**6), configs, st.integers(1, 24), st.integers(1, 30), st.booleans())
 def test_torch_and_numba_against_the_oracle(seed, config, height, width, with_options):
     depth, K = clutter(seed, height, width)
@@ -228,20 +215,22 @@ def test_thresholds_follow_the_image():
     assert not torch.equal(fixed_large[1], large[1])
 
 
-def test_slope_keeps_metric_thresholds():
-    scaled = SPGFConfig.preset("tum")
-    fixed = replace(scaled, scale_with_image=False)
-    assert scaled.slope(525.0) == pytest.approx(2.4 / 525)
-    assert scaled.slope(100.0) == pytest.approx(2.4 / 525)
-    assert fixed.slope(100.0) == pytest.approx(2.4 / 100)
-    # The camera's own focal length: an image of half the size has half of it, and the same threshold in metres.
-    own = replace(scaled, slope_focal="camera")
-    assert own.scaled_to(480, 640).slope(320.0) == pytest.approx(2.4 / 320)
-    assert own.scaled_to(240, 320).slope(160.0) == pytest.approx(2.4 / 320)
-    assert own.scaled_to(240, 320).scaled_to(480, 640).slope(320.0) == pytest.approx(2.4 / 320)
-    # The centre of a 640 x 480 image, enlarged to its width: f is larger, and so is the resolution.
-    assert own.scaled_to(240, 640).slope(320.0) == pytest.approx(2.4 / 320)
-    assert replace(own, scale_with_image=False).scaled_to(240, 320).slope(160.0) == pytest.approx(2.4 / 160)
+@pytest.mark.parametrize(
+    ("slope_focal", "scale_with_image", "size", "focal", "expected"),
+    [
+        ("reference", True, (480, 640), 100.0, 2.4 / 525),
+        ("reference", False, (480, 640), 100.0, 2.4 / 100),
+        # The camera's own focal length: an image of half the size has half of it, and the same threshold in metres.
+        ("camera", True, (480, 640), 320.0, 2.4 / 320),
+        ("camera", True, (240, 320), 160.0, 2.4 / 320),
+        # The centre of a 640 x 480 image, enlarged to its width: f is larger, and so is the resolution.
+        ("camera", True, (240, 640), 320.0, 2.4 / 320),
+        ("camera", False, (240, 320), 160.0, 2.4 / 160),
+    ],
+)
+def test_slope_keeps_metric_thresholds(slope_focal, scale_with_image, size, focal, expected):
+    config = replace(SPGFConfig.preset("tum"), slope_focal=slope_focal, scale_with_image=scale_with_image)
+    assert config.scaled_to(*size).slope(focal) == pytest.approx(expected)
 
 
 @pytest.mark.slow

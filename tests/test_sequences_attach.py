@@ -78,30 +78,12 @@ def test_kitti_rows_by_place_and_a_wrong_count(numbered):
         open_sequence(path, **options)
 
 
-def test_stamps_that_are_neither(numbered):
-    path, _, options = numbered
-    write(options["trajectory"], [500.5 + i / 30 for i in range(FRAMES)])
-    with pytest.raises(
-        ValueError, match=r"are no frame numbers of the images: pass fps|images lie at 7\.000 to 12\.000"
-    ):
-        open_sequence(path, **options)
-
-
 def test_the_layouts_own_poses_are_not_needed(tmp_path):
     path, _, _ = layouts.write_scannet(tmp_path)
     (path / "pose" / "1.txt").write_text("-inf -inf -inf -inf\n" * 4)
     (path / "pose" / "2.txt").unlink()
     write(tmp_path / "slam.txt", range(FRAMES), form="{}")
     assert_moved(open_sequence(path, trajectory=tmp_path / "slam.txt"), range(FRAMES))
-
-
-def test_depth_stays_registered_with_a_trajectory(tmp_path):
-    """7-Scenes: the trajectory is the colour camera's, and depth is warped into that camera as before."""
-    path, _, _ = layouts.write_seven_scenes(tmp_path)
-    write(tmp_path / "slam.txt", range(FRAMES), form="{}")
-    sequence = open_sequence(path, trajectory=tmp_path / "slam.txt")
-    np.testing.assert_array_equal(sequence[3].depth, open_sequence(path)[3].depth)
-    assert_moved(sequence, range(FRAMES))
 
 
 def test_orb_slam3_in_nanoseconds(tmp_path):

@@ -63,29 +63,11 @@ def test_a_sequence_itself_is_found_at_depth_0(root):
     assert found(root, max_depth=0) == {}
 
 
-def test_depth_is_limited(root):
-    assert "a__b__walk" not in found(root, max_depth=2)
-    assert "a__b__walk" in found(root, max_depth=3)
-    assert set(found(root, max_depth=1)) == {"office__P000", "office__P001"}
-
-
-def test_only_one_layout(root):
-    assert set(found(root, layout="tartanair")) == {"office__P000", "office__P001"}
-    assert found(root, layout="generic") == {"a__b__walk": ("generic", root / "a" / "b" / "walk")}
-
-
 def test_links_in_a_circle_end_and_links_do_not_double(root):
     (root / "a" / "again").symlink_to(root)
     (root / "a" / "b" / "walk2").symlink_to(root / "a" / "b" / "walk")
     (root / "0first").symlink_to(root / "scans")
     assert {name: layout for name, (layout, _) in found(root, max_depth=9).items()} == NAMES
-
-
-def test_a_link_to_somewhere_else_counts(root, tmp_path_factory):
-    elsewhere = tmp_path_factory.mktemp("elsewhere")
-    layouts.write_generic(elsewhere, frames=1)
-    (root / "linked").symlink_to(elsewhere)
-    assert set(found(root)) == {*NAMES, "linked__walk"}
 
 
 def test_hidden_folders_and_those_of_others_are_left_out(root, monkeypatch):

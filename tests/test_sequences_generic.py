@@ -31,15 +31,6 @@ def test_row_i_belongs_to_the_i_th_image_by_number(tmp_path):
     np.testing.assert_allclose(sequence.intrinsics, truth.K)
 
 
-def test_kitti_rows_and_a_wrong_count(tmp_path):
-    path, truth = layouts.write_generic(tmp_path)
-    np.savetxt(path / "poses.txt", [T[:3].ravel() for T in truth.T_world_cam])
-    np.testing.assert_allclose(open_sequence(path)[5].T_world_cam, truth.T_world_cam[5])
-    np.savetxt(path / "poses.txt", [T[:3].ravel() for T in truth.T_world_cam[:5]])
-    with pytest.raises(ValueError, match="trajectory has 5 poses for 6 images"):
-        open_sequence(path)
-
-
 def test_a_link_without_its_file_keeps_its_place_and_is_an_error_of_its_frame(tmp_path):
     path, truth = layouts.write_generic(tmp_path)
     (path / "images" / "7.png").unlink()

@@ -9,16 +9,13 @@ from layouts import truncate
 from layouts_more import write_h5, write_nyu
 from tiny_suite import evaluate
 
-from ufmstar_torch.eval.check.check import check_sequence
-from ufmstar_torch.eval.commands.run import job_from
-from ufmstar_torch.eval.commands.run_command import read
+from ufmstar_torch.eval.commands.run import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences import FrameError, find_sequences, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.train.nyu import NyuFrames
 
 NAMES = ("kitchen_1__9", "kitchen_1__10", "office_2__11", "office_2__12")
 
@@ -38,20 +35,6 @@ def test_frames_and_that_they_have_no_poses(written):
         np.testing.assert_array_equal(frame.image, truth.images[i])
         np.testing.assert_allclose(frame.depth, truth.depths[i], rtol=1e-6)
         np.testing.assert_array_equal(frame.T_world_cam, np.eye(4))
-
-
-def test_training_reads_the_same(written):
-    root, _ = written
-    frame, sample = open_sequence(root)[2], NyuFrames(root, "val").load(2)
-    np.testing.assert_array_equal(frame.image.transpose(2, 0, 1), sample.image)
-    np.testing.assert_array_equal(frame.depth, sample.depth)
-    np.testing.assert_allclose(frame.intrinsics, sample.intrinsics)
-
-
-def test_every_other_sequence_has_poses(tmp_path):
-    from layouts import write_generic
-
-    assert open_sequence(write_generic(tmp_path, frames=2)[0]).posed
 
 
 def test_parts_and_scenes(written):
@@ -129,10 +112,3 @@ def test_an_evaluation_refuses_rows_that_compare_views(written):
     rows = [Row(Method.parse(name)) for name in ("Aleatoric", "UfM*-Aleatoric")]
     with pytest.raises(SequenceError, match=r"single images without poses, on which UfM\*-Aleatoric cannot compare"):
         evaluate(open_sequence(written[0]), rows, {"aleatoric": None})
-
-
-def test_the_check_says_so(written):
-    result = check_sequence(open_sequence(written[0]))
-    assert result.ok
-    assert result.pairs == 0
-    assert result.undecided[0] == "there are no poses: methods that compare views cannot be run"

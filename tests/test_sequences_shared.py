@@ -9,7 +9,7 @@ import pytest
 from shared_data import require_shared
 
 from ufmstar_torch.eval.check.check import check_sequence
-from ufmstar_torch.eval.sequences import DepthFolder, open_sequence
+from ufmstar_torch.eval.sequences import open_sequence
 
 # folder, layout, frames, K (fx, fy, cx, cy), a depth scale that is wrong, and by how much
 RECORDINGS = {
@@ -89,10 +89,3 @@ def test_mocap_that_starts_late(tmp_path):
     assert 5 < len(expected) < 45
     assert {frame.reason for frame in sequence.skipped} == {"no pose within 0.1 s around the image"}
     assert len(sequence) == 50 - len(expected)
-
-
-def test_tartanair_depth_as_prediction():
-    path = require_shared("data/tartanair_sample")
-    sequence = open_sequence(path)
-    maps = DepthFolder(path / "P000" / "depth_left").for_frames(sequence.names)
-    np.testing.assert_array_equal(maps[7][0], sequence[7].depth)

@@ -12,8 +12,8 @@ from layouts import truncate, write_generic, write_image
 from tiny_suite import CPU, base_network, evaluate, row, same, write_networks
 
 from ufmstar_torch.eval.engine.predictions import Prediction, PredictionKey, frame_digest, sequence_digest
-from ufmstar_torch.eval.results.cache import CacheError, PredictionCache
 from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.suite.cache import CacheError, PredictionCache
 
 ROWS = [row(name) for name in ("Ensemble", "UfM*-Ensemble", "UfM*-MCD", "MC-Dropout", "Evidential", "UfM-DepthOnly")]
 KEY = PredictionKey("a" * 64, "b" * 64, "frame-7", "all", "c" * 64)

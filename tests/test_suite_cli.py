@@ -15,15 +15,15 @@ from ufmstar_torch.eval.commands import dry_run as dry
 from ufmstar_torch.eval.commands.eval_command import job_from, read
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.suite import names
-from ufmstar_torch.eval.results import launch
+from ufmstar_torch.eval.suite import shards
 
 
 @pytest.fixture
 def stubbed(monkeypatch):
     """The judge of sequences, replaced by one that draws figures; returns it."""
     stub = Stub()
-    own = launch.evaluate_suite
-    monkeypatch.setattr(launch, "evaluate_suite", lambda *given, **how: own(*given, evaluate=stub, **how))
+    own = shards.evaluate_suite
+    monkeypatch.setattr(shards, "evaluate_suite", lambda *given, **how: own(*given, evaluate=stub, **how))
     return stub
 
 
@@ -74,8 +74,8 @@ MISTAKES = {
     "no root": (["{}", "--root", "/nowhere"], "no such file or folder: /nowhere"),
     "frames": (["{}", "--frames", "5"], "--frames must be START:STOP"),
     "shard": (["{}", "--shard", "0/2"], "--shard must be 1/n to n/n"),
-    "shard and pool": (["{}", "--shard", "1/2", "--processes", "2"], "--shard and --processes contradict each other"),
-    "shard and overwrite": (["{}", "--shard", "1/2", "--overwrite"], "--overwrite goes without --shard"),
+    "shard and slurm": (["{}", "--shard", "1/2", "--slurm", "jobs=2"], "--shard and --slurm contradict each other"),
+    "shard and overwrite": (["{}", "--shard", "1/2", "--overwrite"], "--overwrite goes without shards"),
     "both": (["{}", "--resume", "--overwrite"], "--resume and --overwrite contradict"),
     "processes": (["{}", "--processes", "0"], "--processes must be at least 1"),
     "threads": (["{}", "--threads", "0"], "--threads must be at least 1"),
@@ -152,8 +152,8 @@ def test_a_signal_stops_in_good_order_and_resume_goes_on(ufmstar, rooms, tmp_pat
     code, text, err = ufmstar(*words_for(rooms, tmp_path / "out"))
     assert code == 130
     assert "1 sequence" in text
-    assert "stopped; finished rows are kept in " in err
-    assert "records; --resume goes on" in err
+    assert "stopped; finished rows are in " in err
+    assert "records; --resume continues" in err
     assert ufmstar(*words_for(rooms, tmp_path / "out", "--resume", "--no-report"))[0] == 0
     assert [name for name, _ in stubbed.asked] == ["ash", "birch", "birch", "cedar"]
 
@@ -223,7 +223,7 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
     rows = ["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"]
     (tmp_path / "timed.toml").write_text(f"efficiency = true\n[[rows]]\nmethods = {rows}\n")
     words = words_for(rooms, tmp_path / "out", "--no-report", "--threads", "1", suite=tmp_path / "timed.toml")
-    assert "measured when all sequences are evaluated" in ufmstar(*words, "--shard", "1/2")[1]
+    assert "this shard is complete, others are not" in ufmstar(*words, "--shard", "1/2")[2]
     assert measured == [], "another part may still be running"
     code, _, err = ufmstar(*words, "--shard", "2/2")
     assert (code, "measuring time, energy and memory" in err) == (0, True)

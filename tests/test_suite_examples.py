@@ -9,9 +9,9 @@ from layouts import truncate, write_generic
 from tiny_suite import base_network, evaluate, row, write_networks
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.eval.results.examples import ExampleWriter
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
+from ufmstar_torch.eval.suite.examples import ExampleWriter
 
 ROWS = [row("UfM*-Aleatoric"), row("Aleatoric"), row("DepthOnly"), row("UfM-Aleatoric-100K")]
 

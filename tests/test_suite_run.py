@@ -19,12 +19,12 @@ from tiny_suite import evaluate, rows_of
 from ufmstar_torch.eval.commands.eval_command import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.report.data import load_results
-from ufmstar_torch.eval.results.cache import CacheError
-from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.record import Record
-from ufmstar_torch.eval.results.work import DIED, with_references
-from ufmstar_torch.eval.results.worklist import Shard, content_digest
 from ufmstar_torch.eval.run.folder import FolderError
+from ufmstar_torch.eval.suite.cache import CacheError
+from ufmstar_torch.eval.suite.evaluate import with_references
+from ufmstar_torch.eval.suite.folder import EvalFolder
+from ufmstar_torch.eval.suite.record import Record
+from ufmstar_torch.eval.suite.work_items import Shard, content_digest
 
 
 def folder_of(job):
@@ -33,8 +33,8 @@ def folder_of(job):
 
 def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
     job = job_on(rooms, tmp_path / "out")
-    ended, message = go(job)
-    assert ended
+    outcome, message = go(job)
+    assert outcome.finished
     assert [line.split(":")[0] for line in message] == [f"rooms/{name}" for name in NAMES]
     record = Record.load(job.out / "records" / "rooms" / "birch" / "UfMstar-DepthOnly.json")
     assert (record.suite, record.dataset, record.sequence) == ("depth-only", "rooms", "birch")
@@ -66,7 +66,8 @@ def test_resume_computes_nothing_that_is_there(rooms, tmp_path):
     go(job)
     before = {path: path.stat().st_mtime_ns for path in job.out.rglob("*.json")}
     stub = Stub()
-    assert go(job, stub, resume=True) == (True, [])
+    outcome, lines = go(job, stub, resume=True)
+    assert (outcome.finished, outcome.complete, lines) == (True, True, [])
     assert stub.asked == []
     assert {path: path.stat().st_mtime_ns for path in job.out.rglob("*.json")} == before
 
@@ -94,8 +95,8 @@ def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path):
     root = write_rooms(tmp_path / "own")
     (root / "birch" / "poses.txt").write_text("not a pose\n")
     job = job_on(root, tmp_path / "out")
-    ended, message = go(job)
-    assert ended
+    outcome, message = go(job)
+    assert outcome.finished
     assert "rooms/birch: failed: " in message[1]
     assert sorted(path.split("/")[2] for path in kept(job.out)) == ["ash"] * 4 + ["cedar"] * 4
     failed = json.loads((job.out / "records" / "rooms" / "birch" / "failed.json").read_text())
@@ -105,7 +106,7 @@ def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path):
     # Mended, it is tried again.
     write_rooms(root, ["birch"])
     stub = Stub()
-    assert go(job, stub, resume=True)[0]
+    assert go(job, stub, resume=True)[0].finished
     assert [name for name, _ in stub.asked] == ["birch"]
     assert not folder_of(job).failures(job.items)
     go(job_on(rooms, tmp_path / "whole"))
@@ -129,7 +130,7 @@ def test_what_the_judge_cannot_use_is_broken_and_what_it_cannot_write_ends_all(r
     for error in (CacheError("disk full"), OSError("disk full"), TypeError("a mistake of ours")):
         with pytest.raises(type(error)):
             go(job, fails(error), resume=True)
-    assert go(job, resume=True)[0]
+    assert go(job, resume=True)[0].complete
 
 
 def test_real_sequences_without_ground_truth_are_broken(rooms, tmp_path):
@@ -138,7 +139,7 @@ def test_real_sequences_without_ground_truth_are_broken(rooms, tmp_path):
         file.unlink()
     (root / "ash" / "depth").rmdir()
     job = job_on(root, tmp_path / "out")
-    assert go(job, evaluate_sequence)[0]
+    assert go(job, evaluate_sequence)[0].finished
     assert folder_of(job).failures(job.items) == {"rooms/ash": "no frame has ground truth"}
     assert len(kept(job.out)) == 4
 
@@ -146,8 +147,8 @@ def test_real_sequences_without_ground_truth_are_broken(rooms, tmp_path):
 def test_images_without_poses_are_for_networks_alone(tmp_path):
     root, _ = write_nyu(tmp_path / "nyu")
     job = job_on(root, tmp_path / "out")
-    ended, message = go(job, evaluate_sequence)
-    assert ended
+    outcome, message = go(job, evaluate_sequence)
+    assert outcome.finished
     folder, (item,) = folder_of(job), job.items
     done = sorted(path.stem for path in folder.place(item).glob("*.json") if path.stem != "failed")
     assert done == ["DepthOnly"]
@@ -155,8 +156,8 @@ def test_images_without_poses_are_for_networks_alone(tmp_path):
     assert "no poses" in failure["reason"]
     assert failure["rows"] == ["UfM-DepthOnly", "UfM-DepthOnly-100K", "UfMstar-DepthOnly"]
     assert sum("failed" in line for line in message) == 1
-    again, message = go(job, evaluate_sequence, resume=True)
-    assert again
+    outcome, message = go(job, evaluate_sequence, resume=True)
+    assert outcome.finished
     assert sum("failed" in line for line in message) == 1, "it is told each time"
 
 
@@ -191,55 +192,45 @@ def test_another_sequence_of_the_name_is_refused(tmp_path):
         go(job, resume=True)
 
 
-def test_stopping_loses_the_sequence_in_hand_alone(rooms, tmp_path):
-    requested = []
-
-    def stop():
-        return bool(requested) and requested[-1] == ("birch", 2)
-
+def test_stopping_loses_the_sequence_at_work_alone(rooms, tmp_path):
+    reached = []
     job = job_on(rooms, tmp_path / "out")
-    assert not go(job, Stub(lambda *where: requested.append(where)), stop=stop)[0]
+    outcome, _ = go(job, Stub(lambda *where: reached.append(where)), stop=lambda: reached[-1:] == [("birch", 2)])
+    assert (outcome.finished, outcome.stopped, outcome.complete) == (False, True, False)
     assert {path.split("/")[2] for path in kept(job.out)} == {"ash"}
     stub = Stub()
-    assert go(job, stub, resume=True)[0]
+    assert go(job, stub, resume=True)[0].complete
     assert [name for name, _ in stub.asked] == ["birch", "cedar"]
 
 
-def killed_in_birch(job, launch):
-    """In a process of its own: ends by SIGKILL in the middle of the second sequence."""
-
+# Python 3.12 warns of forks beside threads; this process uses none of what is not its own.
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_a_kill_loses_the_sequence_at_work_alone(rooms, tmp_path):
     def before(name, done):
         if (name, done) == ("birch", 2):
             os.kill(os.getpid(), signal.SIGKILL)
 
-    child = multiprocessing.get_context("fork").Process(
-        target=go, args=(job, Stub(before)), kwargs={"resume": True, "launch": launch}
-    )
+    job = job_on(rooms, tmp_path / "out")
+    child = multiprocessing.get_context("fork").Process(target=go, args=(job, Stub(before)))
     child.start()
     child.join(60)
     assert child.exitcode == -signal.SIGKILL
-
-
-# Python 3.12 warns of forks beside threads; these processes use none of what is not theirs.
-forks = pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-
-
-@pytest.mark.slow
-@forks
-def test_a_kill_loses_the_sequence_in_hand_alone(rooms, tmp_path):
-    job = job_on(rooms, tmp_path / "out")
-    killed_in_birch(job, "")
     assert {path.split("/")[2] for path in kept(job.out)} == {"ash"}
+    place = folder_of(job).place(job.items[1])
+    begun, own = place / ".A.pt.0123456789ab.tmp", place / ".mine.tmp"
+    for file in (begun, own):
+        file.write_text("x")
     stub = Stub()
-    assert go(job, stub, resume=True)[0]
+    assert go(job, stub, resume=True)[0].complete
     assert [name for name, _ in stub.asked] == ["birch", "cedar"]
+    assert (begun.exists(), own.exists()) == (False, True), "what a killed process had begun to write is removed"
     go(job_on(rooms, tmp_path / "whole"))
     assert kept(job.out) == kept(tmp_path / "whole")
 
 
 def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, monkeypatch):
-    job = job_on(rooms, tmp_path / "out")
-    saved = []
+    job, saved, whole = job_on(rooms, tmp_path / "out"), [], Record.save
 
     def save(self, path):
         if len(saved) == 6:
@@ -247,7 +238,6 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, mon
         saved.append(path)
         whole(self, path)
 
-    whole = Record.save
     monkeypatch.setattr(Record, "save", save)
     with pytest.raises(KeyboardInterrupt):
         go(job)
@@ -260,43 +250,8 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, mon
     assert kept(job.out) == kept(tmp_path / "whole")
 
 
-@pytest.mark.slow
-@forks
-def test_helpers_do_not_try_again_what_killed_one_of_them(rooms, tmp_path):
-    job = job_on(rooms, tmp_path / "out")
-    killed_in_birch(job, "together")
-    stub = Stub()
-    ended, _ = go(job, stub, resume=True, launch="together", helps=True, shard=Shard(2, 2))
-    assert ended
-    assert [name for name, _ in stub.asked] == ["cedar"]
-    assert folder_of(job).failures(job.items) == {"rooms/birch": DIED}
-    # Nor what has failed for one of them.
-    assert go(job, stub, resume=True, launch="together")[0]
-    assert len(stub.asked) == 1
-    assert go(job, stub, resume=True, launch="later")[0]
-    assert [name for name, _ in stub.asked] == ["cedar", "birch"]
-
-
-def test_a_part_does_its_own_and_a_helper_the_rest(rooms, tmp_path):
-    for shard, helps, expected in (
-        (Shard(1, 2), False, ["ash", "cedar"]),
-        (Shard(2, 2), False, ["birch"]),
-        (Shard(2, 2), True, ["birch", "ash", "cedar"]),
-        (Shard(4, 4), False, []),
-    ):
+def test_a_shard_does_its_own(rooms, tmp_path):
+    for shard, expected in ((Shard(1, 2), ["ash", "cedar"]), (Shard(2, 2), ["birch"]), (Shard(4, 4), [])):
         stub = Stub()
-        out = tmp_path / f"{shard.index}{shard.count}{helps}"
-        assert go(job_on(rooms, out), stub, shard=shard, helps=helps)[0]
+        assert go(job_on(rooms, tmp_path / f"{shard.index}{shard.count}"), stub, shard=shard)[0].finished
         assert [name for name, _ in stub.asked] == expected
-
-
-def test_a_sequence_that_another_process_is_at_is_left_to_it(rooms, tmp_path):
-    job = job_on(rooms, tmp_path / "out")
-    networks = job.load(torch.device("cpu"))
-    folder = EvalFolder.open(job.out, job.about(networks), resume=False, overwrite=False)
-    stub = Stub()
-    with folder.claim(job.items[0], "other"):
-        ended, message = go(job, stub, resume=True)
-    assert ended
-    assert message[-1] == "left to another process that is at it: rooms/ash"
-    assert [name for name, _ in stub.asked] == ["birch", "cedar"]

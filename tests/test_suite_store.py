@@ -5,10 +5,8 @@ from __future__ import annotations
 import errno
 import fcntl
 import json
-import multiprocessing
 import os
 import random
-import time
 
 import pytest
 import torch
@@ -20,10 +18,9 @@ from suite_runs import NAMES, go, job_on, write_rooms
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
-from ufmstar_torch.eval.results.claim import ABANDONED_SECONDS
-from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest, find_work, read_names
 from ufmstar_torch.eval.run.folder import FolderError, differences, hold
+from ufmstar_torch.eval.suite.folder import EvalFolder
+from ufmstar_torch.eval.suite.work_items import Shard, WorkItem, content_digest, find_work, read_names
 
 # ---- work list ----
 
@@ -116,23 +113,23 @@ ABOUT = {
 
 def test_a_folder_is_begun_continued_and_replaced_only_as_asked(tmp_path):
     out = tmp_path / "out"
-    EvalFolder.open(out, ABOUT, resume=False, overwrite=False)
+    EvalFolder.open(out, ABOUT)
     with pytest.raises(FolderError, match="--resume goes on with it, --overwrite replaces it"):
-        EvalFolder.open(out, ABOUT, resume=False, overwrite=False)
-    EvalFolder.open(out, ABOUT, resume=True, overwrite=False)
-    EvalFolder.open(out, {**ABOUT, "suite": "y"}, resume=False, overwrite=True)
+        EvalFolder.open(out, ABOUT)
+    EvalFolder.open(out, ABOUT, resume=True)
+    EvalFolder.open(out, {**ABOUT, "suite": "y"}, overwrite=True)
     assert json.loads((out / "eval.json").read_text())["suite"] == "y"
 
 
 def test_files_of_someone_else_are_not_touched(tmp_path):
     (tmp_path / "thesis.tex").write_text("x")
     with pytest.raises(FolderError, match="files of someone else"):
-        EvalFolder.open(tmp_path, ABOUT, resume=True, overwrite=False)
+        EvalFolder.open(tmp_path, ABOUT, resume=True)
     with pytest.raises(FolderError, match="files of someone else"):
-        EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=True)
+        EvalFolder.open(tmp_path, ABOUT, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     with pytest.raises(FolderError, match="is a file"):
-        EvalFolder.open(tmp_path / "thesis.tex", ABOUT, resume=False, overwrite=False)
+        EvalFolder.open(tmp_path / "thesis.tex", ABOUT)
 
 
 def test_overwriting_removes_our_files_alone(tmp_path):
@@ -145,21 +142,23 @@ def test_overwriting_removes_our_files_alone(tmp_path):
     made = [out / "tables" / "main.md", out / "results.json", out / "cache" / "kept"]
     for file in made:
         file.write_text("made")
-    EvalFolder.open(out, ABOUT, resume=False, overwrite=True)
+    EvalFolder.open(out, ABOUT, overwrite=True)
     assert all(file.read_text() == "mine" for file in own)
     assert [file.exists() for file in made] == [False, False, True]
     left = {path.name for path in out.rglob("*") if path.is_file()}
-    assert left == {"eval.json", "eval.lock", ".writable", "kept", *(file.name for file in own)}
+    assert left == {"eval.json", "eval.lock", "eval-1-of-1.lock", ".writable", "kept", *(file.name for file in own)}
 
 
-def test_overwriting_waits_for_nobody(tmp_path):
-    folder = EvalFolder.open(tmp_path / "out", ABOUT, resume=False, overwrite=False)
-    with (
-        folder.claim(WorkItem("d", "s", "p", "auto"), "one"),
-        pytest.raises(FolderError, match="evaluating s there now"),
-    ):
-        EvalFolder.open(folder.path, ABOUT, resume=False, overwrite=True)
-    EvalFolder.open(folder.path, ABOUT, resume=False, overwrite=True)
+def test_a_shard_is_evaluated_by_one_process_and_not_overwritten_meanwhile(tmp_path):
+    out = tmp_path / "out"
+    with EvalFolder.open(out, ABOUT, shard=Shard(1, 2)):
+        with EvalFolder.open(out, ABOUT, shard=Shard(2, 2), resume=True):
+            pass
+        with pytest.raises(FolderError, match="another process is evaluating shard 1/2 there now"):
+            EvalFolder.open(out, ABOUT, shard=Shard(1, 2), resume=True)
+        with pytest.raises(FolderError, match="another process is evaluating there now"):
+            EvalFolder.open(out, ABOUT, overwrite=True)
+    EvalFolder.open(out, ABOUT, overwrite=True)
 
 
 @pytest.mark.parametrize(
@@ -172,110 +171,25 @@ def test_overwriting_waits_for_nobody(tmp_path):
     ],
 )
 def test_resuming_something_else_is_refused_by_name(tmp_path, changed, told):
-    EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False)
+    EvalFolder.open(tmp_path, ABOUT)
     with pytest.raises(FolderError, match=told):
-        EvalFolder.open(tmp_path, {**ABOUT, **changed}, resume=True, overwrite=False)
+        EvalFolder.open(tmp_path, {**ABOUT, **changed}, resume=True)
 
 
 def test_resuming_adds_rows_sequences_and_networks(tmp_path):
-    EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False)
+    EvalFolder.open(tmp_path, ABOUT)
     more = {
         "networks": {"ensemble": {"sha256": "c"}},
         "rows": [{"method": "B"}, {"method": "A"}],
         "sequences": [{"dataset": "d", "sequence": "t"}],
         "missing_bases": ["aleatoric", "evidential"],
     }
-    EvalFolder.open(tmp_path, {**ABOUT, **more}, resume=True, overwrite=False)
+    EvalFolder.open(tmp_path, {**ABOUT, **more}, resume=True)
     about = json.loads((tmp_path / "eval.json").read_text())
     assert about["networks"].keys() == {"aleatoric", "ensemble"}
     assert about["rows"] == [{"method": "A"}, {"method": "B"}]
     assert [s["sequence"] for s in about["sequences"]] == ["s", "t"]
     assert about["missing_bases"] == ["evidential"]
-
-
-@pytest.fixture(params=["flock", "no flock"])
-def flock(request, monkeypatch):
-    """Locks as the kernel has them, and as NFS mounted with nolock has them: granted to everybody."""
-    if request.param == "no flock":
-        monkeypatch.setattr(fcntl, "flock", lambda *_: None)
-
-
-def leave(claimed, **changes):
-    """A claim as a killed process leaves it whose number another process has now."""
-    holder = json.loads(claimed.path.read_text())
-    claimed.release()
-    claimed.path.write_text(json.dumps({**holder, "started": "1", **changes}))
-
-
-@pytest.mark.usefixtures("flock")
-def test_a_sequence_is_claimed_by_one(tmp_path):
-    folder, item = EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False), WorkItem("d", "s", "p", "auto")
-    first = folder.claim(item, "one")
-    assert first is not None
-    assert folder.claim(item, "two") is None
-    with folder.claim(WorkItem("d", "t", "p", "auto"), "two") as another_sequence:
-        assert not another_sequence.died
-    leave(first)
-    with folder.claim(item, "two") as other_launch:
-        assert not other_launch.died
-    leave(folder.claim(item, "one"))
-    with folder.claim(item, "one") as same_launch:
-        assert same_launch.died
-    with folder.claim(item, "one") as in_good_order:
-        assert not in_good_order.died
-    assert len(list(folder.place(item).iterdir())) == 1
-
-
-def test_a_claim_of_another_computer_counts_until_it_is_old(tmp_path):
-    folder, item = EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False), WorkItem("d", "s", "p", "auto")
-    claimed = folder.claim(item, "one")
-    leave(claimed, host="elsewhere")
-    assert folder.claim(item, "one") is None
-    old = time.time() - ABANDONED_SECONDS - 1
-    os.utime(claimed.path, (old, old))
-    with folder.claim(item, "one") as again:
-        assert again.died
-    # One that was killed before it wrote its name, likewise.
-    again.path.write_text("")
-    assert folder.claim(item, "one") is None
-    os.utime(again.path, (old, old))
-    assert folder.claim(item, "one") is not None
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # of forks, from Python 3.12 on
-def test_processes_that_claim_at_the_same_time_share_without_locks(tmp_path):
-    folder = EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False)
-    for n in range(0, 60, 2):  # half of them left by a process that was killed
-        leave(folder.claim(WorkItem("d", f"s{n}", "p", "auto"), "before"))
-    fork = multiprocessing.get_context("fork")
-    names, over = fork.Queue(), fork.Event()
-
-    def work():
-        fcntl.flock = lambda *_: None
-        names.put([n for n in range(60) if folder.claim(WorkItem("d", f"s{n}", "p", "auto"), "one") is not None])
-        over.wait(60)
-
-    children = [fork.Process(target=work) for _ in range(4)]
-    for child in children:
-        child.start()
-    taken = [names.get(timeout=60) for _ in children]
-    over.set()
-    for child in children:
-        child.join(60)
-    assert sorted(n for part in taken for n in part) == list(range(60))
-
-
-def test_temporary_files_of_a_killed_process_are_removed(tmp_path):
-    folder, item = EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False), WorkItem("d", "s", "p", "auto")
-    folder.place(item).mkdir(parents=True)
-    left = [tmp_path / ".eval.json.0123456789ab.tmp", folder.place(item) / ".A.pt.0123456789ab.tmp"]
-    kept = [tmp_path / ".report.html.0123456789ab.tmp", folder.place(item) / ".mine.tmp"]
-    for file in [*left, *kept]:
-        file.write_text("x")
-    with EvalFolder.open(tmp_path, ABOUT, resume=True, overwrite=False).claim(item, "one"):
-        assert not any(file.exists() for file in left)
-        assert all(file.exists() for file in kept)
 
 
 def test_a_row_without_its_sums_or_with_half_a_record_is_missing(tmp_path):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -12,14 +10,13 @@ from hypothesis import strategies as st
 
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.eval.tour import Tour, TourStyle, export_tour, make_tour, render, tour_path, tour_sequence
-from ufmstar_torch.eval.tour.box_room import intrinsics, look
+from ufmstar_torch.eval.tour import Tour, export_tour, make_tour, render, tour_path, tour_sequence
 from ufmstar_torch.eval.tour.intersect import entry
 from ufmstar_torch.eval.tour.sensor import develop
-from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD, Finish, ball, box, part, surfaces, tube, turn
+from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD, Finish, ball, box, part, surfaces, tube
 from ufmstar_torch.eval.tour.style import HALL_TEXTURES, HOME_TEXTURES, STYLES, TEXTURES
 from ufmstar_torch.eval.tour.texture import Patch, albedo, noise_table
-from ufmstar_torch.eval.tour.view import cast
+from ufmstar_torch.eval.tour.view import cast, intrinsics
 
 K = torch.from_numpy(intrinsics(24, 32))
 
@@ -81,14 +78,6 @@ def test_depth_of_a_sphere_is_the_quadratic_formula():
     np.testing.assert_allclose(depth_of(ball(centre, (r, r, r), Finish())), expected, rtol=1e-9)
 
 
-def test_depth_of_an_ellipsoid_is_that_of_a_ball_in_stretched_space():
-    half, d = np.array([0.5, 1.0, 0.25]), rays()
-    centre, d = np.array([0.0, 0.0, 3.0]) / half, d / half
-    a, b, c = (d * d).sum(-1), d @ centre, centre @ centre - 1
-    expected = np.where(b * b >= a * c, (b - np.sqrt(np.maximum(b * b - a * c, 0))) / a, np.inf)
-    np.testing.assert_allclose(depth_of(ball((0, 0, 3), half, Finish())), expected, rtol=1e-9)
-
-
 def test_depth_of_a_box_in_front_is_its_front_or_a_side():
     d, (x, z) = rays(), (0.5, 2.0)
     front = np.where((np.abs(d[..., 0]) * z <= x) & (np.abs(d[..., 1]) * z <= x), z, np.inf)
@@ -116,23 +105,6 @@ def test_depth_of_a_cylinder_and_of_its_cap():
     cap = np.where(np.hypot(d[..., 0], d[..., 1]) * 2 <= 0.8, 2.0, np.inf)
     on_end = depth_of(tube((0, 0, 3), 0.8, 1.0, Finish(), rotation=lying))
     np.testing.assert_allclose(on_end, cap, rtol=1e-9)
-
-
-def test_depth_of_a_cone():
-    """Apex (nearly) at the camera's height, so that x^2 + z^2 = (taper' y)^2 has the camera's axis in its plane."""
-    depth = depth_of(tube((0, 0, 3), 1.0, 1.0, Finish(), taper=0.2), size=(25, 33))
-    # In the middle row y = 0, where the radius is (1 + taper) / 2 = 0.6.
-    d = rays((25, 33))[12]
-    a, b, c = d[:, 0] ** 2 + 1, 3.0, 9 - 0.36
-    expected = np.where(b * b >= a * c, (b - np.sqrt(np.maximum(b * b - a * c, 0))) / a, np.inf)
-    np.testing.assert_allclose(depth[12], expected, rtol=1e-9)
-    points = rays((25, 33)) * np.where(np.isfinite(depth), depth, 0)[..., None]
-    seen = np.isfinite(depth)
-    y, r = points[seen][:, 1], np.hypot(points[seen][:, 0], points[seen][:, 2] - 3)
-    on_side = np.abs(r - (0.6 + 0.4 * y)) < 1e-9
-    on_cap = (np.abs(np.abs(y) - 1) < 1e-9) & (r <= 0.6 + 0.4 * y + 1e-9)
-    assert (on_side | on_cap).all()
-    assert on_side.sum() > 50
 
 
 def test_a_quad_is_seen_from_its_front_only():
@@ -174,17 +146,6 @@ def test_entry_is_the_first_point_of_the_solid(seed, kind, taper):
     assert inside((o + t[grazing, None] * d[grazing]) * (1 - 1e-9)).all()
 
 
-def test_rotated_box_and_moved_camera_agree_with_turning_the_world_back():
-    pose = look((0.4, -0.3, -1.0), 0.3, 0.1)
-    first = depth_of(box((0.5, 0.1, 3), (0.4, 0.7, 0.3), Finish(), yaw=0.8), pose=pose)
-    turned = np.eye(4)
-    turned[:3, :3] = turn(-0.8)
-    moved = turn(-0.8) @ np.array([0.5, 0.1, 3])
-    second = depth_of(box(moved, (0.4, 0.7, 0.3), Finish()), pose=turned @ pose)
-    assert np.isfinite(first).sum() > 30
-    np.testing.assert_allclose(first, second, rtol=1e-9)
-
-
 def test_the_nearer_surface_hides_the_farther_one():
     near, far = box((0.3, 0, 2), (0.2, 0.2, 0.2), Finish()), ball((0, 0, 5), (2, 2, 2), Finish())
     a, b = depth_of(near), depth_of(far)
@@ -210,7 +171,8 @@ def test_a_seed_makes_the_same_tour_and_pictures_for_any_number_of_threads(home)
     threads, state = torch.get_num_threads(), torch.get_rng_state()
     try:
         torch.set_num_threads(3)
-        again = make_tour(2, STYLES["home"])  # a style that is given whole is not kept
+        make_tour.cache_clear()
+        again = make_tour(2, "home")
         assert again is not home
         assert same(home, again)
         poses = tour_path(home, 40)
@@ -224,12 +186,6 @@ def test_a_seed_makes_the_same_tour_and_pictures_for_any_number_of_threads(home)
     assert torch.equal(views[0].image, views[1].image)
     assert torch.equal(views[0].depth, views[1].depth)
     assert torch.equal(state, torch.get_rng_state())
-
-
-def test_other_seeds_make_other_rooms_and_ways(home):
-    assert not same(home, make_tour(3))
-    assert not torch.equal(tour_path(home, 20, 1), tour_path(home, 20, 2))
-    assert not torch.equal(tour_path(home, 20, 1), tour_path(home, 20))
 
 
 def to_surfaces(tour: Tour, points: torch.Tensor) -> torch.Tensor:
@@ -368,24 +324,6 @@ def test_mixed_tours_begin_at_home_and_end_in_a_hall(mixed):
     assert of_home <= set(HOME_TEXTURES)
 
 
-@pytest.mark.parametrize("style", ["home", "hall"])
-def test_sizes_are_the_styles(style):
-    tour, expected = make_tour(SEEDS[style], style), STYLES[style]
-    size = tour.rooms[:, 1] - tour.rooms[:, 0]
-    assert expected.rooms[0] <= len(tour.rooms) <= expected.rooms[1]
-    assert ((size[:, [0, 2]] >= expected.room_size[0]) & (size[:, [0, 2]] <= expected.room_size[1])).all()
-    assert ((size[:, 1] >= expected.ceiling[0]) & (size[:, 1] <= expected.ceiling[1])).all()
-    kinds = torch.bincount(tour.surfaces.kind, minlength=4)
-    assert (kinds > 2).all(), "boxes, ellipsoids, frusta and quads"
-
-
-def test_shadows_darken_what_a_box_hides_from_the_lamp(home):
-    assert home.volumes.min() < 0.3
-    assert home.volumes.max() == 1
-    # High up in a room, hardly anything stands between a point and the lamps; near the floor, much does.
-    assert home.volumes[:, 0, 2].mean() > home.volumes[:, 0, -1].mean()
-
-
 def test_the_sensor_is_mild_and_repeats(home):
     pose = tour_path(home, 10)[4]
     clean = render(home, pose, K, 24, 32).image.double()
@@ -425,17 +363,6 @@ def test_image_and_depth_of_a_frame_come_from_one_rendering(monkeypatch):
     assert len(calls) == 9
     np.testing.assert_array_equal(sequence[0].image, frames[0].image)
     assert len(calls) == 10, "only a few are kept"
-
-
-def test_path_seed_and_sensor_are_options_of_the_name():
-    plain, other = (
-        open_sequence("tour:2?frames=4&size=24x32"),
-        open_sequence("tour:2?frames=4&size=24x32&path=3&sensor=0"),
-    )
-    assert not np.array_equal(plain[0].T_world_cam, other[0].T_world_cam)
-    same_seed = open_sequence("tour:2?size=24x32&path=3&frames=4")
-    np.testing.assert_array_equal(same_seed[1].depth, other[1].depth)
-    assert not np.array_equal(same_seed[1].image, other[1].image)
 
 
 @pytest.mark.parametrize(
@@ -501,36 +428,3 @@ def test_bad_input_is_named(home):
     ):
         with pytest.raises(ValueError, match=expected):
             call()
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"textures": ()},
-        {"textures": ("velvet",)},
-        {"rooms": (0, 3)},
-        {"rooms": (4, 3)},
-        {"room_size": (1.0, 4.0)},
-        {"ceiling": (1.5, 3.0)},
-        {"camera_height": (1.0, 3.0)},
-        {"warmth": (-2.0, 0.0)},
-        {"brightness": (0.0, 1.0)},
-        {"scale": (1.0, 9.0)},
-        {"furniture": -1.0},
-    ],
-)
-def test_impossible_styles_are_refused(change):
-    with pytest.raises(ValueError, match=next(iter(change))):
-        replace(TourStyle(), **change)
-    with pytest.raises(ValueError, match=next(iter(change))):
-        TourStyle.from_dict({name: list(v) if isinstance(v, tuple) else v for name, v in change.items()})
-
-
-def test_a_style_of_ones_own_from_plain_values():
-    style = TourStyle.from_dict({"name": "cell", "rooms": [1, 1], "room_size": [3.0, 3.2], "furniture": 0.2})
-    tour = make_tour(0, style)
-    assert len(tour.rooms) == 1
-    assert tour.room_styles == ("cell",)
-    assert render(tour, tour_path(tour, 5)[2], K, 24, 32).valid.all()
-    with pytest.raises(ValueError, match=r"TourStyle has no \['colour'\]"):
-        TourStyle.from_dict({"colour": "red"})

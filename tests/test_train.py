@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from shared_data import require_shared
-from trainings import RECIPE, SPEC, scenes, tiny_job, with_network, write_frames
+from trainings import RECIPE, SPEC, logged, scenes, tiny_job, with_network, write_frames
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.commands.options import parse, parser_of
@@ -39,7 +39,6 @@ from ufmstar_torch.train import (
 from ufmstar_torch.train.command import TrainOptions
 from ufmstar_torch.train.examples import camera_image
 from ufmstar_torch.train.fit import fit
-from ufmstar_torch.train.history import METRICS, read_rows
 from ufmstar_torch.train.member import WEIGHTS, make_data, new_network
 from ufmstar_torch.train.presets import table
 from ufmstar_torch.train.start import train_only
@@ -67,17 +66,16 @@ def test_it_learns_depth_and_where_the_depth_is_noisy(tmp_path):
     size = (64, 64)
     folders = [str(write_frames(tmp_path / f"walk{n}", 12, size, noise=0.9, seed=n)) for n in (1, 2, 3)]
     recipe = replace(with_network(RECIPE, size=size), epochs=20, average=0.0)
-    job = tiny_job(folders[0], tmp_path / "out", recipe, augment=False, checkpoint_every=0)
+    job = tiny_job(folders[0], tmp_path / "out", recipe, augment=False)
     parts = {"part": "0:", "validation_part": "0:", "validation_paths": (folders[1],)}
     summary = fit(replace(job, data=replace(job.data, paths=(folders[0], folders[2]), **parts)))
-    rows = read_rows(tmp_path / "out" / "member_0" / METRICS)
-    first, last = ({name: float(value) for name, value in rows[i].items()} for i in (0, -1))
-    assert [int(row["epoch"]) for row in rows] == list(range(20))
-    assert last["step"] == 120
-    assert last["train_loss"] < first["train_loss"] - 0.3
+    losses, last = logged(tmp_path / "out", "train_loss_epoch"), summary["mean"]
+    assert len(losses) == 20
+    assert len(logged(tmp_path / "out", "train_loss")) == summary["members"][0]["steps"] == 120
+    assert losses[-1] < losses[0] - 0.3
     assert last["val_nll"] < last["val_nll_constant_best"] - 0.15
     assert last["val_nll_constant_best"] <= last["val_nll_constant"]
-    assert summary["mean"]["val_nll"] == last["val_nll"]
+    assert last["val_nll"] == pytest.approx(logged(tmp_path / "out", "val_nll")[-1], rel=1e-5)
     (network,) = load_trained(tmp_path / "out" / WEIGHTS)
     images, depths, _, red = scenes(12, size, noisy=True)
     with torch.no_grad():
@@ -105,7 +103,8 @@ def test_what_a_training_leaves(pair):
     stored = json.loads((out / "summary.json").read_text())
     assert stored["members"] == summary["members"]
     # Validated at the end, although no epoch ended there.
-    assert [(m["steps"], m["figures"]["step"]) for m in summary["members"]] == [(4, 4), (4, 4)]
+    assert [m["steps"] for m in summary["members"]] == [4, 4]
+    assert all(len(logged(out, "val_rmse", member)) == 2 for member in (0, 1))
 
 
 def test_the_file_of_all_members_predicts_as_the_members(pair):
@@ -160,7 +159,7 @@ def test_bfloat16_trains_and_its_loss_is_in_single_precision(frames, tmp_path):
     losses = []
     for name, precision in (("full", "32-true"), ("mixed", "bf16-mixed")):
         fit(tiny_job(frames, tmp_path / name, recipe, precision=precision))
-        losses.append(float(read_rows(tmp_path / name / "member_0" / METRICS)[-1]["train_loss"]))
+        losses += logged(tmp_path / name, "train_loss")
     assert losses[0] != losses[1]
     assert losses[0] == pytest.approx(losses[1], rel=0.05)
 
@@ -217,14 +216,12 @@ def test_a_loss_that_is_not_finite_names_its_samples_and_loses_nothing(frames, t
         return replace(distribution, log_variance=distribution.log_variance * (float("nan") if bad else 1.0))
 
     monkeypatch.setattr(TrainingModule, "_distribution", poisoned)
-    job = tiny_job(frames, tmp_path / "out", recipe, checkpoint_every=1)
+    job = tiny_job(frames, tmp_path / "out", recipe)
     message = r"the loss is not finite in epoch 0, batch 1 \(step 1\), samples "
     with pytest.raises(NonFiniteLossError, match=message) as caught:
         fit(job)
     data = make_data(job, 1, 1)
-    batches = data.train_dataloader().batches
-    batches.set_epoch(0, 1)
-    for key in next(iter(batches)):
+    for key in list(data.train_dataloader().batch_sampler)[1]:
         assert data.train_set.source.name(key.frame) in str(caught.value)
     assert len(load_trained(tmp_path / "out" / WEIGHTS)) == 1
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["stopped"] == "failed"

@@ -1,4 +1,4 @@
-"""The order of training samples: shares of processes, resumption inside an epoch, workers."""
+"""The order of training samples: shares of processes, epochs, workers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from training_data import loader, numbers, truncated, write_nyu
 
 from ufmstar_torch.models import Preprocess
-from ufmstar_torch.train import Augmentation, AugmentationConfig, EpochBatches, EpochLoader, NyuFrames, SampleDataset
+from ufmstar_torch.train import Augmentation, AugmentationConfig, EpochBatches, NyuFrames, SampleDataset
+from ufmstar_torch.train.data import sample_loader
 
 LENGTHS = {"length": st.integers(1, 200), "batch_size": st.integers(1, 9), "world": st.integers(1, 4)}
 
@@ -49,16 +50,14 @@ def test_validation_takes_every_frame_once(length, batch_size, world):
 
 
 def test_order_depends_on_seed_and_epoch_alone():
-    def order(seed, epoch, start=0):
+    def order(seed, epoch):
         batches = EpochBatches(50, 7, seed=seed)
-        batches.set_epoch(epoch, start)
+        batches.set_epoch(epoch)
         torch.manual_seed(np.random.default_rng().integers(1000))
         return [key.frame for batch in batches for key in batch]
 
     assert order(1, 2) == order(1, 2)
     assert len({tuple(order(s, e)) for s in range(3) for e in range(3)}) == 9
-    assert order(1, 2)[3 * 7 :] == order(1, 2, start=3)
-    assert order(1, 2, start=7) == []
     assert sorted(order(1, 2)) != order(1, 2)
 
 
@@ -66,44 +65,13 @@ def test_impossible_orders_are_named():
     for wrong in ({"length": 0}, {"batch_size": 0}, {"seed": -1}, {"rank": 1}, {"rank": -1}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             EpochBatches(**{"length": 9, "batch_size": 3, **wrong})
-    for epoch, start in ((-1, 0), (0, 4), (0, -1)):
-        with pytest.raises(ValueError, match="epoch"):
-            EpochBatches(9, 3).set_epoch(epoch, start)
-
-
-def test_a_loader_goes_on_inside_an_epoch():
-    """What a killed run has seen, and what the next one sees from its checkpoint's state, is one epoch."""
-    whole = loader()
-    whole.set_epoch(3)
-    expected = list(whole)
-    killed = loader()
-    killed.set_epoch(3)
-    seen = []
-    for batch in killed:
-        seen.append(batch)
-        if len(seen) == 2:
-            state = killed.state_dict()
-            break
-    assert state == {"epoch": 3, "batch": 2}
-    resumed = loader()
-    resumed.load_state_dict(state)
-    resumed.set_epoch(3)  # Lightning calls it at the start of the epoch it goes on with
-    assert len(resumed) == len(expected) == 5
-    assert resumed.state_dict() == state
-    seen += list(resumed)
-    assert len(seen) == 5
-    for one, two in zip(seen, expected, strict=True):
-        assert all(torch.equal(one[name].nan_to_num(-1), two[name].nan_to_num(-1)) for name in one)
-    assert resumed.state_dict() == {"epoch": 4, "batch": 0}
-    resumed.set_epoch(4)
-    assert len(list(resumed)) == 5
 
 
 def test_epochs_differ_and_passes_over_one_do_not():
     batches = loader()
     first = [numbers(batch) for batch in batches]
     assert [numbers(batch) for batch in batches] == first
-    batches.set_epoch(1)
+    batches.batch_sampler.sampler.set_epoch(1)
     assert [numbers(batch) for batch in batches] != first
 
 
@@ -123,12 +91,12 @@ def test_worker_processes_load_the_same_and_report_broken_files(tmp_path):
     def made(workers):
         augmentation = Augmentation(AugmentationConfig(crop="random"))
         dataset = SampleDataset(frames, Preprocess(size=(32, 40)), augmentation, on_bad_file="skip")
-        return EpochLoader(dataset, EpochBatches(len(frames), 2, seed=9), workers=workers)
+        return sample_loader(dataset, EpochBatches(len(frames), 2, seed=9), workers)
 
     alone, apart = made(0), made(1)
     for epoch in (0, 1):
         for one in (alone, apart):
-            one.set_epoch(epoch)
+            one.batch_sampler.sampler.set_epoch(epoch)
         for one, two in zip(alone, apart, strict=True):
             assert all(torch.equal(one[name].nan_to_num(-1), two[name].nan_to_num(-1)) for name in one)
     assert apart.dataset.bad_files() == alone.dataset.bad_files() == (str(frames.files[1]),)

@@ -172,7 +172,9 @@ def test_a_data_module_gives_each_process_its_share_and_tells_broken_files(tmp_p
         DepthDataModule(data.config, PLAIN).train_dataloader()
     seen = []
     for rank in (0, 1):
-        data.trainer = SimpleNamespace(global_rank=rank, world_size=2)
+        progress = SimpleNamespace(current=SimpleNamespace(processed=0))
+        fit_loop = SimpleNamespace(epoch_progress=progress)
+        data.trainer = SimpleNamespace(global_rank=rank, world_size=2, fit_loop=fit_loop)
         assert len(data.train_dataloader()) == 3
         seen += [batch["depth"].sum().item() for batch in data.val_dataloader()]
         list(data.train_dataloader())

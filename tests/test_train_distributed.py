@@ -9,23 +9,18 @@ import subprocess
 import sys
 import textwrap
 import time
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
-import torch.distributed as dist
-from trainings import RECIPE, tiny_job, with_network, write_frames
+from trainings import RECIPE, logged, tiny_job, with_network, write_frames
 
-from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.models.checkpoints import read_safetensors
 from ufmstar_torch.train import FitSettings
 from ufmstar_torch.train.ensemble import share_of_time
 from ufmstar_torch.train.fit import fit
-from ufmstar_torch.train.history import METRICS, STEPS, read_rows
-from ufmstar_torch.train.launch import prepared_by_first
 from ufmstar_torch.train.member import WEIGHTS, make_data
 
 # Without batch norm, whose statistics are those of each process's own part of the batch.
@@ -62,7 +57,7 @@ def command(job):
 
 
 def losses(out):
-    return [float(row["train_loss"]) for row in read_rows(out / "member_0" / STEPS)]
+    return logged(out, "train_loss")
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +81,8 @@ def test_two_processes_give_the_losses_of_one(frames, alone, tmp_path):
     mine, theirs = (read_safetensors(out / "member_0" / WEIGHTS)[0] for out in (tmp_path / "two", alone))
     for name, value in theirs.items():
         torch.testing.assert_close(mine[name], value, atol=2e-5, rtol=0, msg=name)
-    validations = [read_rows(out / "member_0" / METRICS)[-1] for out in (tmp_path / "two", alone)]
-    for name in ("train_loss", "val_nll", "val_nll_constant", "val_nll_constant_best", "val_rmse", "val_delta1"):
-        assert float(validations[0][name]) == pytest.approx(float(validations[1][name]), abs=2e-4), name
+    for name in ("train_loss_epoch", "val_nll", "val_nll_constant", "val_nll_constant_best", "val_rmse", "val_delta1"):
+        assert logged(tmp_path / "two", name) == pytest.approx(logged(alone, name), abs=2e-4), name
 
 
 def free_port():
@@ -149,53 +143,6 @@ def test_the_second_process_may_come_first(frames, alone, tmp_path, launch, sett
     assert losses(out) == pytest.approx(losses(alone), abs=1e-6)
 
 
-@pytest.fixture
-def meeting(monkeypatch):
-    """Makes what a trainer of a process of two knows; their store is already there, as torchrun's is."""
-    store = dist.TCPStore("127.0.0.1", 0, None, True, wait_for_workers=False)
-    monkeypatch.setenv("MASTER_PORT", str(store.port))
-    monkeypatch.setenv("TORCHELASTIC_USE_AGENT_STORE", "True")
-    environment = SimpleNamespace(main_address="127.0.0.1", main_port=store.port, keep=store)
-
-    def trainer(rank):
-        strategy = SimpleNamespace(cluster_environment=environment)
-        return SimpleNamespace(world_size=2, global_rank=rank, is_global_zero=rank == 0, strategy=strategy)
-
-    return trainer
-
-
-@pytest.mark.slow
-def test_every_training_waits_for_its_own_preparation(meeting, tmp_path):
-    for _ in range(2):
-        with (
-            pytest.raises(FolderError, match=r"process 1 of 2 has waited 0\.1 s for the first"),
-            prepared_by_first(nullcontext(), meeting(1), tmp_path, wait=0.1),
-        ):
-            pass
-        with prepared_by_first(nullcontext(), meeting(0), tmp_path, wait=10):
-            pass
-
-
-@pytest.mark.slow
-def test_all_processes_end_where_the_first_cannot_prepare(meeting, tmp_path):
-    @contextmanager
-    def refused():
-        raise FolderError("holds an earlier training")
-        yield
-
-    with pytest.raises(FolderError, match=r"^holds"), prepared_by_first(refused(), meeting(0), tmp_path, wait=10):
-        pass
-    message = "^the first process could not prepare the folder: holds an earlier training"
-    with pytest.raises(FolderError, match=message), prepared_by_first(refused(), meeting(1), tmp_path, wait=10):
-        pass
-    # Each computer with a disk of its own.
-    with prepared_by_first(nullcontext(), meeting(0), tmp_path, wait=10):
-        pass
-    other = prepared_by_first(nullcontext(), meeting(1), tmp_path / "nowhere", wait=10)
-    with pytest.raises(FolderError, match="all machines must see the folder"), other:
-        pass
-
-
 @pytest.mark.slow
 def test_one_validation_frame_for_two_processes(frames, tmp_path):
     """With batch norm, whose statistics DistributedDataParallel sends around in the first validation batch."""
@@ -212,7 +159,7 @@ def test_one_validation_frame_for_two_processes(frames, tmp_path):
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == 0, message
-    assert float(read_rows(tmp_path / "out" / "member_0" / METRICS)[-1]["val_rmse"]) > 0
+    assert logged(tmp_path / "out", "val_rmse")[-1] > 0
 
 
 @pytest.mark.slow
@@ -232,7 +179,7 @@ def test_settings_that_cannot_be(tmp_path):
     for values, message in [
         ({"strategy": "ddp_spawn"}, "'ddp', not 'ddp_spawn'"),
         ({"member_processes": 2, "devices": 2}, "goes with devices = 1"),
-        ({"checkpoint_every": -1}, r"checkpoint_every must lie in \[0"),
+        ({"log_every": 0}, r"log_every must lie in \[1"),
         ({"max_minutes": float("nan")}, "max_minutes must be a number"),
     ]:
         with pytest.raises(ValueError, match=message):

@@ -1,4 +1,4 @@
-"""A training that is killed, stopped or fails goes on exactly, and loses nothing that was finished."""
+"""A training that is killed, stopped or fails goes on from its last epoch, and loses nothing that was finished."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from trainings import RECIPE, tiny_job, with_network, write_frames
+from trainings import RECIPE, logged, tiny_job, with_network, write_frames
 
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.models.checkpoints import read_safetensors
 from ufmstar_torch.train import ResumeError
-from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, read_checkpoint
+from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO
 from ufmstar_torch.train.fit import fit
-from ufmstar_torch.train.history import METRICS, STEPS, read_rows
 from ufmstar_torch.train.member import RESULT, WEIGHTS
 
 # Dropout, batch norm, augmentation, a schedule and a running mean: whatever could be out of step.
@@ -54,31 +53,34 @@ def tensors(path):
     return read_safetensors(path)[0]
 
 
+def stored(out, member=0):
+    return torch.load(out / f"member_{member}" / NAME, weights_only=True)
+
+
 def assert_same_result(out, reference, member=0):
-    """Weights bit for bit, the optimizer's state too, and the histories but for the clock."""
+    """Weights bit for bit, the optimizer's state too, and the losses of the last epoch."""
     mine, theirs = (tensors(folder / f"member_{member}" / WEIGHTS) for folder in (out, reference))
     assert mine.keys() == theirs.keys()
     assert [key for key in mine if not torch.equal(mine[key], theirs[key])] == []
-    mine, theirs = (read_checkpoint(folder / f"member_{member}" / NAME) for folder in (out, reference))
-    for key, state in theirs["optimizer_states"][0]["state"].items():
+    states = [stored(folder, member)["optimizer_states"][0]["state"] for folder in (out, reference)]
+    for key, state in states[1].items():
         for name, value in state.items():
-            assert torch.equal(value, mine["optimizer_states"][0]["state"][key][name]), (key, name)
-    for name in (METRICS, STEPS):
-        histories = [read_rows(folder / f"member_{member}" / name) for folder in (out, reference)]
-        assert [{**row, "seconds": ""} for row in histories[0]] == [{**row, "seconds": ""} for row in histories[1]]
+            assert torch.equal(value, states[0][key][name]), (key, name)
+    for name in ("train_loss", "val_rmse"):
+        assert logged(out, name)[-1] == logged(reference, name)[-1]
 
 
 def stop_after(steps):
-    """Asks to stop after so many steps (it is asked once before the first)."""
-    count = iter(range(1, 10_000))
-    return lambda: next(count) > steps
+    """Asks to stop after so many steps of the first member (it is asked once before them)."""
+    count = iter(range(10_000))
+    return lambda: next(count) >= steps
 
 
 # ---- killed ----
 
 
 @pytest.mark.slow
-def test_killed_in_the_middle_of_an_epoch_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path):
+def test_killed_in_the_middle_of_an_epoch_it_repeats_the_epoch_bit_for_bit(frames, uninterrupted, tmp_path):
     code = f"""
         import os, signal, sys
         from pathlib import Path
@@ -90,7 +92,7 @@ def test_killed_in_the_middle_of_an_epoch_it_goes_on_bit_for_bit(frames, uninter
         from test_train_resume import DROPOUT
         steps = iter(range(100))
         def asked():
-            # Asked once before the first step; after step 5 of 9, the last checkpoint being that of step 4.
+            # Asked once before the first step; after step 5 of 9, the last checkpoint being that of step 3.
             if next(steps) == 5:
                 os.kill(os.getpid(), signal.SIGKILL)
             return False
@@ -98,29 +100,23 @@ def test_killed_in_the_middle_of_an_epoch_it_goes_on_bit_for_bit(frames, uninter
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=200)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    stored = read_checkpoint(tmp_path / "out" / "member_0" / NAME)
-    assert (stored["global_step"], stored["ufmstar_next"]) == (4, {"epoch": 1, "batch": 1})
+    assert stored(tmp_path / "out")["global_step"] == 3
     assert not (tmp_path / "out" / "member_0" / RESULT).exists()
-    # As a kill in the middle of a line leaves it.
-    with (tmp_path / "out" / "member_0" / STEPS).open("a") as file:
-        file.write("6,1,3.0,1.2")
     summary = fit(tiny_job(frames, tmp_path / "out", DROPOUT), resume=True)
     assert summary["stopped"] is None
     assert_same_result(tmp_path / "out", uninterrupted)
 
 
-@pytest.mark.parametrize("steps", [4, pytest.param(3, marks=pytest.mark.slow)])
-def test_stopped_again_and_again_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path, steps):
-    sessions = 0
-    while True:
-        job = tiny_job(frames, tmp_path / "out", DROPOUT, checkpoint_every=0)
-        summary = fit(job, resume=True, asked=stop_after(steps))
-        sessions += 1
-        if summary["stopped"] is None:
-            break
-        assert summary["members"][0]["steps"] == min(9, steps * sessions)
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_stopped_again_and_again_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path, workers):
+    """Two steps into the second and the third of three epochs of three steps; weights are there after each session."""
+    job = tiny_job(frames, tmp_path / "out", DROPOUT)
+    job = replace(job, data=replace(job.data, workers=workers))
+    for reached, kept in ((5, 3), (8, 6), (9, 9)):
+        summary = fit(job, resume=True, asked=stop_after(5))
+        assert (summary["members"][0]["steps"], stored(tmp_path / "out")["global_step"]) == (reached, kept)
         assert (tmp_path / "out" / WEIGHTS).is_file()
-    assert sessions == -(-9 // steps)
+    assert summary["stopped"] is None
     assert_same_result(tmp_path / "out", uninterrupted)
 
 
@@ -161,7 +157,7 @@ def test_sigterm_reaches_who_asks_for_the_stop(frames, tmp_path):
     received = []
 
     def asked():
-        if (tmp_path / "out" / "member_0" / STEPS).exists() and not received:
+        if list((tmp_path / "out" / "member_0").glob("version_0/*.csv")) and not received:
             os.kill(os.getpid(), signal.SIGTERM)
         return bool(received)
 
@@ -181,7 +177,7 @@ def test_sigterm_reaches_who_asks_for_the_stop(frames, tmp_path):
 def test_a_write_that_fails_leaves_the_checkpoint_before_it(tmp_path):
     path = tmp_path / NAME
     io = AtomicCheckpointIO()
-    io.save_checkpoint({"ufmstar_next": {"epoch": 1, "batch": 0}, "x": torch.ones(3)}, path)
+    io.save_checkpoint({"x": torch.ones(3)}, path)
 
     class Unwritable:
         def __reduce__(self):
@@ -189,13 +185,13 @@ def test_a_write_that_fails_leaves_the_checkpoint_before_it(tmp_path):
 
     with pytest.raises(OSError, match="disk full"):
         io.save_checkpoint({"x": torch.ones(10_000), "y": Unwritable()}, path)
-    assert torch.equal(read_checkpoint(path)["x"], torch.ones(3))
+    assert torch.equal(torch.load(path, weights_only=True)["x"], torch.ones(3))
     assert [p.name for p in tmp_path.iterdir()] == [NAME]
 
 
 def test_a_damaged_checkpoint_is_named(frames, tmp_path):
-    job = tiny_job(frames, tmp_path / "out", replace(RECIPE, epochs=1))
-    fit(job, asked=stop_after(2))
+    job = tiny_job(frames, tmp_path / "out", replace(RECIPE, epochs=2))
+    fit(job, asked=stop_after(4))
     file = tmp_path / "out" / "member_0" / NAME
     whole = file.read_bytes()
     for broken in (whole[: len(whole) // 2], b"", b"hello"):
@@ -223,7 +219,7 @@ def test_a_folder_is_refused_that_is_not_this_training(frames, tmp_path):
         with pytest.raises(FolderError, match=message):
             fit(other, resume=True)
     # Whatever changes the speed only is no other training.
-    same = replace(job, settings=replace(job.settings, checkpoint_every=7, max_minutes=3.0))
+    same = replace(job, settings=replace(job.settings, log_every=7, max_minutes=3.0))
     assert fit(same, resume=True)["stopped"] is None
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("x")

@@ -136,7 +136,7 @@ class TestFrames:
         writer.write("a", **frame(far=100.0))
         lost = writer.write("b", **frame(far=2.0))
         assert lost["depth"] == 0
-        FrameWriter(tmp_path).write("c", **frame(far=2.0))
+        FrameWriter(tmp_path, writer.unit).write("c", **frame(far=2.0))
         for kind, unit in (("depth", 1 / 256), ("sigma", 1 / 2560)):
             assert [read_map(tmp_path / kind / f"{n}.png", "depth")[1] for n in "abc"] == [unit] * 3
 
@@ -157,7 +157,6 @@ class TestFrames:
             assert writer.finished("a")
             writer.paths("a")[kind].unlink()
             assert not writer.finished("a")
-            assert writer.finished_frames() == []
 
     @pytest.mark.parametrize("name", ["", "../a", "a/b", ".hidden", "a\\b"])
     def test_names_stay_in_the_folder(self, tmp_path: Path, name: str) -> None:
@@ -200,11 +199,11 @@ class TestFullDisk:
         after = tree(tmp_path)
         assert {name: after[name] for name in before} == before
         assert not writer.finished("b")
-        assert writer.finished_frames() == ["a"]
+        assert writer.finished("a")
         assert not [name for name in after if name.endswith(".tmp")]
         assert json.loads(after["summary.json"]) == {"frames": 1}
         writer.write("b", **frame(1))  # space again: the run goes on
-        assert writer.finished_frames() == ["a", "b"]
+        assert writer.finished("b")
 
     def test_write_fails_in_the_middle_of_a_file(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         writer = FrameWriter(tmp_path)

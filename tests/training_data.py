@@ -10,11 +10,11 @@ from ufmstar_torch.train import (
     Augmentation,
     AugmentationConfig,
     EpochBatches,
-    EpochLoader,
     SampleDataset,
     SampleError,
     TourSettings,
 )
+from ufmstar_torch.train.data import sample_loader
 from ufmstar_torch.train.samples import RawSample
 
 SMALL = (48, 64)  # NYU's aspect ratio
@@ -72,4 +72,4 @@ def truncated(path, share):
 
 def loader(length=23, **options):
     dataset = SampleDataset(Numbered(length), PLAIN, Augmentation(AugmentationConfig(scale=(1.0, 1.0))))
-    return EpochLoader(dataset, EpochBatches(length, 4, seed=9, **options))
+    return sample_loader(dataset, EpochBatches(length, 4, seed=9, **options))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 
 import numpy as np
@@ -57,7 +58,16 @@ def tiny_job(frames, out, recipe=RECIPE, augment=True, **settings):
         augmentation=AugmentationConfig() if augment else None,
     )
     quiet = {"examples": 0, "tensorboard": False, "progress": False, "accelerator": "cpu", "log_every": 1}
-    return Job(recipe, data, FitSettings(out=out, **{"checkpoint_every": 2, **quiet, **settings}))
+    return Job(recipe, data, FitSettings(out=out, **{**quiet, **settings}))
+
+
+def logged(out, name, member=0):
+    """The logged values of a name, in the order of their steps, over all sessions of a training."""
+    found = []
+    for file in sorted((out / f"member_{member}").glob("version_*/metrics.csv")):
+        with file.open(newline="") as rows:
+            found += [float(row[name]) for row in csv.DictReader(rows) if row.get(name)]
+    return found
 
 
 def with_network(recipe=RECIPE, **changes):

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.train.augment import Augmentation as Augmentation
     from ufmstar_torch.train.augment import AugmentationConfig as AugmentationConfig
     from ufmstar_torch.train.batches import EpochBatches as EpochBatches
-    from ufmstar_torch.train.batches import EpochLoader as EpochLoader
     from ufmstar_torch.train.checkpoints import ResumeError as ResumeError
     from ufmstar_torch.train.data import DepthDataModule as DepthDataModule
     from ufmstar_torch.train.data_config import DataConfig as DataConfig

@@ -8,13 +8,14 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
+from torch.utils.data import DataLoader
 
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.augment import Augmentation
-from ufmstar_torch.train.batches import EpochBatches, EpochLoader
+from ufmstar_torch.train.batches import EpochBatches
 from ufmstar_torch.train.data_config import DataConfig, Part
 from ufmstar_torch.train.nyu import NyuFrames
-from ufmstar_torch.train.samples import FrameSource, SampleDataset, clips
+from ufmstar_torch.train.samples import FrameSource, Sample, SampleDataset, clips
 from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
 from ufmstar_torch.train.tour_data import TourFrames, TourSettings, tour_frames
 
@@ -66,11 +67,11 @@ class DepthDataModule(LightningDataModule):
         self.train_set = SampleDataset(train, self.preprocess, augmentation, seed=c.seed, on_bad_file=c.on_bad_file)
         self.validation_set = SampleDataset(validation, self.preprocess, on_bad_file=c.on_bad_file, evaluate=True)
 
-    def train_dataloader(self) -> EpochLoader:
+    def train_dataloader(self) -> DataLoader[Sample]:
         """Shuffled; this process's share of every batch."""
         return self._loader(self.train_set, shuffle=True)
 
-    def val_dataloader(self) -> EpochLoader:
+    def val_dataloader(self) -> DataLoader[Sample]:
         """Every frame once, over all processes together."""
         return self._loader(self.validation_set, shuffle=False)
 
@@ -78,7 +79,7 @@ class DepthDataModule(LightningDataModule):
         """The broken files met so far in either part, where they are skipped."""
         return tuple(name for part in (self.train_set, self.validation_set) if part for name in part.bad_files())
 
-    def _loader(self, dataset: SampleDataset | None, shuffle: bool) -> EpochLoader:
+    def _loader(self, dataset: SampleDataset | None, shuffle: bool) -> DataLoader[Sample]:
         if dataset is None:
             raise RuntimeError("call setup() before asking for a loader")
         rank, world = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
@@ -88,7 +89,25 @@ class DepthDataModule(LightningDataModule):
             batches = EpochBatches(len(self.clips), c.batch_size // self.clip_frames, clips=self.clips, **order)
         else:
             batches = EpochBatches(len(dataset), c.batch_size, **order)
-        return EpochLoader(dataset, batches, workers=c.workers, pin_memory=torch.cuda.is_available())
+        if shuffle and self.trainer is not None:
+            # Workers load ahead before Lightning announces the epoch, which is not 0 in a resumed training.
+            batches.set_epoch(self.trainer.fit_loop.epoch_progress.current.processed)
+        return sample_loader(dataset, batches, c.workers)
+
+
+def sample_loader(dataset: SampleDataset, batches: EpochBatches, workers: int = 0) -> DataLoader[Sample]:
+    """A loader of samples in the order of ``batches``, by ``workers`` processes (0: this one), which are started with
+    "spawn": forked ones inherit OpenMP's threads as they are, and hang where the parent has used them."""
+    return DataLoader(
+        dataset,
+        batch_sampler=batches,
+        num_workers=workers,
+        pin_memory=torch.cuda.is_available(),
+        multiprocessing_context="spawn" if workers else None,
+        persistent_workers=workers > 0,
+        # Its own generator: without one, every iteration would draw from the global one.
+        generator=torch.Generator(),
+    )
 
 
 def sources(config: DataConfig) -> tuple[FrameSource, FrameSource]:

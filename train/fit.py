@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
+import lightning.pytorch as pl
 import torch
 
 from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.models.trained import load_for_training, save_trained
 from ufmstar_torch.train.ensemble import read_result, train_members
 from ufmstar_torch.train.folder import SUMMARY, open_folder
-from ufmstar_torch.train.history import FIGURES
-from ufmstar_torch.train.launch import prepared_by_first
 from ufmstar_torch.train.member import WEIGHTS, make_trainer, quiet_lightning
 from ufmstar_torch.train.presets import text_table
+from ufmstar_torch.train.progress import FIGURES
 from ufmstar_torch.train.settings import Job
 
 
@@ -52,15 +55,31 @@ def fit(
     with quiet_lightning():
         trainer = make_trainer(job, 0)
     first = trainer.is_global_zero
-    folder = prepared_by_first(open_folder(job, resume=resume, overwrite=overwrite), trainer, job.settings.out)
+    folder = open_folder(job, resume=resume, overwrite=overwrite) if first else nullcontext()
     with folder, torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         stopped: str | None = "failed"
         try:
+            _meet(trainer, job.settings.out)
             stopped = train_members(job, end=end, asked=asked)
         finally:
             if first:
                 summary = _conclude(job, stopped, time.monotonic() - began, command)
     return summary if first else {"stopped": stopped}
+
+
+def _meet(trainer: pl.Trainer, out: Path) -> None:
+    """Wait until the first process has prepared the folder: it joins Lightning's process group only then.
+
+    Raises:
+        FolderError: this machine does not see the first process's folder.
+    """
+    if trainer.world_size == 1:
+        return
+    launcher: Any = trainer.strategy.launcher
+    launcher.launch(trainer.strategy.setup_environment)
+    trainer.strategy.barrier("the folder is prepared")
+    if not out.is_dir():
+        raise FolderError(f"--out {out} does not exist: all machines must see the folder of the first process")
 
 
 def _conclude(job: Job, stopped: str | None, seconds: float, command: Sequence[str]) -> dict[str, Any]:

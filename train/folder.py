@@ -3,7 +3,7 @@
 ```
 OUT/training.json         what the training was started with
 OUT/lock                  held while it is going on
-OUT/member_0/...          checkpoint, weights, metrics.csv, steps.csv, examples/ of every member
+OUT/member_0/...          checkpoint, weights, version_N/metrics.csv of every session, examples/ of every member
 OUT/tensorboard/          logs
 OUT/trained.safetensors   all members
 OUT/summary.json          figures, command, versions, hardware, seconds

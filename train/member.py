@@ -11,21 +11,21 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
-from lightning.pytorch.callbacks import TQDMProgressBar
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.callbacks import Timer, TQDMProgressBar
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import save_trained
-from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, Checkpoints, Stops, read_checkpoint
+from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, Checkpoints, Stops, require_checkpoint
 from ufmstar_torch.train.data import DepthDataModule
 from ufmstar_torch.train.examples import Examples
-from ufmstar_torch.train.history import METRICS, History, read_rows
 from ufmstar_torch.train.module import TrainingModule, step_seed
 from ufmstar_torch.train.settings import Job
 from ufmstar_torch.train.start import starting_network, train_only
 
 _LIGHTNINGS_OWN = r"`isinstance\(treespec, LeafSpec\)` is deprecated"
+_ADVICE = r".*(does not have many workers|smaller than the logging interval)"
 WEIGHTS, RESULT = "trained.safetensors", "result.json"
 
 
@@ -48,22 +48,25 @@ def train_member(
     s, folder = job.settings, job.folder(member)
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / NAME
-    stored = read_checkpoint(checkpoint) if checkpoint.is_file() else None
-    history = History(folder, s.log_every, stored)
+    stored = checkpoint if checkpoint.is_file() else None
+    if stored is not None:
+        require_checkpoint(stored)
     with quiet_lightning():
         trainer: Any = make_trainer(job, member)
         data = make_data(job, member, trainer.world_size)
         total, epochs = training_length(job, data)
         stops = Stops(total, deadline, asked)
         examples = [Examples(folder, data, s.examples, epochs)] if s.examples else []
-        # In this order: Stops decides before Checkpoints writes.
-        trainer.callbacks[:0] = [*examples, stops, history, Checkpoints(checkpoint, s.checkpoint_every)]
+        timer = Timer()  # its checkpoint contains the time of earlier sessions
+        trainer.callbacks[:0] = [*examples, stops, timer, Checkpoints(checkpoint)]
         module = TrainingModule(new_network(job, member), job.recipe, total, job.seed(member))
-        trainer.fit(module, data, ckpt_path=None if stored is None else checkpoint, weights_only=True)
+        trainer.fit(module, data, ckpt_path=stored, weights_only=True)
     # A stop that is asked for at the last step leaves a finished training.
     reason = stops.reason if trainer.global_step < total else None
     if trainer.is_global_zero:
-        _finish(job, member, module, history, trainer.global_step, reason)
+        figures = {"epoch": trainer.current_epoch, **module.figures}
+        session = {"steps": trainer.global_step, "seconds": round(timer.time_elapsed(), 1), "figures": figures}
+        _finish(job, member, module, {**session, "finished": reason is None, "stopped": reason})
     trainer.strategy.barrier("member is written")
     return reason
 
@@ -95,6 +98,10 @@ def make_trainer(job: Job, member: int) -> pl.Trainer:
     """Lightning's trainer; only :class:`Checkpoints` writes checkpoints."""
     r, s = job.recipe, job.settings
     precision: Any = s.precision  # one of many literals, which Lightning checks
+    # A session's rows go into the next version_N/metrics.csv, since the logger never continues a file.
+    loggers: list[Logger] = [CSVLogger(s.out, name=f"member_{member}", flush_logs_every_n_steps=s.log_every)]
+    if s.tensorboard:
+        loggers.append(TensorBoardLogger(str(s.out), name="tensorboard", version=f"member_{member}"))
     return pl.Trainer(
         accelerator=("gpu" if torch.cuda.is_available() else "cpu") if s.accelerator == "auto" else s.accelerator,
         devices=s.devices,
@@ -104,13 +111,11 @@ def make_trainer(job: Job, member: int) -> pl.Trainer:
         max_epochs=-1 if r.max_steps else r.epochs,
         max_steps=r.max_steps or -1,
         gradient_clip_val=r.clip or None,
-        logger=TensorBoardLogger(str(s.out), name="tensorboard", version=f"member_{member}")
-        if s.tensorboard
-        else False,
+        logger=loggers,
         callbacks=[TQDMProgressBar(leave=True)] if s.progress else [],
         sync_batchnorm=s.sync_batchnorm,
         plugins=[AtomicCheckpointIO()],
-        log_every_n_steps=1,
+        log_every_n_steps=s.log_every,
         enable_checkpointing=False,
         enable_model_summary=False,
         enable_progress_bar=s.progress,
@@ -120,19 +125,10 @@ def make_trainer(job: Job, member: int) -> pl.Trainer:
     )
 
 
-def _finish(job: Job, member: int, module: TrainingModule, history: History, step: int, reason: str | None) -> None:
+def _finish(job: Job, member: int, module: TrainingModule, session: dict[str, Any]) -> None:
     """Write the weights, and then result.json, whose "finished" states that the member needs no more training."""
     folder = job.folder(member)
-    rows = read_rows(folder / METRICS)
-    result = {
-        "member": member,
-        "seed": job.seed(member),
-        "steps": step,
-        "seconds": round(history.seconds, 1),
-        "finished": reason is None,
-        "stopped": reason,
-        "figures": {k: float(v) for k, v in rows[-1].items() if v} if rows else {},
-    }
+    result = {"member": member, "seed": job.seed(member), **session}
     info = {"recipe": job.recipe.to_dict(), **result}
     save_trained(folder / WEIGHTS, [module.result.eval()], job.recipe.network, info=info)
     write_json_atomic(folder / RESULT, result)
@@ -149,6 +145,7 @@ def quiet_lightning() -> Iterator[None]:
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", _LIGHTNINGS_OWN, FutureWarning)
+            warnings.filterwarnings("ignore", _ADVICE)
             yield
     finally:
         for logger, level in zip(loggers, before, strict=True):

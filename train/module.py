@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from dataclasses import astuple
+from itertools import islice
 from typing import Any
 
 import lightning.pytorch as pl
@@ -26,6 +26,7 @@ from ufmstar_torch.train.presets import Recipe
 from ufmstar_torch.train.progress import Sums, Validation
 
 Batch = Mapping[str, Any]
+FIGURES_KEY = "ufmstar_figures"  # of the last validation, in checkpoints
 
 
 class NonFiniteLossError(RuntimeError):
@@ -49,6 +50,7 @@ class TrainingModule(pl.LightningModule):
         residuals: squared errors of the training part in this epoch, as they were at each step: the variance of
             the constant-variance baseline.
         losses: of the training part in this epoch: (sum, pixels).
+        figures: of the last validation, by name.
     """
 
     def __init__(self, network: nn.Module, recipe: Recipe, total_steps: int, seed: int = 0) -> None:
@@ -62,6 +64,7 @@ class TrainingModule(pl.LightningModule):
         self.residuals = Sums()
         self.losses = Sums()
         self.validation = Validation()
+        self.figures: dict[str, float] = {}
         self._batch_idx = 0
         # No module of this one: nothing of it is kept from step to step.
         self._teacher = Teacher(recipe.clip_frames, stated_range([network])) if recipe.clip_frames > 1 else None
@@ -163,19 +166,19 @@ class TrainingModule(pl.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Log the validation's figures, over all processes."""
-        for name, value in self.validation.figures(self.residuals).items():
+        self.figures = self.validation.figures(self.residuals)
+        for name, value in self.figures.items():
             self.log(name, value, prog_bar=name in ("val_nll", "val_delta1"), sync_dist=True)
 
     # ---- state ----
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """The epoch's sums, beside what Lightning keeps."""
-        checkpoint["ufmstar_sums"] = {"residuals": [*astuple(self.residuals)], "losses": [*astuple(self.losses)]}
+        """The figures, beside what Lightning keeps."""
+        checkpoint[FIGURES_KEY] = self.figures
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restore the epoch's sums."""
-        self.residuals = Sums(*checkpoint["ufmstar_sums"]["residuals"])
-        self.losses = Sums(*checkpoint["ufmstar_sums"]["losses"])
+        """Restore the figures."""
+        self.figures = checkpoint[FIGURES_KEY]
 
     def _distribution(self, image: Tensor) -> DepthDistribution:
         image = image.contiguous(memory_format=torch.channels_last)
@@ -203,9 +206,9 @@ class TrainingModule(pl.LightningModule):
     def _samples(self, batch_idx: int) -> list[str]:
         """Names of the frames in this process's batch; their order follows from the epoch."""
         loader: Any = self.trainer.train_dataloader
-        batches = copy.copy(loader.batches)
-        batches.set_epoch(self.current_epoch, batch_idx)
-        return [loader.dataset.source.name(key.frame) for key in next(iter(batches))]
+        batches = copy.copy(loader.batch_sampler)
+        batches.set_epoch(self.current_epoch)
+        return [loader.dataset.source.name(key.frame) for key in next(islice(batches, batch_idx, None))]
 
     def _blame(self, what: str, batch_idx: int, mine: float | None = None) -> str:
         place = f"epoch {self.current_epoch}, batch {batch_idx} (step {self.global_step})"

@@ -17,6 +17,7 @@ from ufmstar_torch.eval.metrics import NLL, RMSE, AbsRel, Delta1
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.train.losses import gaussian_nll
 
+FIGURES = ("val_nll", "val_nll_constant", "val_nll_constant_best", "val_delta1", "val_rmse", "val_rel")
 # [m^2] Smallest variance of a constant: (1 mm)^2, as the heads have it.
 VARIANCE_FLOOR = 1e-6
 

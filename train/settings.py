@@ -28,10 +28,10 @@ class FitSettings(Checked):
             scripts ("ddp", not "ddp_spawn").
         precision: 32-true, bf16-mixed or 16-mixed; the loss is in float32 always.
         member_processes: members that are trained at the same time, each in a process of its own.
-        checkpoint_every: steps between checkpoints within an epoch, 0 = at the end of epochs only.
-        log_every: steps between rows of steps.csv.
+        log_every: steps between rows of metrics.csv.
         examples: validation images in each epoch's picture, 0 = no pictures.
-        max_minutes: after which this session stops in good order, all members together; --resume goes on. 0 = never.
+        max_minutes: after which this session stops in good order, all members together; --resume goes on from the last
+            whole epoch. 0 = never.
         sync_batchnorm: whether batch norm uses the batches of all processes (GPUs only).
         tensorboard: whether to write logs for TensorBoard.
         progress: whether to show a progress bar.
@@ -50,7 +50,6 @@ class FitSettings(Checked):
     strategy: str = "auto"
     precision: str = "32-true"
     member_processes: int = number(1, "N", "processes", 1)
-    checkpoint_every: int = number(500, "N", "steps", 0)
     log_every: int = number(50, "N", "steps", 1)
     examples: int = number(4, "N", "images", 0)
     max_minutes: float = number(0.0, "t", "min", 0)

@@ -27,8 +27,8 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.checked import Checked, number
-from ufmstar_torch.eval.run.files import write_together
-from ufmstar_torch.eval.tour.style import TourStyle, style_of
+from ufmstar_torch.eval.tour.style import style_of
+from ufmstar_torch.models.atomic import write_together
 from ufmstar_torch.train.samples import RawSample, SampleError
 
 _LOG = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ class TourSettings(Checked):
     frames: int = number(40, "N", "frames", 1)
     stride: int = number(6, "N", "steps", 1)
     size: tuple[int, int] = (160, 224)
-    style: str | TourStyle = "home"
+    style: str = "home"
     fov: float = number(70.0, "fov", "degrees", 20, 120)
 
     def __post_init__(self) -> None:

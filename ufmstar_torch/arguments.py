@@ -36,14 +36,6 @@ def require_mask(name: str, value: object, shapes: Shapes, like: Tensor | None =
     return _fitting(name, value, shapes, like)
 
 
-def require_whole(name: str, value: object, shapes: Shapes, like: Tensor | None = None) -> Tensor:
-    """As :func:`require_float`, for torch.int32 and torch.int64."""
-    if not isinstance(value, Tensor) or value.dtype not in (torch.int32, torch.int64):
-        kind = value.dtype if isinstance(value, Tensor) else type(value).__name__
-        raise TypeError(f"{name} must be a torch.int32 or torch.int64 tensor, got {kind}")
-    return _fitting(name, value, shapes, like)
-
-
 def _fitting(name: str, value: Tensor, shapes: Shapes, like: Tensor | None) -> Tensor:
     if shapes and tuple(value.shape) not in shapes:
         expected = " or ".join(str(shape) for shape in dict.fromkeys(shapes))

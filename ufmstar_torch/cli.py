@@ -15,8 +15,8 @@ from typing import Any
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 # Name, module, and what it is for.
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("eval.commands.demo_command", "the main job on rendered rooms, with nothing but this package"),
-    "run": ("eval.commands.run_command", "depth and variance of a sequence of posed images, onto disk"),
+    "demo": ("eval.commands.demo", "the main job on rendered rooms, with nothing but this package"),
+    "run": ("eval.commands.run", "depth and variance of a sequence of posed images, onto disk"),
     "eval": ("eval.commands.eval_command", "the rows of a table or figure of the paper, on your own sequences"),
     "report": ("eval.commands.report_command", "tables, figures and a page from the results of eval"),
     "bench": ("eval.commands.bench_command", "time per stage and memory, beside the depth network's own"),
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words[:1] in ([], ["-h"], ["--help"]):
-        commands = "\n".join(f"  {name:8}{purpose}" for name, (_, purpose) in COMMANDS.items())
+        commands = "\n".join(f"  {name:13}{purpose}" for name, (_, purpose) in COMMANDS.items())
         print(_HELP.format(commands=commands), end="")
         return OK if words else USAGE
     if words == ["--version"]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -17,10 +16,9 @@ from torch import Tensor
 from ufmstar_torch.checked import Checked, choice
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension
-from ufmstar_torch.stateful import flat
+from ufmstar_torch.stateful import flat, plain
 
 SCALAR, ISOTONIC = "scalar", "isotonic"
-_SHOWN = 12  # digits of a digest
 # Settings of UfM* that do not change what V means.
 _HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
 
@@ -39,9 +37,8 @@ class Recalibration(Checked, Extension):
         kind: "isotonic", or "scalar" with a single knot.
         row: name of the method that it was fitted to, as "UfM*-Anchored-DepthOnly".
         ufm: settings of UfM* that it was fitted to (``UfMStarConfig.to_dict``); {} = unknown.
-        weights: SHA-256 of the network's files, in hex; () = unknown.
-        sequences: names of the sequences that it was fitted to.
-        digests: of these sequences: the map must not be judged on them.
+        network: names of the files of its network's weights, separated by commas; "" = unknown.
+        sequences: names of the sequences that it was fitted to: it must not be judged on them.
 
     Raises:
         ValueError: knots that are not such numbers.
@@ -52,9 +49,8 @@ class Recalibration(Checked, Extension):
     kind: str = choice(ISOTONIC, SCALAR)
     row: str = ""
     ufm: Mapping[str, Any] = field(default_factory=dict)
-    weights: tuple[str, ...] = ()
+    network: str = ""
     sequences: tuple[str, ...] = ()
-    digests: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -91,26 +87,24 @@ class Recalibration(Checked, Extension):
         """V' of V."""
         return self(variance)
 
-    def require(self, config: UfMStarConfig, weights: Iterable[str] | None = None) -> None:
+    def require(self, config: UfMStarConfig, network: str = "") -> None:
         """Check that V means what it meant when the map was fitted.
 
         Args:
             config: of the UfM* whose variance is to be mapped.
-            weights: SHA-256 of the network's files; None = unknown.
+            network: names of the files of the network's weights, separated by commas; "" = unknown.
 
         Raises:
             ValueError: the map was fitted under other settings of UfM*, or to another network.
         """
-        now = flat(config.to_dict())
-        changed = [
-            f"{name} = {value!r} (now {now[name]!r})"
-            for name, value in flat(self.ufm).items()
-            if name in now and name not in _HARMLESS and now[name] != value
-        ]
+        fitted, now = flat(self.ufm), flat(plain(config))
+        names = sorted((fitted.keys() | now.keys()) - set(_HARMLESS)) if fitted else []
+        changed = [name for name in names if fitted.get(name) != now.get(name)]
         if changed:
-            raise ValueError(f"the recalibration was fitted to UfM* with {', '.join(changed)}")
-        if weights is not None and self.weights and set(weights) != set(self.weights):
-            raise ValueError("the recalibration was fitted to a network with other weights")
+            each = ", ".join(f"{name} = {fitted.get(name)!r} (now {now.get(name)!r})" for name in changed)
+            raise ValueError(f"the recalibration was fitted to UfM* with {each}")
+        if network and self.network and network != self.network:
+            raise ValueError(f"the recalibration was fitted to the network {self.network}, not {network}")
 
     def save(self, path: str | Path) -> None:
         """Write it as JSON, which :meth:`from_json` reads."""
@@ -120,40 +114,6 @@ class Recalibration(Checked, Extension):
         """At least two knots: a single one is doubled with the same ratio above."""
         v, r = self.variance, self.recalibrated
         return (v, r) if len(v) > 1 else ((v[0], 2 * v[0]), (r[0], 2 * r[0]))
-
-
-def read_recalibration(name: str) -> Recalibration:
-    """From FILE, or from FILE@DIGEST, which refuses a file that has changed since it was named.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no recalibration, or another one than was named.
-    """
-    file, digest = split_name(name)
-    if digest and not file_digest(file).startswith(digest):
-        raise ValueError(f"{file} has changed since it was chosen for this evaluation: use another output folder")
-    return Recalibration.from_json(file)
-
-
-def split_name(name: str) -> tuple[str, str]:
-    """(FILE, DIGEST) of FILE@DIGEST; the digest is "" without one."""
-    file, mark, digest = name.rpartition("@")
-    named = mark and len(digest) == _SHOWN and all(c in "0123456789abcdef" for c in digest)
-    return (file, digest) if named else (name, "")
-
-
-def named(file: str | Path) -> str:
-    """FILE@DIGEST.
-
-    Raises:
-        FileNotFoundError: no such file.
-    """
-    return f"{file}@{file_digest(file)[:_SHOWN]}"
-
-
-def file_digest(file: str | Path) -> str:
-    """Hex digest of a file's content."""
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest()
 
 
 def beside(weights: str | Path) -> Path:

@@ -87,9 +87,7 @@ class StatefulModule(nn.Module):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Warn where the config of a loaded state differs from this module's."""
-        # A setting younger than the state had its default.
-        saved = flat(type(self.config)().to_dict()) | flat(_config_of(state))
-        ours = flat(self.config.to_dict())
+        saved, ours = flat(_config_of(state)), flat(plain(self.config))
         changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
         if changed:
             each = ", ".join(f"{key} was {saved.get(key)!r}, is {ours.get(key)!r}" for key in changed)
@@ -190,6 +188,11 @@ def _config_of(state: object) -> dict[str, Any]:
     if not isinstance(config, dict):
         raise ValueError(f"_extra_state must hold a JSON object, got {type(config).__name__}")
     return config
+
+
+def plain(config: Config) -> dict[str, Any]:
+    """Its values as JSON returns them."""
+    return _config_of(_bytes_of(config))
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -1,175 +1,141 @@
-"""``ufmstar bench``: times of the stages and of the whole UfM* step beside two networks' forward passes.
-
-Nothing here passes or fails: absolute times depend on the machine and on what else it does. See
-docs/results/benchmark.md for what each figure means.
-"""
+"""``ufmstar bench``: UfM*, with anchors and with the posterior, beside a network's forward pass, on the same frames."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.eval.bench.anchors import measure_anchors
-from ufmstar_torch.eval.bench.compare import compare, measure_peer
-from ufmstar_torch.eval.bench.device import measure_device
-from ufmstar_torch.eval.bench.floors import machine_rates
-from ufmstar_torch.eval.bench.frames import (
-    FrameSource,
-    RecordedSequence,
-    RenderedBuilding,
-    RenderedRoom,
-    RenderedStreet,
-)
-from ufmstar_torch.eval.bench.growth import measure_growth
-from ufmstar_torch.eval.bench.settings import CORNERS, BenchSettings
-from ufmstar_torch.eval.bench.step import build_up, measure_compilation, measure_step, reference_networks
-from ufmstar_torch.eval.bench.timing import most_threads, pinned_threads
-from ufmstar_torch.eval.run import machine
-from ufmstar_torch.models import FastDepth, FastDepthWidths, load_network
+import torch
+from torch import Tensor, nn
 
-# Milliseconds and ratios at 224 x 224, bytes and ratios for one room; the tracker's mean processor time for 300 corners
-# at 640 x 480. For information.
-_TARGETS = {
-    "spgf_ms": 0.5,
-    "step_ms": 3.6,
-    "step/fastdepth": 0.3,
-    "step/resnet50": 0.03,
-    "components_bytes": 30_000.0,
-    "long_run_ratio": 1.2,
-    "tracker_cpu_ms": 3.0,
-}
-_TARGET_SIZE = 224
-_WARM_UP, _TORCH_ROUNDS = 3, 3
-_PARTS = ("compilation", "long_run", "anchors", "peer", "against", "rates", "device")  # None where not measured
+from ufmstar_torch.eval.bench.measure import Plan, measure
+from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
+from ufmstar_torch.eval.bench.parts import MULTIVIEW
+from ufmstar_torch.eval.bench.settings import ARCHITECTURES, TOUR, BenchSettings
+from ufmstar_torch.eval.methods.method import BASES, Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.run.machine import available_cores, require_device
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError
+from ufmstar_torch.models import FastDepth, FastDepthWidths, MonodepthResNet, Preprocess, load_network
+from ufmstar_torch.models.ensemble import Ensemble
+from ufmstar_torch.models.inference import Inference
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.prediction import DepthPrediction
+
+_ERROR, _GRID = 0.03, 4  # [1] standard deviation of a network's smooth relative error, and its nodes per side
 Progress = Callable[[str], object]
 
 
 def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None) -> dict[str, Any]:
     """Measure what the options ask for.
 
-    Args:
-        options: see :class:`BenchSettings`.
-        progress: is called with a description of what is measured next.
-
     Returns:
-        The report: settings, versions, hardware, "results" per size and backend, "rates" of the machine, "compilation",
-        "long_run", "growth" (a long run for each world, limit of merging and limit of components), "anchors", "device",
-        "peer" and "against" where asked for, and "targets".
+        "schema", "date", "options" and "results": what :func:`ufmstar_torch.eval.bench.measure.measure` returns, for
+        every size.
 
     Raises:
-        ValueError: an option is out of range.
+        ValueError: an option is out of range, or the sequence has too few frames.
         FileNotFoundError, ModuleNotFoundError: a file or a package is missing.
     """
-    if options.against is not None and not options.against.is_file():
-        raise FileNotFoundError(f"--against {options.against} does not exist")
-    load = machine.load_average()
-    threads = most_threads() if options.threads is None else options.threads
-    report: dict[str, Any] = {
-        **dict.fromkeys(_PARTS),
-        "growth": [],
-        "results": [],
-        "schema": 1,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": machine.versions(),
-        "hardware": machine.hardware(),
-        "settings": {"threads": threads, "seed": options.seed, "config": UfMStarConfig().to_dict()},
-    }
-    if options.device == "cpu":
-        if "numba" in options.backends and not options.skip_compile:
-            progress("compilation")
-            report["compilation"] = measure_compilation()
-        with pinned_threads(threads):
-            _on_cpu(options, report, progress)
-        report["targets"] = targets(report)
-    else:
-        report["device"] = measure_device(options, progress)
-        report["targets"] = []
-    report["load_average"] = {"before": load, "after": machine.load_average()}
-    if options.against is not None and options.device == "cpu":
-        report["against"] = compare(report, options.against)
-    return report
-
-
-def _on_cpu(options: BenchSettings, report: dict[str, Any], progress: Progress) -> None:
-    """Add to the report what is measured with a fixed number of threads, and the frames' source to its settings."""
-    config = UfMStarConfig()
-    report["rates"] = machine_rates()
-    fastdepth, source = _inputs(options)
-    report["settings"]["source"] = source.describe()
-    for size in options.sizes:
-        report["results"] += _results(options, config, fastdepth, source, size, report["rates"], progress)
-    config = config.replace(backend=options.backends[0])
-    if options.peer is not None:
-        progress("the peer")
-        report["peer"] = measure_peer(options.peer, source.frames(options.sizes[0], options.frames))
-    if options.long is not None:
-        building, street = RenderedBuilding(boxes=options.boxes, seed=options.seed), RenderedStreet(seed=options.seed)
-        far = config.replace(segment=replace(config.segment, max_depth=street.max_depth))
-        worlds = {"room": (source, config), "building": (building, config), "drive": (street, far)}
-        report["growth"] = measure_growth(
-            {name: worlds[name] for name in options.world}, options.merge, options.max_components, size=_TARGET_SIZE,
-            frames=options.long, progress=progress,
-        )  # fmt: skip
-        report["long_run"] = next((run for run in report["growth"] if run["world"] == "room"), None)
-    if options.anchors is not None:
-        progress(f"{options.anchors} corners and anchors")
-        report["anchors"] = measure_anchors(options, source, config, _TARGET_SIZE)
-
-
-def _inputs(options: BenchSettings) -> tuple[FastDepth, FrameSource]:
-    """FastDepth, with random weights of the pruned network's shape if none are given, and the frames' source."""
-    if options.weights is None:
-        fastdepth = FastDepth(FastDepthWidths.pruned()).eval()
-    else:
-        loaded = load_network("fastdepth", options.weights)
-        assert isinstance(loaded, FastDepth)
-        fastdepth = loaded
-    if options.sequence is None:
-        return fastdepth, RenderedRoom(boxes=options.boxes, seed=options.seed)
-    if not options.sequence.exists():
-        raise FileNotFoundError(f"--sequence {options.sequence} does not exist")
-    return fastdepth, RecordedSequence(options.sequence, None if options.weights is None else fastdepth)
-
-
-def _results(
-    options: BenchSettings, config: UfMStarConfig, fastdepth: FastDepth, source: FrameSource, size: int,
-    rates: dict[str, float], progress: Progress,
-) -> list[dict[str, Any]]:  # fmt: skip
-    """The steps of one size, by every backend."""
-    progress(f"{size} x {size}, building up the mixture")
-    networks, about = reference_networks(size, fastdepth, options.runtime)
-    built, frames, history = build_up(
-        source, config, size=size, in_view=options.in_view, history=options.history, rounds=_WARM_UP + options.frames
+    device = torch.device(require_device(options.device))
+    threads = options.threads or available_cores()
+    plan = Plan(frames=options.frames, warm_up=options.history, threads=threads, windows=1)
+    networks = (
+        [_loaded(options, threads, device)] if options.weights else (_random(options, s, device) for s in options.sizes)
     )
     results = []
-    for backend in options.backends:
-        progress(f"{size} x {size}, {backend}")
-        warm_up, timed = _WARM_UP, options.frames
-        if backend == "torch":
-            warm_up, timed = 1, min(timed, _TORCH_ROUNDS)
-        result = measure_step(built, frames[: warm_up + timed], networks, backend=backend, warm_up=warm_up, rates=rates)
-        results.append({**result, "history": history, "networks_about": about})
-    return results
+    for network in networks:
+        height, width = network.preprocess.size or (0, 0)
+        progress(f"{network.label} {height} x {width}, {options.history + options.frames} frames")
+        name = f"{TOUR}?frames={options.history + options.frames}&size={height}x{width}"
+        sequence = open_sequence(name if options.sequence == TOUR else options.sequence)
+        rows = [Row(Method.parse(name), setting) for name, setting in _rows(network.base, options.backends)]
+        results.append(
+            measure(rows, {network.base: network}, sequence, device=device, multiview_device=device, plan=plan)
+        )
+    used = {name: str(value) for name, value in vars(options).items() if value is not None}
+    return {"schema": 2, "date": datetime.now(UTC).isoformat(timespec="seconds"), "options": used, "results": results}
 
 
-def targets(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """The figures that have a target, for information: name, value (None = not measured), target, met."""
-    values: dict[str, float] = {}
-    for result in report["results"]:
-        if (result["size"], result["backend"]) == (_TARGET_SIZE, "numba"):
-            values["spgf_ms"] = result["kernels"]["spgf"]["median_ms"]
-            values["step_ms"] = result["step"]["median_ms"]
-            values["components_bytes"] = result["memory"]["in_use"]
-            values |= {name: ratio["median"] for name, ratio in result["ratios"].items() if name in _TARGETS}
-    if (run := report["long_run"]) is not None:
-        values |= {"long_run_ratio": run["ratio"], "components_bytes": run["memory"]["in_use"]}
-    if (anchors := report["anchors"]) is not None and anchors["points"] == CORNERS:
-        values["tracker_cpu_ms"] = anchors["tracker"]["update"]["cpu_mean_ms"]
-    return [
-        {"name": name, "value": value, "target": target, "met": None if value is None else value <= target}
-        for name, target in _TARGETS.items()
-        for value in (values.get(name),)
+def _rows(base: str, backends: tuple[str, ...]) -> list[tuple[str, Setting]]:
+    """Methods and settings: UfM, and for every backend UfM*, with corners, and the posterior with dense anchors."""
+    alone = BASES[base][1]
+    rows = [(f"UfM-{alone}-100K", Setting())]
+    for backend in backends:
+        of = {} if backend == "auto" else {"backend": backend}
+        kinds: tuple[dict[str, Any], ...] = ({}, {"anchors": "tracked"}, {"anchors": "dense", "posterior": True})
+        rows += [(f"UfM*-{alone}", Setting(overrides=of, **kind)) for kind in kinds]
+    return rows
+
+
+class _Random(TimedNetwork):
+    """An architecture with random weights, for its time; its depth is the sequence's with smooth errors of 3 %."""
+
+    def prepare(self, frame: Frame, device: torch.device) -> tuple[Tensor, Tensor]:
+        """See :class:`TimedNetwork`. Raises FrameError: no depth at the image's pixels."""
+        x, K = super().prepare(frame, device)
+        if frame.depth is None or frame.depth_intrinsics is not None:
+            raise FrameError(frame.name, "has no depth at the image's pixels: predict depth with --weights")
+        depth = self.preprocess.apply_depth(torch.from_numpy(frame.depth)[None])
+        noise = torch.randn(1, 1, _GRID, _GRID, generator=torch.Generator().manual_seed(frame.index))
+        smooth = nn.functional.interpolate(_ERROR * noise, depth.shape[-2:], mode="bicubic", align_corners=True)[0]
+        self._depth = (depth * (1 + smooth)).to(device)
+        return x, K
+
+    def predict(self, part: str, x: Tensor, intrinsics: Tensor, *, turn: int = 0) -> DepthPrediction:
+        super().predict(part, x, intrinsics, turn=turn)
+        return DepthPrediction(self._depth)
+
+
+def _random(options: BenchSettings, side: int, device: torch.device) -> TimedNetwork:
+    """One of the paper's architectures with random weights, as it runs fastest in torch."""
+    size = (side, side)
+    network: DepthNetwork = MonodepthResNet(size=size)
+    if options.model == ARCHITECTURES[0]:
+        network = FastDepth(FastDepthWidths.pruned(), size=size).eval().folded()
+    network.preprocess = Preprocess(resize_height=side, crop=size, size=size)
+    return _Random("depth_only", [network.eval().to(device, memory_format=torch.channels_last)], options.model)
+
+
+def _loaded(options: BenchSettings, threads: int, device: torch.device) -> TimedNetwork:
+    """The network of the options, as ``ufmstar run`` runs it."""
+    assert options.weights is not None
+    inference = Inference(runtime=options.runtime, threads=threads)
+    spec = {} if options.spec is None else {"spec": options.spec}
+    loaded = load_network(options.model, options.weights, **spec, **inference.options(options.model, device))
+    members = list(loaded.members) if isinstance(loaded, Ensemble) else [loaded]
+    ready = [inference.ready(member, options.weights, device).to(device) for member in members]
+    return TimedNetwork("ensemble" if len(ready) > 1 else "depth_only", ready, options.model)
+
+
+def format_report(report: Mapping[str, Any]) -> str:
+    """The machine, and a table for every size."""
+    return "\n\n".join("\n".join(_lines(result)) for result in report["results"])
+
+
+def _lines(result: Mapping[str, Any]) -> list[str]:
+    machine, ((base, network),) = result["machine"], result["networks"].items()
+    hardware, load = machine["hardware"], machine["load"]
+    where = hardware["cpu"] if machine["gpu"] is None else machine["gpu"]
+    versions = ", ".join(f"{name} {value}" for name, value in machine["versions"].items() if value)
+    lines = [
+        f"{where}, {hardware['cores']} cores, {result['plan']['threads']} threads; {versions}",
+        f"{result['sequence']['name']}, {result['plan']['frames']} frames of {result['map']}"
+        + (f"; load average {load:.1f}" if load else ""),
+        f"{'[ms]':52}{'median':>9}{'IQR':>8}{'minimum':>9}{'x network':>11}{'state':>11}",
     ]
+    rows = [(f"{network['label']} ({base})", network["latency"][ONCE], None, None)]
+    for row in result["rows"]:
+        ratio, kept = row["ratios_to_depth"][MULTIVIEW]["median"], row["memory"]["multiview"]["bytes_end"]
+        rows.append((row["row"], row["latency"][MULTIVIEW], ratio, kept))
+    for name, times, ratio, kept in rows:
+        tail = "" if ratio is None else f"{ratio:11.3f}{kept / 1e3:8.1f} kB"
+        lines.append(f"{name:52}{times['median_ms']:9.2f}{times['iqr_ms']:8.2f}{times['min_ms']:9.2f}{tail}")
+    for row in result["rows"]:
+        if row["stages"] is not None:
+            stages = row["stages"]["stages"].items()
+            lines.append(f"stages of {row['row']}: " + ", ".join(f"{n} {t['median_ms']:.2f}" for n, t in stages))
+    return [*lines, *(f"no energy of the {unit}: {why}" for unit, why in result["power"]["missing"].items())]

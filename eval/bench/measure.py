@@ -1,13 +1,13 @@
-"""The measurement behind the paper's table of latency, power, energy and memory.
+"""The measurement behind the paper's table 2 (latency, power, energy, memory) and its figure of the stages' shares.
 
 Per row: what the network spends on depth alone, what uncertainty adds to the network (a head, further members or
-samples), and the multiview step. Times come from a race over the frames of one sequence (``race``), energies from
-windows of the machine's own counters (``energy``), memory from the tensors that are kept (``memory``).
+samples), and the multiview step. Times come from the frames of one sequence (``parts``), energies from zeus
+(``energy``), memory from the tensors that are kept (``memory``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import islice
@@ -17,25 +17,24 @@ import numpy as np
 import torch
 
 from ufmstar_torch.checked import Checked, number
-from ufmstar_torch.eval.bench.energy import CPU, GPU, PartEnergy, PowerMeter, repeated, run_windows
+from ufmstar_torch.eval.bench.energy import CPU, GPU, Energy, EnergyMeter, difference, measure_energy, summary
 from ufmstar_torch.eval.bench.memory import overhead_percent
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
-from ufmstar_torch.eval.bench.race import MULTIVIEW, PROCESSOR, WALL, Part, Race, inference_of, run_race
+from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, Part, TimedParts, inference_of, time_parts
 from ufmstar_torch.eval.bench.timing import pinned_threads
 from ufmstar_torch.eval.engine.clock import paired_ratio, spread, synchronize
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.results.work import EvalJob
 from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.run.machine import available_cores, device_of, hardware, load_average, versions
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.suite.job import EvalJob
 
 EFFICIENCY = "efficiency.json"
-FORMAT = 1
 NETWORK = "network_uncertainty"
 NOT_NEEDED = "the method needs only depth of the network"
 
-Energies = Mapping[Part, PartEnergy]
+Energies = Mapping[Part, Energy]
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,6 @@ class Plan(Checked):
         threads: of torch and numba on the CPU; None = all cores that this process may use.
         seconds: a window of energy lasts at least so long [s].
         windows: of energy per part.
-        idle: for so long nothing is done, for the idle power [s].
-        sequences: of an evaluation that are measured, the first ones; None = all.
 
     Raises:
         ValueError: a number out of range.
@@ -60,8 +57,6 @@ class Plan(Checked):
     threads: int | None = number(None, "", "1", 1)
     seconds: float = number(3.0, "", "s", 0.0, open_low=True)
     windows: int = number(3, "", "1", 1)
-    idle: float = number(10.0, "", "s", 0.0, open_low=True)
-    sequences: int | None = number(None, "", "1", 1)
 
 
 def measure(
@@ -72,7 +67,7 @@ def measure(
     device: torch.device | str = "cpu",
     multiview_device: torch.device | str = "cpu",
     plan: Plan | None = None,
-    meter: PowerMeter | None = None,
+    meter: EnergyMeter | None = None,
 ) -> dict[str, Any]:
     """Measure every row on the first frames of a sequence.
 
@@ -93,41 +88,39 @@ def measure(
         ValueError: no row can be measured, or too few frames can be read.
     """
     plan = plan or Plan()
+    plan = replace(plan, threads=plan.threads or available_cores())
     device, multiview_device = torch.device(device), torch.device(multiview_device)
     left_out = {row.label: why for row in rows if (why := _obstacle(row, networks)) is not None}
     chosen = [row for row in rows if row.label not in left_out]
     if not chosen:
         raise ValueError(f"rows must hold one that can be measured: {left_out or 'none was given'}")
-    broken: list[FrameError] = []
-    wanted = plan.warm_up + plan.frames
-    frames = list(islice(sequence.readable(broken.append), wanted))
-    if len(frames) < wanted:
-        raise ValueError(f"{sequence.name} has {len(frames)} readable frames, the plan needs {wanted}")
     on_gpu = next((d for d in (device, multiview_device) if d.type == "cuda"), None)
-    meter = meter or PowerMeter.open(None if on_gpu is None else on_gpu.index or 0)
-    threads = plan.threads or available_cores()
-    with pinned_threads(threads):
-        idle = meter.idle(plan.idle)
-        race = run_race(
+    meter = meter or EnergyMeter(None if on_gpu is None else on_gpu.index or 0)
+    with pinned_threads(plan.threads or 1):
+        broken: list[FrameError] = []
+        frames = list(islice(sequence.readable(broken.append), wanted := plan.warm_up + plan.frames))
+        if len(frames) < wanted:
+            raise ValueError(f"{sequence.name} has {len(frames)} readable frames, the plan needs {wanted}")
+        parts = time_parts(
             chosen, networks, frames, warm_up=plan.warm_up, device=device, multiview_device=multiview_device
         )
         work = {}
-        for (owner, part), calls in race.calls.items():
+        for (owner, part), calls in parts.calls.items():
             where = multiview_device if part == MULTIVIEW else device
-            work[owner, part] = (_unit(where), repeated(calls, partial(synchronize, where)))
-        energy = run_windows(meter, work, idle, seconds=plan.seconds, windows=plan.windows)
+            work[owner, part] = (_unit(where), [partial(_finished, call, where) for call in calls])
+        energy = measure_energy(meter, work, seconds=plan.seconds, windows=plan.windows)
     units = {DEPTH: _unit(device), NETWORK: _unit(device), MULTIVIEW: _unit(multiview_device)}
-    used = [base for base in networks if (base, DEPTH) in race.calls]
     gpu = None if on_gpu is None else torch.cuda.get_device_name(on_gpu)
     return {
-        "format": FORMAT,
+        "format": 1,
         "machine": {"hardware": hardware(), "versions": versions(), "load": load_average(), "gpu": gpu},
         "devices": {"networks": str(device), "multiview": str(multiview_device), "units": units},
-        "plan": {**asdict(plan), "threads": threads},
+        "plan": asdict(plan),
         "sequence": {"name": sequence.name, "layout": sequence.layout, "unreadable": len(broken)},
-        "power": {"rails": [asdict(rail) for rail in meter.rails], "missing": meter.missing, "idle_watts": idle},
-        "networks": {base: _network_line(networks[base], race, energy) for base in used},
-        "rows": [_row_line(row, networks[row.method.base], race, energy) for row in chosen],
+        "power": {"missing": meter.missing},
+        "map": parts.size,
+        "networks": {b: _network_line(networks[b], parts, energy) for b in networks if parts.ms(b, DEPTH)},
+        "rows": [_row_line(row, networks[row.method.base], parts, energy) for row in chosen],
         "left_out": left_out,
     }
 
@@ -135,26 +128,26 @@ def measure(
 def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
     """Measure the rows on the sequences of an evaluation, and write their means to OUT/efficiency.json.
 
-    UfM and UfM* run on the CPU, as the paper's do, the networks on the job's device. Of sequences with fewer frames
-    than the plan has, all are taken; windows of energy are divided among the sequences, at least one for each.
+    UfM and UfM* run on the CPU, as the paper's do, the networks on the job's device. Sequences may have fewer frames
+    than the plan; its windows of energy are divided among them.
 
     Raises:
         ValueError: no sequence can be opened, none has frames enough, or no row can be measured.
         OSError: the file cannot be written.
     """
     plan = plan or Plan()
+    plan = replace(plan, windows=-(-plan.windows // max(1, len(job.items))))
     device = device_of(job.device, 0)
-    rows, items = job.suite.rows, job.items[: plan.sequences]
-    plan = replace(plan, windows=-(-plan.windows // max(1, len(items))))
-    networks = timed_networks(job.load(torch.device(device)), rows)
+    networks = timed_networks(job.load(torch.device(device)), job.suite.rows)
     measured: dict[tuple[str, str], dict[str, Any]] = {}
     failed = []
-    for item in items:
+    for item in job.items:
         try:
             sequence = item.open()
-            frames = max(1, min(plan.frames, len(sequence) - plan.warm_up))
-            result = measure(rows, networks, sequence, device=device, plan=replace(plan, frames=frames))
-            measured[item.dataset, item.sequence] = result
+            of_item = replace(plan, frames=max(1, min(plan.frames, len(sequence) - plan.warm_up)))
+            measured[item.dataset, item.sequence] = measure(
+                job.suite.rows, networks, sequence, device=device, plan=of_item
+            )
         except (OSError, ValueError) as error:
             failed.append(f"{item.label}: {error}")
     if not measured:
@@ -192,8 +185,6 @@ def _mean(values: Sequence[Any]) -> Any:
     first = values[0]
     if isinstance(first, Mapping) and all(isinstance(v, Mapping) and v.keys() == first.keys() for v in values):
         return {name: _mean([value[name] for value in values]) for name in first}
-    if isinstance(first, list) and all(isinstance(v, list) and len(v) == len(first) for v in values):
-        return [_mean(parts) for parts in zip(*values, strict=True)]
     numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
     return sum(values) / len(values) if numbers and any(v != first for v in values) else first
 
@@ -207,93 +198,78 @@ def _obstacle(row: Row, networks: Mapping[str, TimedNetwork]) -> str | None:
         return f"it runs several members, {networks[base].label} has one"
     if setting.skip or setting.pose_noise:
         return "left out frames and noise on poses are no matter of efficiency"
-    if setting.anchors:
-        return "anchors are not measured here: `ufmstar bench` times the tracker, `ufmstar eval` UfM* with them"
-    return None
+    return None if setting.anchors in ANCHORS else f"anchors of {setting.anchors!r} have no cost of their own"
 
 
 def _unit(device: torch.device) -> str:
     return CPU if device.type == "cpu" else GPU
 
 
+def _finished(call: Callable[[], object], device: torch.device) -> None:
+    call()
+    synchronize(device)
+
+
 # ---- the lines of the result ----
 
 
-def _network_line(network: TimedNetwork, race: Race, energy: Energies) -> dict[str, Any]:
+def _network_line(network: TimedNetwork, parts: TimedParts, energy: Energies) -> dict[str, Any]:
     """A base's networks: what they are, and what depth alone and each form of inference take."""
-    parts = [part for part in (DEPTH, ONCE, EVERY) if race.ms(network.base, part)]
+    forms = [form for form in (DEPTH, ONCE, EVERY) if parts.ms(network.base, form)]
     return {
         "label": network.label,
         "members": len(network.members),
         "passes": network.passes,
         "whole": network.why_whole,
         "memory": network.memory(),
-        "latency": {part: spread(race.ms(network.base, part)) for part in parts},
-        "energy": {part: energy[network.base, part].to_dict() for part in parts},
+        "latency": {form: spread(parts.ms(network.base, form)) for form in forms},
+        "energy": {form: summary(energy[network.base, form]) for form in forms},
     }
 
 
-def _row_line(row: Row, network: TimedNetwork, race: Race, energy: Energies) -> dict[str, Any]:
+def _row_line(row: Row, network: TimedNetwork, parts: TimedParts, energy: Energies) -> dict[str, Any]:
     """One line of the table."""
-    base, part, name = row.method.base, inference_of(row), row.label
-    missing = _no_network_part(row, network)
-    clocks = (WALL, PROCESSOR)
-    depth = {clock: race.ms(base, DEPTH, clock) for clock in clocks}
-    times: dict[str, dict[str, list[float]]] = {}
-    energies: dict[str, PartEnergy] = {DEPTH: energy[base, DEPTH]}
-    if missing is None:
-        times[NETWORK] = {clock: race.added_ms(base, part, clock) for clock in clocks}
-        energies[NETWORK] = energy[base, part].minus(energy[base, DEPTH])
+    base, form, name = row.method.base, inference_of(row), row.label
+    unknown: dict[str, str] | None = None  # why the network's share for uncertainty is nothing or unknown
+    if base == "depth_only":
+        unknown = {"none": NOT_NEEDED}
+    elif network.why_whole is not None and not row.method.every_member:
+        unknown = {"not_separable": network.why_whole}
+    depth = parts.ms(base, DEPTH)
+    times: dict[str, list[float]] = {}
+    energies = {DEPTH: energy[base, DEPTH]}
+    if unknown is None:
+        times[NETWORK] = [a - b for a, b in zip(parts.ms(base, form), depth, strict=True)]
+        energies[NETWORK] = difference(energy[base, form], energy[base, DEPTH])
     if row.method.fusion != ALONE:
-        times[MULTIVIEW] = {clock: race.ms(name, MULTIVIEW, clock) for clock in clocks}
-        energies[MULTIVIEW] = energy[name, MULTIVIEW]
-    unmeasured = {} if missing is None else {NETWORK: missing}
-    latency = {key: spread(ms[WALL]) for key, ms in ({DEPTH: depth} | times).items()}
-    ratios = {key: {clock: paired_ratio(ms[clock], depth[clock]) for clock in clocks} for key, ms in times.items()}
+        times[MULTIVIEW], energies[MULTIVIEW] = parts.ms(name, MULTIVIEW), energy[name, MULTIVIEW]
+    words = {} if unknown is None else {NETWORK: unknown}
     return {
         "method": row.method.name,
         "setting": row.setting.to_dict(),
         "row": name,
         "base": base,
         "network": network.label,
-        "latency": latency | unmeasured,
-        "ratios_to_depth": ratios,
-        "stages": race.staged[name].summary(warm_up=race.warm_up) if name in race.staged else None,
-        "energy": {key: value.to_dict() for key, value in energies.items()} | unmeasured,
-        "energy_overhead_percent": _energy_overhead(energies, missing),
-        "memory": _memory(row, network, race),
+        "latency": {part: spread(ms) for part, ms in ({DEPTH: depth} | times).items()} | words,
+        "ratios_to_depth": {part: paired_ratio(ms, depth) for part, ms in times.items()},
+        "stages": parts.staged[name].summary(warm_up=parts.warm_up) if name in parts.staged else None,
+        "energy": {part: summary(value) for part, value in energies.items()} | words,
+        "energy_overhead_percent": None if "not_separable" in (unknown or {}) else _energy_overhead(energies),
+        "memory": _memory(network.memory(), parts.memory.get(name)),
     }
 
 
-def _no_network_part(row: Row, network: TimedNetwork) -> dict[str, str] | None:
-    """None, or why the network's share for uncertainty is nothing or unknown."""
-    if row.method.base == "depth_only":
-        return {"none": NOT_NEEDED}
-    if network.why_whole is not None and not row.method.every_member:
-        return {"not_separable": network.why_whole}
-    return None
+def _energy_overhead(energies: Mapping[str, Energy]) -> dict[str, float] | None:
+    """Share of uncertainty in all energy [%], negative differences as nothing; None unless all of it was measured."""
+    joules = {key: max(0.0, float(np.median(e[:, 0]))) for key, e in energies.items() if not isinstance(e, str)}
+    depth = joules.pop(DEPTH, 0.0)
+    return (
+        {"gross": overhead_percent(sum(joules.values()), depth)} if depth and len(joules) + 1 == len(energies) else None
+    )
 
 
-def _energy_overhead(energies: Mapping[str, PartEnergy], missing: Mapping[str, str] | None) -> dict[str, float] | None:
-    """Share of uncertainty in all energy [%], gross and net; None unless all of it was measured.
-
-    A difference that the noise makes negative counts as nothing.
-    """
-    if any(part.reason is not None for part in energies.values()) or (missing is not None and "none" not in missing):
-        return None
-    overhead: dict[str, float] = {}
-    for column, kind in enumerate(("gross", "net")):
-        middle = {key: float(np.median(part.windows[:, column])) for key, part in energies.items()}
-        depth = middle.pop(DEPTH)
-        if depth > 0:
-            overhead[kind] = overhead_percent(sum(max(0.0, value) for value in middle.values()), depth)
-    return overhead or None
-
-
-def _memory(row: Row, network: TimedNetwork, race: Race) -> dict[str, Any]:
+def _memory(memory: Mapping[str, int] | None, state: Mapping[str, float] | None) -> dict[str, Any]:
     """Bytes of the network for depth, of what uncertainty adds to it, and of the multiview state; the share."""
-    memory = network.memory()
-    state = race.steps[row.label].memory() if row.method.fusion != ALONE else None
     if memory is None:
         return {"multiview": state, "not_measurable": "the weights are not torch's tensors"}
     uncertainty = memory["uncertainty"] + (0 if state is None else state["bytes_end"])

@@ -28,10 +28,6 @@ from ufmstar_torch.prediction import DepthPrediction, infer
 DEPTH, ONCE, EVERY = "depth", "once", "every"
 
 
-class Inseparable(Exception):
-    """A network's share for depth alone cannot be separated from the rest; the message is the reason."""
-
-
 class TimedNetwork:
     """The loaded network(s) of a base (a key of ``BASES``), on one device and in eval mode.
 
@@ -63,12 +59,9 @@ class TimedNetwork:
         self.base, self.label, self.members = base, label, tuple(opened)
         self._turns = NetworksInTurn(opened, samples=samples if base == "mc_dropout" else None)
         self.passes, self.preprocess = self._turns.passes, opened[0].preprocess
-        self.why_whole: str | None = None
-        self.depth: DepthNetwork = opened[0]
-        try:
-            self.depth = depth_alone(opened[0])
-        except Inseparable as error:
-            self.why_whole = str(error)
+        alone = depth_alone(opened[0])
+        self.depth = alone or opened[0]
+        self.why_whole = None if alone else f"a {type(opened[0]).__name__} predicts all that it predicts in one"
 
     def predict(self, part: str, x: Tensor, intrinsics: Tensor, *, turn: int = 0) -> DepthPrediction:
         """Depth without uncertainty ("depth"), with it by the member whose turn it is ("once"), or by "every" member
@@ -116,13 +109,9 @@ def timed_networks(sources: Mapping[str, DepthSource], rows: Sequence[Row] = ())
     return timed
 
 
-def depth_alone(network: DepthNetwork) -> DepthNetwork:
+def depth_alone(network: DepthNetwork) -> DepthNetwork | None:
     """A copy of a network without what uncertainty adds: heads, sampling, factors of a BatchEnsemble. A graph of ONNX
-    Runtime that declares nothing but depth is returned as it is.
-
-    Raises:
-        Inseparable: its kind has no known division.
-    """
+    Runtime that declares nothing but depth is returned as it is; None where its kind has no known division."""
     if isinstance(network, MonteCarloDropout):
         return depth_alone(network.network)
     if isinstance(network, BatchEnsembleMember):
@@ -132,7 +121,7 @@ def depth_alone(network: DepthNetwork) -> DepthNetwork:
     if isinstance(network, OnnxNetwork) and len(network.fetched) == 1:
         return network
     if not isinstance(network, Backbone):
-        raise Inseparable(f"a {type(network).__name__} predicts all that it predicts in one")
+        return None
     backbone = copy.deepcopy(network)
     for module in backbone.modules():
         if isinstance(module, DecoderDropout):

@@ -7,10 +7,10 @@ threads (threads that wait by spinning included), without what other processes t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib import import_module
-from itertools import cycle
+from importlib.util import find_spec
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,55 +18,38 @@ import torch
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.engine.clock import CallTimes, StageTimer, spread, synchronize
-from ufmstar_torch.eval.run.machine import available_cores
 
 F = TypeVar("F")
 Name = TypeVar("Name", bound=Hashable)
 
 # Every moment of a step belongs to one of these; see ``ufmstar_torch.step.StepObserver``.
 STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
-_KERNELS = ("spgf", "floor_covariance", "correspond", "fuse", "regress_image")
 _CPU = torch.device("cpu")
 
 
 @contextmanager
-def pinned_threads(count: int, *, opencv: bool = False) -> Iterator[None]:
-    """Set the number of threads of torch and numba; restore the previous numbers afterwards.
-
-    Args:
-        count: threads of each.
-        opencv: set OpenCV's number too.
+def pinned_threads(count: int) -> Iterator[None]:
+    """Set the number of threads of torch, numba and OpenCV; restore the previous numbers afterwards.
 
     Raises:
         ValueError: ``count`` is not positive or more than numba has started.
-        ModuleNotFoundError: ``opencv`` without OpenCV.
     """
-    if count < 1:
-        raise ValueError(f"threads must be at least 1, got {count}")
     numba: Any = import_module("numba")
-    if count > numba.config.NUMBA_NUM_THREADS:
-        raise ValueError(f"threads must be at most numba's {numba.config.NUMBA_NUM_THREADS}, got {count}")
+    if not 1 <= count <= numba.config.NUMBA_NUM_THREADS:
+        raise ValueError(f"threads must be 1 to {numba.config.NUMBA_NUM_THREADS} (numba's), got {count}")
     # torch last: where numba's loops run on OpenMP, setting its number sets torch's as well.
-    libraries: list[tuple[Callable[[], int], Callable[[int], Any]]] = [
-        (torch.get_num_threads, torch.set_num_threads),
-        (numba.get_num_threads, numba.set_num_threads),
-    ]
-    if opencv:
+    libraries = [(numba.get_num_threads, numba.set_num_threads), (torch.get_num_threads, torch.set_num_threads)]
+    if find_spec("cv2") is not None:
         cv2: Any = import_module("cv2")
-        libraries.append((cv2.getNumThreads, cv2.setNumThreads))
+        libraries.insert(0, (cv2.getNumThreads, cv2.setNumThreads))
     before = [read() for read, _ in libraries]
     try:
-        for _, write in reversed(libraries):
+        for _, write in libraries:
             write(count)
         yield
     finally:
-        for (_, write), number in reversed(list(zip(libraries, before, strict=True))):
+        for (_, write), number in zip(libraries, before, strict=True):
             write(number)
-
-
-def most_threads() -> int:
-    """The cores of this process, or fewer where numba may start fewer threads (``NUMBA_NUM_THREADS``)."""
-    return min(available_cores(), import_module("numba").config.NUMBA_NUM_THREADS)
 
 
 class TimedCalls:
@@ -74,48 +57,33 @@ class TimedCalls:
 
     On odd frames the order is reversed: no call always follows the same neighbour, and a busy machine slows all calls
     of a frame alike.
-
-    Args:
-        before: predecessors by name: one of them in turn runs before every call, as a network runs before a
-            step in use, on the same arguments. Each is timed the first time that it runs on a frame.
     """
 
-    def __init__(self, before: Mapping[str, Callable[..., Any]] | None = None) -> None:
+    def __init__(self) -> None:
         self.times = CallTimes()
-        self._before = dict(before or {})
         self._number = 0
 
     def frames(self, frames: Iterable[F], *, warm_up: int = 0) -> Iterator[F]:
         """The frames; after the last one, the times of the first ``warm_up`` are dropped."""
-        for number, frame in enumerate(frames):
-            self._number = number
+        for self._number, frame in enumerate(frames):
             yield frame
         self.times.drop(warm_up)
 
-    def call(
-        self, calls: Mapping[Name, Callable[..., Any]], *args: Any, device: torch.device = _CPU
-    ) -> dict[Name, Any]:
+    def call(self, calls: Mapping[Name, Callable[[], Any]], device: torch.device = _CPU) -> dict[Name, Any]:
         """Make every call on the current frame; the results by name.
 
         Args:
             calls: by name.
-            args: of every call.
-            device: where the calls compute; it is waited for before and within the timed span.
+            device: where they compute; it is waited for before and within the timed span.
         """
 
-        def finished(call: Callable[..., Any]) -> Any:
-            result = call(*args)
+        def finished(call: Callable[[], Any]) -> Any:
+            result = call()
             synchronize(device)
             return result
 
-        untimed, order = set(self._before), list(calls)[:: -1 if self._number % 2 else 1]
         results = {}
-        for name, previous in zip(order, cycle(self._before or [""]), strict=False):
-            if previous in untimed:
-                self.times.time(previous, finished, self._before[previous])
-                untimed.discard(previous)
-            elif previous:
-                finished(self._before[previous])
+        for name in list(calls)[:: -1 if self._number % 2 else 1]:
             synchronize(device)
             results[name] = self.times.time(name, finished, calls[name])
         return results
@@ -129,42 +97,30 @@ class StagedStep:
     """
 
     def __init__(self, module: UfMStar, device: torch.device = _CPU) -> None:
-        self.module, self._device = module, device
+        self.module, self._timer = module, StageTimer(device)
         self.stages: dict[str, list[float]] = {name: [] for name in STAGES}
-        self.kernels: dict[str, list[float]] = {name: [] for name in _KERNELS}
-        self._stages, self._kernels = StageTimer(device), StageTimer(device)
         module.observer = self
 
     def __call__(self, *args: Any) -> Any:
         """One step of the module."""
-        synchronize(self._device)
-        self._kernels.take()
-        self._stages.take()
+        self._timer.take()
         return self.module(*args)
 
     def stage(self, name: str) -> None:
         """A stage has ended; the last one ends the step."""
-        self._stages.lap(name)
+        self._timer.lap(name)
         if name == STAGES[-1]:
-            for kept, ms in ((self.stages, self._stages.take()), (self.kernels, self._kernels.take())):
-                for part, times in kept.items():
-                    times.append(ms.get(part, 0.0))
+            ms = self._timer.take()
+            for stage, times in self.stages.items():
+                times.append(ms.get(stage, 0.0))
 
     def kernel(self, name: str) -> AbstractContextManager[object]:
-        """Around one call of a kernel."""
-        return self._kernels.stage(name)
+        """Kernels are not timed."""
+        return nullcontext()
 
     def summary(self, *, warm_up: int) -> dict[str, Any]:
-        """Spread of every stage, of every kernel (all its calls in a step), and of the steps' sums; the first
-        ``warm_up`` steps do not count."""
+        """Spread of every stage and of the steps' sums; the first ``warm_up`` steps do not count."""
         return {
             "stages": {name: spread(times[warm_up:]) for name, times in self.stages.items()},
-            "kernels": {name: spread(times[warm_up:]) for name, times in self.kernels.items()},
             "stages_total": spread(np.sum(list(self.stages.values()), axis=0)[warm_up:]),
         }
-
-
-def spread_of_counts(values: Sequence[int]) -> dict[str, float]:
-    """Median, extremes and mean of at least one number."""
-    low, middle, high = (float(v) for v in np.percentile(np.asarray(values, np.float64), (0, 50, 100)))
-    return {"median": middle, "min": low, "max": high, "mean": float(np.mean(values))}

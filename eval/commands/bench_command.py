@@ -1,4 +1,4 @@
-"""``ufmstar bench``: its options are ``BenchSettings``; prints the table, writes JSON and a picture."""
+"""``ufmstar bench``: its options are ``BenchSettings``; prints the table and writes JSON."""
 
 from __future__ import annotations
 
@@ -16,10 +16,7 @@ def read(words: Sequence[str]) -> BenchSettings:
 
 def main(options: BenchSettings) -> int:
     """Run the benchmark, print its table and write its JSON; the exit code."""
-    from ufmstar_torch.eval.bench.benchmark import run_benchmark
-    from ufmstar_torch.eval.bench.text import format_report
-    from ufmstar_torch.eval.report.figures_cost import draw_growth
-    from ufmstar_torch.eval.report.style import save_figure
+    from ufmstar_torch.eval.bench.benchmark import format_report, run_benchmark
     from ufmstar_torch.eval.run.files import write_json_atomic
 
     try:
@@ -29,6 +26,4 @@ def main(options: BenchSettings) -> int:
     print(format_report(report))
     if options.json is not None:
         write_json_atomic(options.json, report)
-        if report["growth"]:
-            save_figure(draw_growth(report["growth"]), options.json.with_suffix(".growth.svg"))
     return 0

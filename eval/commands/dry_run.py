@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.results.work import EvalJob
-from ufmstar_torch.eval.results.worklist import Shard
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.suite.job import EvalJob
+from ufmstar_torch.eval.suite.work_items import Shard
 
 _FILE_BYTES = 2048  # of a cached file beside its maps, rounded up to what file systems allot
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig
 from ufmstar_torch.eval.commands.opening import OpeningOptions
@@ -19,9 +19,8 @@ PRESETS = ("paper", "default")
 _OF_JOB = ("device", "confident", "bins", "examples", "samples", "runtime", "precision")
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.methods.suite import Suite
-    from ufmstar_torch.eval.results.launch import EvalOutcome, LaunchOptions
-    from ufmstar_torch.eval.results.work import EvalJob
+    from ufmstar_torch.eval.suite.job import EvalJob
+    from ufmstar_torch.eval.suite.shards import EvalOutcome
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,15 +110,15 @@ class EvalOutputOptions:
 class EvalOptions:
     """The rows of a table or figure of the paper, on sequences of your own.
 
-    Every sequence is finished for itself: whatever ends the program, --resume computes what is missing. Several
-    processes may share the work: --processes on one computer, torchrun or --slurm on several, --shard by hand.
+    A sequence's rows are written when its last frame is done: whatever ends the program, --resume computes what is
+    missing. The work can be divided: --processes on one computer, --shard by hand, torchrun, or --slurm.
 
     Attributes:
-        device: cpu or cuda; of several processes, each takes the next GPU in turn
+        device: cpu or cuda; of several --processes, each takes the next GPU in turn
         threads: number of CPU threads of each process; default: all cores, divided among --processes
         processes: number of processes on this computer
-        shard: i/n, only the i-th of n parts of the sequences, 1/n to n/n
-        slurm: KEY=VALUE for submitit, as partition=gpu; jobs=N is the number of jobs; repeatable
+        shard: i/n, only the i-th of n parts of the sequences, 1/n to n/n; torchrun's processes are shards as well
+        slurm: KEY=VALUE for submitit, as partition=gpu; jobs=N: a job array of N shards; repeatable
         dry_run: show rows, sequences and the size of the cache, and stop
         debug: show tracebacks
     """
@@ -156,11 +155,8 @@ class EvalOptions:
             raise ValueError(f"--confident must be a share in (0, 1], got {self.output.confident}")
         if self.output.resume and self.output.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
-        several = [n for n in ("shard", "slurm") if values[n]] + (["processes"] if self.processes > 1 else [])
-        if len(several) > 1:
-            raise ValueError(f"--{several[0]} and --{several[1]} contradict each other")
-        if self.shard and self.output.overwrite:
-            raise ValueError("--overwrite goes without --shard: another part may have begun")
+        if self.shard and self.slurm:
+            raise ValueError("--shard and --slurm contradict each other")
 
 
 def read(words: Sequence[str]) -> EvalOptions:
@@ -175,12 +171,8 @@ def main(options: EvalOptions) -> int:
 
         print(listing())
         return 0
-    from ufmstar_torch.eval.results.cache import CacheError
-
     try:
         return _dry_run(options) if options.dry_run else _evaluate(options)
-    except CacheError:
-        raise
     except (FileNotFoundError, ValueError) as error:
         raise UsageError(error) from error
 
@@ -194,12 +186,12 @@ def job_from(options: EvalOptions) -> EvalJob:
     """
     from ufmstar_torch.eval.engine.load import NetworkChoice
     from ufmstar_torch.eval.methods.suite import suite_named
-    from ufmstar_torch.eval.results.work import EvalJob
-    from ufmstar_torch.eval.results.worklist import find_work, read_names
     from ufmstar_torch.eval.sequences.options import Options
+    from ufmstar_torch.eval.suite.job import EvalJob, with_recalibrations
+    from ufmstar_torch.eval.suite.work_items import find_work, read_names
 
     what, data, output, values = options.what, options.data, options.output, as_dict(options)
-    suite = _recalibrated(suite_named(str(what.suite), what.base, what.ufm_preset), what.recalibration)
+    suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), what.recalibration)
     choices = [NetworkChoice.parse(text) for text in what.network]
     networks = {choice.base: choice for choice in choices}
     if len(networks) < len(choices):
@@ -220,35 +212,6 @@ def job_from(options: EvalOptions) -> EvalJob:
     )
 
 
-def _recalibrated(suite: Suite, files: Sequence[str]) -> Suite:
-    """The suite with the rows of recalibrations right behind those to which they were fitted.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: a file is no recalibration, or was fitted to a row that the suite does not have.
-    """
-    from ufmstar_torch.recalibrate import named, read_recalibration
-
-    for file in files:
-        name = named(file)
-        fitted = read_recalibration(name).row
-        own = next((row for row in suite.rows if row.label == fitted), None)
-        if own is None:
-            raise ValueError(f"--recalibration {file} was fitted to the row {fitted!r}, which the suite does not have")
-        mapped = replace(own, setting=replace(own.setting, recalibration=name))
-        at = suite.rows.index(own) + 1
-        suite = replace(suite, rows=(*suite.rows[:at], mapped, *suite.rows[at:]))
-    return suite
-
-
-def launch_from(options: EvalOptions) -> LaunchOptions:
-    """Who carries the evaluation out."""
-    from ufmstar_torch.eval.results.launch import LaunchOptions
-
-    values = as_dict(options)
-    return LaunchOptions(**{f.name: values[f.name] for f in fields(LaunchOptions)})
-
-
 def _evaluate(options: EvalOptions) -> int:
     import torch
 
@@ -257,14 +220,19 @@ def _evaluate(options: EvalOptions) -> int:
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
     from ufmstar_torch.eval.engine.warm_up import warm_up_command
     from ufmstar_torch.eval.methods.method import UFM_STAR
-    from ufmstar_torch.eval.results.launch import evaluate_suite
+    from ufmstar_torch.eval.suite.shards import Slurm, evaluate_on_slurm, evaluate_suite
+    from ufmstar_torch.eval.suite.work_items import Shard
 
+    shard = Shard.parse(options.shard) if options.shard else None
+    slurm = Slurm.parse(options.slurm) if options.slurm else None
+    how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}
+    how |= {"processes": options.processes, "threads": options.threads}
     with Bars() as bars, stop_signals(bars.say) as stop:
-        job, launch = job_from(options), launch_from(options)
+        job = job_from(options)
         for base in job.unused:
             bars.say(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
         rows = [row for row in job.suite.rows if row.method.fusion == UFM_STAR]
-        if rows:
+        if rows and slurm is None:
             anchors = {row.setting.anchors for row in rows}
             config = UfMStarConfig(
                 anchors=AnchorConfig() if anchors != {""} else None,
@@ -272,13 +240,14 @@ def _evaluate(options: EvalOptions) -> int:
             )
             shown = partial(bars.frames, "kernels, compiled on the first run")
             warm_up_command(config, torch.device("cpu"), shown, dense=DENSE in anchors)
-        outcome = evaluate_suite(job, launch, stop=stop, report=bars.say, progress=bars.frames)
-    if outcome.reports:
-        return _report(job, outcome, options.threads, draws=not options.output.no_report)
-    return 0 if outcome.finished else 130
+        if slurm is None:
+            outcome = evaluate_suite(job, shard=shard, **how, stop=stop, report=bars.say, progress=bars.frames)
+        else:
+            outcome = evaluate_on_slurm(job, slurm, **how, stop=stop, report=bars.say)
+    return _report(job, outcome, options)
 
 
-def _report(job: EvalJob, outcome: EvalOutcome, threads: int | None, *, draws: bool) -> int:
+def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     """Print the table, make the measurements and pictures that belong to it, name what failed; the exit code."""
     from ufmstar_torch.eval.report.data import ResultsError, load_results
     from ufmstar_torch.eval.report.text import summary, written
@@ -291,9 +260,9 @@ def _report(job: EvalJob, outcome: EvalOutcome, threads: int | None, *, draws: b
     if job.missing_bases:
         print(f"left out, without a --network: the rows of {', '.join(job.missing_bases)}")
     print(f"{job.out}: eval.json, records/DATASET/SEQUENCE/ with a record for every row", flush=True)
-    if outcome.finished:
-        _measure(job, threads)
-    if outcome.finished and draws:
+    if outcome.complete and job.suite.efficiency:
+        _measure(job, options.threads)
+    if outcome.complete and not options.output.no_report:
         try:
             print(written(job.out, write_report(job.out)))
         except (ImportError, ResultsError) as error:
@@ -301,34 +270,26 @@ def _report(job: EvalJob, outcome: EvalOutcome, threads: int | None, *, draws: b
     for label, reason in outcome.failed.items():
         print(f"ufmstar eval: {label} failed: {reason}", file=sys.stderr)
     if outcome.stopped:
-        kept = f"finished rows are kept in {job.out / 'records'}; --resume goes on"
-        print(f"ufmstar eval: stopped; {kept}", file=sys.stderr)
+        print(f"ufmstar eval: stopped; finished rows are in {job.out / 'records'}; --resume continues", file=sys.stderr)
         return 130
     if outcome.failed or not outcome.finished:
         print("ufmstar eval: not all sequences are complete; --resume tries the rest again", file=sys.stderr)
         return 1
+    if not outcome.complete:
+        print("ufmstar eval: this shard is complete, others are not: the last one makes the report", file=sys.stderr)
     return 0
 
 
 def _measure(job: EvalJob, threads: int | None) -> None:
-    """Measure what a suite about efficiency needs, unless it exists; print why where it cannot be measured.
-
-    Not while sequences are still to be evaluated: other parts (``--shard``) are at them, and would be timed along.
-    """
-    if not job.suite.efficiency:
-        return
+    """Measure time, energy and memory, unless that was done; print why where it is not possible."""
     from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
-    from ufmstar_torch.eval.report.data import ResultsError, load_results
 
-    print("ufmstar eval: measuring time, energy and memory ...", file=sys.stderr)
     if (job.out / EFFICIENCY).exists():
         return
+    print("ufmstar eval: measuring time, energy and memory ...", file=sys.stderr)
     try:
-        if load_results(job.out, with_sums=False).missing:
-            print(f"no {EFFICIENCY} yet: it is measured when all sequences are evaluated")
-        else:
-            measure_job(job, Plan(threads=threads))
-    except (ResultsError, ValueError) as error:
+        measure_job(job, Plan(threads=threads))
+    except ValueError as error:
         print(f"no {EFFICIENCY}: {' '.join(str(error).split())}")
 
 
@@ -337,7 +298,7 @@ def _dry_run(options: EvalOptions) -> int:
     import torch
 
     from ufmstar_torch.eval.commands.dry_run import dry_run
-    from ufmstar_torch.eval.results.worklist import Shard
+    from ufmstar_torch.eval.suite.work_items import Shard
 
     job = job_from(options)
     for base in job.unused:

@@ -74,7 +74,7 @@ def _counts(results: Results, row: Row) -> dict[str, Array]:
     """[V, e] pixels of every sequence by variance and squared error, by "DATASET/SEQUENCE"."""
     from ufmstar_torch.eval.engine.judge import METRICS
     from ufmstar_torch.eval.report.data import read_sums
-    from ufmstar_torch.eval.results.worklist import WorkItem
+    from ufmstar_torch.eval.suite.work_items import WorkItem
 
     counts = {}
     for record in results.of(row):
@@ -109,7 +109,6 @@ def _about(fitted: Recalibration, results: Results, row: Row) -> Recalibration:
         fitted,
         row=row.label,
         ufm=ufm_star_config(row).to_dict(),
-        weights=tuple(file["sha256"] for file in files) if isinstance(files, list) else (),
+        network=", ".join(file["name"] for file in files) if isinstance(files, list) else "",
         sequences=tuple(f"{record.dataset}/{record.sequence}" for record in records),
-        digests=tuple(str(record.provenance["sequence"]) for record in records),
     )

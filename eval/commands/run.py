@@ -1,249 +1,259 @@
-"""``ufmstar run``: a sequence through a depth source and UfM*, onto disk.
-
-Every frame is finished or not there, and a run that was stopped, by whatever, goes on with the same
-results as if it had not been.
-"""
+"""``ufmstar run``: its options, and the printed results."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from importlib.util import find_spec
-from pathlib import Path
-from typing import Any
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import torch
-
-from ufmstar_torch.anchors.dense import DenseEvidence
-from ufmstar_torch.anchors.landmarks import DENSE, LandmarkSource
-from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.eval.commands.run_command import OWN_DEPTH, RunOptions
-from ufmstar_torch.eval.engine.anchors import landmarks_of
-from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
-from ufmstar_torch.eval.engine.load import network_source
-from ufmstar_torch.eval.engine.maps import folder_source, own_depth
-from ufmstar_torch.eval.engine.predictions import DepthSource
-from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
-from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
-from ufmstar_torch.eval.engine.warm_up import warm_up_command
-from ufmstar_torch.eval.engine.writer_thread import WriterThread
-from ufmstar_torch.eval.run.files import write_json_atomic
-from ufmstar_torch.eval.run.journal import Journal
-from ufmstar_torch.eval.run.pictures import Finished, common_columns, draw_sheet, draw_video, mixture_writers
-from ufmstar_torch.eval.run.run_folder import RunFolder
-from ufmstar_torch.eval.run.run_job import RunJob
-from ufmstar_torch.eval.run.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
-from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size, parse_slice
+from ufmstar_torch.config import SPGFConfig, UfMStarConfig
+from ufmstar_torch.eval.commands.opening import SequenceOptions
+from ufmstar_torch.eval.commands.options import UsageError, as_dict, fields_of, option, parse, positional
+from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
-from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.recalibrate import beside, named, read_recalibration
+from ufmstar_torch.stateful import flat
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.run.job import RunJob
+
+PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
+_OF_FOLDER = ("variance", "depth_scale", "map_intrinsics")
 
 
-def run(
-    job: RunJob,
-    out: str | Path,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    progress: Callable[[Progress], None] = lambda _: None,
-    stop: Callable[[], bool] = lambda: False,
-) -> dict[str, Any]:
-    """Run a job and leave its frames, pictures, mixture and summary in a folder.
+@dataclass(frozen=True, kw_only=True)
+class NetworkOptions:
+    """Depth from networks.
 
-    KeyboardInterrupt and OSError (a full disk) end the run in order: finished frames stay, and the summary
-    says so. A frame that cannot be read, or whose pose or intrinsics are unusable, is skipped and counted.
+    Attributes:
+        model: kind of network: fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, torchscript or
+            exported
+        weights: file (depth_anything, huggingface: directory); several are the members of an ensemble
+        mode: of an ensemble: one member per image in turn, or all on every image
+        samples: passes per image of an mc_dropout network in mode full; default: 10
+        offload: trained: keep the weights in host memory, only the member in turn on the device
+        spec: JSON file that declares what the weights do not say: inputs, outputs, an alignment
+        runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
+        precision: of the networks; bf16: torch's autocast
+    """
 
-    Args:
-        job: what to run.
-        out: the folder; see ``RunFolder.open`` for whose it may be.
-        resume: go on where an earlier run stopped.
-        overwrite: replace an earlier run.
-        progress: called at the start of each stage and after every frame.
-        stop: asked before every frame; True ends the run as KeyboardInterrupt does.
+    model: str | None = None
+    weights: tuple[str, ...] = ()
+    mode: str = option("alternate", choices=("alternate", "full"))
+    samples: int | None = None
+    offload: bool = False
+    spec: str | None = None
+    runtime: str = option("auto", choices=("auto", "torch", "onnx"))
+    precision: str = option("float32", choices=("float32", "bf16"))
 
-    Returns:
-        What summary.json holds; ``state`` is "finished", "interrupted" or "failed", ``reason`` says why.
+
+@dataclass(frozen=True, kw_only=True)
+class MapOptions:
+    """Depth from files, instead of a network.
+
+    Attributes:
+        depth: folder of predicted maps (16-bit PNG, EXR, npy), or an earlier run's output; 'self': the sequence's own
+            depth
+        variance: folder of variance maps [m^2] that belong to them
+        depth_scale: metres per unit of the maps in the folder
+        map_intrinsics: of the maps, if they do not show the whole image: a file, or fx fy cx cy [px]
+        size: HxW [px], to which the maps are brought
+    """
+
+    depth: str | None = None
+    variance: str | None = None
+    depth_scale: float | None = None
+    map_intrinsics: tuple[str, ...] = ()
+    size: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class UfMOptions:
+    """UfM*.
+
+    Attributes:
+        preset: segmentation thresholds of the authors' code for a kind of recording; single --ufm.segment.* take
+            precedence
+        ufm_preset: paper: the paper's own settings (UfMStarConfig.paper), default: ours; --preset and single --ufm.*
+            take precedence
+        anchors: depths that show the error on which all views agree (docs/anchors.md). Without a word, or with corners:
+            corners tracked in the images; dense: a depth in every cell of the image, searched in earlier images; FILE:
+            landmarks, a line x y z sigma [m] each, in the world of the poses
+        posterior: also a depth that anchors correct, with its variance (docs/results/posterior.md); --anchors chooses
+            the anchors, default: dense
+        recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
+    """
+
+    preset: str | None = option(None, choices=PRESETS)
+    ufm_preset: str | None = option(None, choices=("paper", "default"))
+    anchors: bool | str = option(False, const=True)
+    posterior: bool = False
+    recalibration: str | None = None
+    ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Depth with a variance for every pixel of a sequence of posed images.
+
+    The depth comes from a network (--model, --weights), from maps that another program predicted (--depth DIR), or
+    from the sequence itself (--depth self).
+
+    Attributes:
+        sequence: folder of the sequence, or a video file, or tour:SEED for rendered rooms
+        out: folder for everything that is written
+        frames: START:STOP:STEP, which frames, counted from 0 as Python does
+        resume: continue the run in --out
+        overwrite: replace the run in --out
+        no_video: leave preview.mp4 out
+        no_sheet: leave contact_sheet.png out
+        device: cpu, cuda or cuda:N
+        threads: number of CPU threads of network and step; default: all cores but one, which reads and writes
+        debug: show tracebacks
+    """
+
+    USAGE: ClassVar[str] = "ufmstar run SEQUENCE (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
+
+    sequence: str = positional()
+    out: str
+    frames: str | None = None
+    resume: bool = False
+    overwrite: bool = False
+    no_video: bool = False
+    no_sheet: bool = False
+    device: str = "cpu"
+    threads: int | None = None
+    debug: bool = False
+    opening: SequenceOptions
+    network: NetworkOptions
+    maps: MapOptions
+    uncertainty: UfMOptions
+
+    def __post_init__(self) -> None:
+        _ = self.config  # checks the settings
+        parse_slice(self.frames)
+        parse_size(self.maps.size)
+        for words, name in (
+            (self.opening.intrinsics, "--intrinsics"),
+            (self.opening.depth_intrinsics, "--depth-intrinsics"),
+            (self.maps.map_intrinsics, "--map-intrinsics"),
+        ):
+            parse_intrinsics(words, name)
+        _check_depth(as_dict(self.network) | as_dict(self.maps))
+        if self.resume and self.overwrite:
+            raise ValueError("--resume and --overwrite contradict each other")
+
+    @property
+    def config(self) -> UfMStarConfig:
+        """The configuration of UfM*."""
+        chosen = self.uncertainty
+        sections: dict[str, Any] = {}
+        for name, used in (("anchors", chosen.anchors or chosen.posterior), ("posterior", chosen.posterior)):
+            if chosen.ufm[name] is not None and not used:
+                raise ValueError(f"--ufm.{name}.* needs --{name}")
+            sections[name] = (chosen.ufm[name] or {}) if used else None
+        return UfMStarConfig.from_dict(chosen.ufm | sections)
+
+    def settings(self) -> dict[str, Any]:
+        """What is run, as plain values that a configuration file may hold: not how it is started."""
+        started = ("resume", "overwrite", "debug")
+        plain = {name: value for name, value in as_dict(self).items() if name not in started}
+        sections = ("anchors", "posterior", "merge")
+        ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in sections}
+        return plain | {"ufm": ufm}
+
+
+def read(words: Sequence[str]) -> RunOptions:
+    """The options of a command line.
 
     Raises:
-        FolderError: the folder cannot be used.
-        OSError: not even the summary can be written.
-        Exception: whatever else the network or UfM* raise, after the summary was written.
+        ValueError: an unknown option, or values that are impossible or contradict each other.
+        SystemExit: help was asked for.
     """
-    with RunFolder.open(out, job.identity(), resume=resume, overwrite=overwrite) as folder:
-        write_summary(job, folder, *GOING_ON)
-        ending, outputs = (FAILED, "an error in the program"), {}
-        try:
-            _frames(job, folder, progress, stop)
-            ending = _ending(job, folder)
-            outputs = _outputs(job, folder, progress, stop)
-        except (KeyboardInterrupt, Stopped):
-            ending = INTERRUPTED, f"stopped by the user after {_counts(folder, job)}; --resume goes on"
-        except OSError as error:
-            ending = FAILED, f"{error}; stopped after {_counts(folder, job)}; --resume goes on"
-        except BaseException as error:
-            ending = FAILED, f"{type(error).__name__}: {error}"
-            raise
-        finally:
-            summary = write_summary(job, folder, *ending, outputs)
-    return summary
+    prog = "ufmstar run"
+    options = parse(RunOptions, words, prog)
+    defaults: dict[str, Any] = {}
+    if options.uncertainty.ufm_preset == "paper":
+        paper = UfMStarConfig.paper()
+        changed = flat(paper.to_dict()) | {"on_bad_frame": "skip"}
+        off = ("anchors", "posterior", "merge")
+        defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in off}
+    if options.uncertainty.preset is not None:
+        preset = SPGFConfig.preset(options.uncertainty.preset).to_dict()
+        defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
+    return parse(RunOptions, words, prog, defaults) if defaults else options
 
 
-def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
-    """The frames that are left."""
+def main(options: RunOptions) -> int:
+    """Run, and print the results' table; the exit code."""
+    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.run.folder import FolderError
+    from ufmstar_torch.eval.run.machine import share_threads
+    from ufmstar_torch.eval.run.run import run
 
-    def compiling(done: int, total: int) -> None:
-        progress(Progress("kernels", done, total))
-
-    dense = job.config.anchors is not None and isinstance(job.landmarks(), DenseEvidence)
-    warm_up_command(job.config, job.device, compiling, images=job.source.needs_image, dense=dense)
-    row, metrics = job.row(folder.checkpoint), RunMetrics(UFM, folder.checkpoint.metrics)
-    stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=folder.checkpoint.position)
-    with WriterThread([metrics, Journal(job, folder, metrics)]) as behind:
-        stream.drive([behind, ProgressSink(progress, _skipped(folder))], stop=stop)
-
-
-def _ending(job: RunJob, folder: RunFolder) -> tuple[str, str]:
-    """Of a run that went through all frames."""
-    if any(record["state"] == "done" for record in folder.records):
-        return FINISHED, _counts(folder, job)
-    reasons = sorted({record["reason"] for record in folder.records})
-    return FAILED, f"no frame could be used: {'; '.join(reasons[:3])}"
-
-
-def _skipped(folder: RunFolder) -> int:
-    return sum(record["state"] == "skipped" for record in folder.records)
-
-
-def _counts(folder: RunFolder, job: RunJob) -> str:
-    skipped = _skipped(folder)
-    done = f"{len(folder.records) - skipped} of {len(job.indices)} frames"
-    return f"{done} ({skipped} skipped)" if skipped else done
-
-
-def _outputs(
-    job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]
-) -> dict[str, str | None]:
-    """Mixture, curves and pictures of all finished frames: by file, None if made, else why not."""
-    done = [record for record in folder.records if record["state"] == "done"]
-    if not done:
-        return {}
-    for name, write in mixture_writers(job.ufm(folder.checkpoint)).items():
-        write(folder.path / name)
-    write_json_atomic(folder.path / "curves.json", RunMetrics(UFM, folder.checkpoint.metrics).curves())
-    made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json"))
-    with_error = any(record["ground_truth"] for record in done) and not job.source.is_truth
-    finished = Finished(folder.path, job.sequence, done, with_error)
+    if options.threads is None:
+        share_threads()
     try:
-        if job.sheet or job.video:
-            columns = common_columns(finished)
-        if job.sheet:
-            draw_sheet(finished, columns, f"{job.sequence.name}: {_counts(folder, job)}")
-            made["contact_sheet.png"] = None
-        for drawn in draw_video(finished, columns) if job.video else ():
-            progress(Progress("pictures", drawn, len(done)))
-            if stop():
-                raise Stopped
-        if job.video:
-            made["preview.mp4"] = None
-    except ImportError as error:  # an optional package; the frames are what a run is for
-        expected = {"contact_sheet.png": job.sheet, "preview.mp4": job.video}
-        made |= {name: str(error) for name, requested in expected.items() if requested and name not in made}
-    return made
-
-
-def job_from(chosen: RunOptions) -> RunJob:
-    """The job that the options describe.
-
-    Raises:
-        ValueError: options that do not go together, files that do not fit, no frame selected.
-        FileNotFoundError, NotADirectoryError: something that was named does not exist.
-        ModuleNotFoundError: an optional package is missing.
-    """
-    options, config, device = chosen.settings(), chosen.config, chosen.device
-    sequence = open_sequence(chosen.sequence, **chosen.opening.given())
-    if not sequence.posed:
-        raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
-    landmarks = (
-        _landmarks(chosen.uncertainty.anchors or DENSE, sequence) if config.anchors is not None else LandmarkTracker
-    )
-    indices = range(len(sequence))[parse_slice(options["frames"])]
-    if not indices:
-        raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")
-    source = _source(options, sequence, indices, device)
-    return RunJob(
-        sequence=sequence,
-        indices=indices,
-        source=source,
-        config=config.within(source.max_depth),
-        recalibration=_recalibration(chosen, source),
-        device=torch.device(device),
-        settings=options,
-        every=options["model"] is not None and options["mode"] == "full",
-        video=not options["no_video"],
-        sheet=not options["no_sheet"],
-        landmarks=landmarks,
-    )
-
-
-def _recalibration(chosen: RunOptions, source: DepthSource) -> str:
-    """FILE@DIGEST of the map that is named or lies beside the weights; "" = none.
-
-    Raises:
-        FileNotFoundError: the named file does not exist.
-        ValueError: it is no recalibration, or was fitted under other settings or to another network.
-    """
-    name, weights = chosen.uncertainty.recalibration, chosen.network.weights
-    if name == "none" or (name is None and not (weights and beside(weights[0]).is_file())):
-        return ""
-    file = beside(weights[0]) if name is None else Path(name)
+        job = job_from(options)
+    except (ImportError, OSError, ValueError) as error:
+        raise UsageError(error) from error
     try:
-        files = source.identity.get("weights", ())
-        read_recalibration(str(file)).require(chosen.config, [one["sha256"] for one in files])
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
-    return named(file)
+        with Bars() as bars, stop_signals(bars.say) as stop:
+            how = {"resume": options.resume, "overwrite": options.overwrite}
+            summary = run(job, options.out, **how, progress=bars.show, stop=stop)
+    except FolderError as error:
+        raise UsageError(error) from error
+    return _report(summary, options.out)
 
 
-def _landmarks(value: str | bool, sequence: FrameSequence) -> Callable[[], LandmarkSource]:
-    """Makes the source of anchors in its initial state.
+def job_from(options: RunOptions) -> RunJob:
+    """Open the sequence, and make the job that the options describe; errors as ``open_sequence`` and ``make_job``."""
+    from ufmstar_torch.eval.run.make_job import make_job
+    from ufmstar_torch.eval.sequences.open import open_sequence
 
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: an unknown source, or the sequence has no images to track in.
-        ModuleNotFoundError: OpenCV is not installed.
-    """
-    source = landmarks_of(value, sequence.folder)
-    if source.needs_image and all(entry.load_image is None for entry in sequence.entries):
-        raise ValueError(f"--anchors tracks corners of images, of which the sequence {sequence.name!r} has none")
-    if source.needs_image and find_spec("cv2") is None:
-        raise ModuleNotFoundError("--anchors needs OpenCV: pip install 'ufmstar-torch[eval]'")
-    # A map of landmarks remembers no image, and is read once.
-    return (lambda: landmarks_of(value, sequence.folder)) if source.needs_image else (lambda: source)
+    sequence = open_sequence(options.sequence, **options.opening.given())
+    return make_job(options.settings(), options.config, sequence)
 
 
-def _source(options: Mapping[str, Any], sequence: FrameSequence, indices: range, device: str) -> DepthSource:
-    size = parse_size(options["size"])
-    if options["model"] is not None:
-        return network_source(
-            options["model"],
-            options["weights"],
-            spec=options["spec"],
-            mode=options["mode"],
-            samples=options["samples"],
-            offload=options["offload"],
-            inference=Inference(options["runtime"], options["precision"], options["threads"]),
-            device=device,
-        )
-    if options["depth"] in OWN_DEPTH:
-        if len(sequence.without_depth) == len(sequence):
-            raise ValueError(f"--depth {options['depth']}: the sequence {sequence.name!r} has no depth maps")
-        return own_depth(size)
-    return folder_source(
-        sequence,
-        options["depth"],
-        variance=options["variance"],
-        scale=options["depth_scale"],
-        intrinsics=parse_intrinsics(options["map_intrinsics"], "--map-intrinsics"),
-        size=size,
-        indices=indices,
-    )
+def _report(summary: Mapping[str, Any], out: str) -> int:
+    """Print the table and where the outputs are; the exit code."""
+    from ufmstar_torch.eval.report.text import run_table
+    from ufmstar_torch.eval.run.summary import FINISHED, INTERRUPTED
+
+    if summary["frames"]["done"]:
+        print(run_table(summary))
+    made = [name for name, reason in summary["outputs"].items() if reason is None]
+    for name, reason in summary["outputs"].items():
+        if reason is not None:
+            print(f"no {name}: {reason}")
+    print(f"{out}: {', '.join(['summary.json', 'frames.jsonl', 'frames/', 'depth/', 'sigma/', *made])}")
+    state = f"ufmstar run: {summary['state']}: {summary['reason']}"
+    if summary["state"] == FINISHED:
+        print(state)
+        return 0
+    print(state, file=sys.stderr)
+    return 130 if summary["state"] == INTERRUPTED else 1
+
+
+def _check_depth(options: Mapping[str, Any]) -> None:
+    """Whether the options name one source of depth, and nothing that belongs to another one. Raises ValueError: they do
+    not."""
+    model, depth = options["model"], options["depth"]
+    if (model is None) == (depth is None):
+        expected = "--model NAME --weights FILE for a network, or --depth DIR for maps that are already predicted"
+        raise ValueError(f"the depth must come from one place: give {expected}" + (", not both" if model else ""))
+    if model is not None and not options["weights"]:
+        raise ValueError(f"--model {model} needs --weights FILE")
+    of_folder = [name for name in _OF_FOLDER if options[name] not in (None, [])]
+    needs_model = [name for name in ("weights", "spec", "samples", "offload") if options[name] and model is None]
+    needs_trained = [name for name in ("samples", "offload") if options[name] and model != "trained"]
+    needs_depth = [*of_folder, *(["size"] if options["size"] is not None else [])] if depth is None else []
+    needs_folder = of_folder if depth in ("self", "ground-truth") else []
+    wrong = ((needs_model, "--model"), (needs_trained, "--model trained"))
+    for names, missing in (*wrong, (needs_depth, "--depth"), (needs_folder, "--depth DIR")):
+        if names:
+            raise ValueError(f"--{names[0].replace('_', '-')} goes with {missing} only")
+    if options["mode"] == "full" and len(options["weights"]) < 2 and model != "trained":
+        raise ValueError("--mode full needs several --weights")
+    if options["samples"] is not None and (options["samples"] < 2 or options["mode"] != "full"):
+        raise ValueError(f"--samples must be at least 2 and goes with --mode full, got {options['samples']}")

@@ -143,9 +143,8 @@ class AnchorSource:
         if count is None or len(landmarks.depth) <= count:
             return landmarks
         taken = self._drawn(index, _TAKEN).permutation(len(landmarks.depth))[:count]
-        confirmed = None if landmarks.confirmed is None else landmarks.confirmed[taken]
         parts = {name: getattr(landmarks, name)[taken] for name in ("pixel", "depth", "variance")}
-        return replace(landmarks, **parts, confirmed=confirmed)
+        return replace(landmarks, **parts)
 
     def _drawn(self, index: int, what: int) -> np.random.Generator:
         return np.random.default_rng([self._setting.seed, index, what])

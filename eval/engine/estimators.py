@@ -19,7 +19,7 @@ from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import FrameStatistics
-from ufmstar_torch.recalibrate import Recalibration, read_recalibration
+from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
 
 
@@ -89,7 +89,7 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
     if method.fusion == UFM:
         points = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
         return Pointwise(points, device, uses_variances=method.uses_aleatoric)
-    recalibration = read_recalibration(setting.recalibration) if setting.recalibration else None
+    recalibration = Recalibration.from_json(setting.recalibration) if setting.recalibration else None
     config = ufm_star_config(row).within(max_depth)
     return Gaussians(
         config,

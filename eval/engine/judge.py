@@ -1,4 +1,4 @@
-"""Figures against ground truth, as sinks of a stream: of a run, of the rows of an evaluation, of image regions.
+"""Figures against ground truth, as sinks of a stream: of a run, and of the rows of an evaluation.
 
 For the figure of NLL by error, the paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is
 confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, of every frame, the share
@@ -9,7 +9,7 @@ pixels.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
@@ -139,62 +139,6 @@ class RowMetrics(FrameSink):
         named: dict[str, Any] = {METRICS: self._metrics[key]}
         named |= {f"{BY_ERROR}:{reference}": binned for reference, binned in self._by_error.get(key, {}).items()}
         return {name: {entry: value.cpu() for entry, value in m.state_dict().items()} for name, m in named.items()}
-
-
-class RegionMetrics(FrameSink):
-    """The figures of every row (by its key) in every region of the images, and those of all regions together.
-    ``region_of`` returns [h, w] int64, at every pixel of a row's map, the number of its region."""
-
-    def __init__(
-        self, rows: Sequence[str], regions: Sequence[str], region_of: Callable[[FrameResult, RowFrame], Tensor]
-    ) -> None:
-        self._rows, self._regions, self._region_of = tuple(rows), tuple(regions), region_of
-        self._metrics: dict[tuple[str, str], SequenceMetrics] = {}
-        pairs = [(row, region) for row in rows for region in regions]
-        self._variance = dict.fromkeys(pairs, (0.0, 0))
-
-    def take(self, result: FrameResult) -> None:
-        """Add a frame."""
-        for key, row in result.rows.items():
-            if row.truth is None:
-                continue
-            target, numbers = torch.from_numpy(row.truth), self._region_of(result, row)
-            for number, region in enumerate(self._regions):
-                inside = (numbers == number) & (target > 0)
-                if bool(inside.any()):
-                    self._add((key, region), row, target, inside & row.estimate.valid)
-
-    def _add(self, pair: tuple[str, str], row: RowFrame, target: Tensor, use: Tensor) -> None:
-        estimate = row.estimate
-        assert estimate.variance is not None
-        metrics_of(self._metrics, pair).update(estimate.depth, estimate.variance, target, use)
-        chosen = estimate.variance[use].double()
-        total, pixels = self._variance[pair]
-        self._variance[pair] = (total + float(chosen.sum()), pixels + chosen.numel())
-
-    def overall(self) -> dict[str, SequenceMetrics]:
-        """The metrics of all regions, by row."""
-        from ufmstar_torch.eval.metrics import SequenceMetrics
-
-        merged = {}
-        for row in self._rows:
-            merged[row] = SequenceMetrics()
-            for region in self._regions:
-                merged[row].merge_state(metrics_of(self._metrics, (row, region)))
-        return merged
-
-    def by_region(self) -> dict[str, dict[str, dict[str, float]]]:
-        """By region and row: "rmse" [m], "rms_sigma" (root of the mean variance) [m] and the other figures."""
-
-        def figures(row: str, region: str) -> dict[str, float]:
-            pair = row, region
-            total, pixels = self._variance[pair]
-            return {
-                **metrics_of(self._metrics, pair).compute(),
-                "rms_sigma": (total / pixels) ** 0.5 if pixels else math.nan,
-            }
-
-        return {region: {row: figures(row, region) for row in self._rows} for region in self._regions}
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:

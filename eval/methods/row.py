@@ -9,7 +9,6 @@ from typing import Any
 
 from ufmstar_torch.eval.methods.method import UFM_STAR, Method
 from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, Setting, configured
-from ufmstar_torch.recalibrate import split_name
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class Row:
         """Settings that are not the default, but for what is part of ``name``."""
         values = self.setting.to_dict()
         if self.setting.recalibration:  # without the folder
-            values["recalibration"] = Path(split_name(self.setting.recalibration)[0]).name
+            values["recalibration"] = Path(self.setting.recalibration).name
         named = {"anchors", "posterior"} if self.setting.anchors == TRACKED else set()
         return {name: value for name, value in values.items() if name not in named}
 

@@ -51,7 +51,7 @@ class Setting(Checked):
         track_noise: standard deviation of noise on tracked positions [px of the image]; see ``engine.anchors``.
         corrected: judge the depth corrected by the anchors' bias, and the variance that remains.
         posterior: judge the posterior's depth and variance (``UfMStarConfig.posterior`` follows).
-        recalibration: FILE or FILE@DIGEST of a map of the variance (``ufmstar recalibrate``); "" = none.
+        recalibration: file of a map of the variance (``ufmstar recalibrate``); "" = none.
 
     Raises:
         ValueError: a value is out of range, or they do not go together.

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import SumMetric, share
-from ufmstar_torch.eval.metrics.pixels import Pixels
+from ufmstar_torch.eval.metrics.pixel_sums import add_delta1, add_errors
 
 
 class Delta1(SumMetric):
@@ -24,19 +22,13 @@ class Delta1(SumMetric):
         tolerance: .25 in both definitions.
     """
 
+    ADD = add_delta1
+
     def __init__(self, tolerance: float = 0.25, **kwargs: Any) -> None:
         if not tolerance > 0:
             raise ValueError(f"tolerance must be positive, got {tolerance}")
-        super().__init__({"tolerance": tolerance}, **kwargs)
-        self.tolerance = tolerance
+        super().__init__({"tolerance": tolerance}, (tolerance,), **kwargs)
         self.add_counts("hits", "hits_ratio", "pixels", "with_truth")
-
-    def sums_of(self, p: Pixels) -> dict[str, Tensor | float]:
-        hits = (p.depth - p.target).abs() <= self.tolerance * p.target
-        positive = p.depth > 0
-        d = torch.where(positive, p.depth, torch.ones_like(p.depth))
-        ratio = positive & (torch.maximum(d / p.target, p.target / d) < 1 + self.tolerance)
-        return {"hits": hits.sum(), "hits_ratio": ratio.sum(), "pixels": len(p.depth), "with_truth": p.with_truth}
 
     def compute(self) -> dict[str, Tensor]:
         return {
@@ -47,37 +39,29 @@ class Delta1(SumMetric):
         }
 
 
-class _MeanError(SumMetric):
-    """Mean over all pixels of an error, which a subclass defines."""
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_sums("total")
-        self.add_counts("pixels")
-
-    def sums_of(self, p: Pixels) -> dict[str, Tensor | float]:
-        return {"total": self._error(p).sum(), "pixels": len(p.depth)}
-
-    @abstractmethod
-    def _error(self, p: Pixels) -> Tensor:
-        """[P] the error of each pixel."""
-
-
-class AbsRel(_MeanError):
+class AbsRel(SumMetric):
     """Mean of |d - g| / g; ``compute()`` returns ``abs_rel``, NaN without a pixel."""
 
-    def _error(self, p: Pixels) -> Tensor:
-        return (p.depth - p.target).abs() / p.target
+    ADD = add_errors
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(None, (False,), **kwargs)
+        self.add_sums("total")
+        self.add_counts("pixels")
 
     def compute(self) -> dict[str, Tensor]:
         return {"abs_rel": share(self.total, self.pixels)}
 
 
-class RMSE(_MeanError):
+class RMSE(SumMetric):
     """Root of the mean of (d - g)^2 over all pixels [m]; ``compute()`` returns ``rmse``, NaN without one."""
 
-    def _error(self, p: Pixels) -> Tensor:
-        return (p.depth - p.target).square()
+    ADD = add_errors
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(None, (True,), **kwargs)
+        self.add_sums("total")
+        self.add_counts("pixels")
 
     def compute(self) -> dict[str, Tensor]:
         return {"rmse": share(self.total, self.pixels).sqrt()}

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torchmetrics import Metric
 
-from ufmstar_torch.eval.metrics.pixels import Pixels, require_variance, select_pixels
+
+class Pixels(NamedTuple):
+    """The pixels of one or more frames, flat on the CPU, as the loops in ``pixel_sums`` take them."""
+
+    depth: NDArray[np.float64]  # [P] d [m]
+    variance: NDArray[np.float64]  # [P] v [m^2]; [0] where there is none
+    target: NDArray[np.float64]  # [P] g [m]
+    use: NDArray[np.bool_]  # [P] True = use
 
 
 class SumMetric(Metric):
@@ -24,9 +31,12 @@ class SumMetric(Metric):
 
     Attributes:
         OF_VARIANCE: the name, in messages, of a metric that needs a variance; "" for one of the depth alone.
+        ADD: the loop over the pixels, of ``pixel_sums``.
+        constants: what it takes between the pixels and the states.
     """
 
     OF_VARIANCE: ClassVar[str] = ""
+    ADD: ClassVar[Any]
     is_differentiable = False
     full_state_update = False
 
@@ -35,11 +45,11 @@ class SumMetric(Metric):
         def __getattr__(self, name: str) -> Tensor:
             """The states are the only attributes that are not in ``__dict__``."""
 
-    def __init__(self, settings: dict[str, Any] | None = None, **kwargs: Any) -> None:
+    def __init__(self, settings: dict[str, Any] | None = None, constants: tuple[Any, ...] = (), **kwargs: Any) -> None:
         # torchmetrics keeps a computed value across merge_state and load_state_dict, where it is stale.
         kwargs.setdefault("compute_with_cache", False)
         super().__init__(**kwargs)
-        self.settings = dict(settings or {})
+        self.settings, self.constants = dict(settings or {}), constants
 
     @property
     def update_called(self) -> bool:
@@ -64,18 +74,18 @@ class SumMetric(Metric):
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use. Raises ValueError: shapes or types
         disagree, or a needed variance is missing."""
-        needed = require_variance(variance, self.OF_VARIANCE) if self.OF_VARIANCE else None
-        self.add(**self.sums_of(select_pixels(depth, needed, target, valid)))
+        self.add(flat_pixels(depth, variance, target, valid))
 
-    @abstractmethod
-    def sums_of(self, p: Pixels) -> Mapping[str, Tensor | float]:
-        """What pixels add to the states, by name."""
-
-    def add(self, **sums: Tensor | float) -> None:
-        """Add to the states by name; the states are exchanged, never changed in place."""
+    def add(self, pixels: Pixels) -> None:
+        """Add pixels. States are exchanged, never changed in place: others may hold the previous ones. Raises
+        ValueError: a needed variance is missing."""
+        if self.OF_VARIANCE and len(pixels.variance) != len(pixels.depth):
+            judged = f"{self.OF_VARIANCE} judges the predicted distribution N(depth, variance)"
+            raise ValueError(f"variance must be given: {judged}")
+        sums = {name: getattr(self, name).to("cpu", copy=True) for name in self.states}
+        type(self).ADD(*pixels, *self.constants, *(value.numpy() for value in sums.values()))
         for name, value in sums.items():
-            state: Tensor = getattr(self, name)
-            setattr(self, name, state + (value.to(state.device) if isinstance(value, Tensor) else value))
+            setattr(self, name, value.to(getattr(self, name).device))
 
     def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:
         """Add another metric's sums to this one's. Raises ValueError: the other one was made with other settings, so
@@ -88,6 +98,35 @@ class SumMetric(Metric):
         super().merge_state(incoming_state)
         if isinstance(incoming_state, Metric):
             self._update_count += incoming_state._update_count
+
+
+def flat_pixels(depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> Pixels:
+    """All pixels of maps of one shape [...], in float64.
+
+    Args:
+        depth: predicted depth d [m]; not finite = no prediction.
+        variance: predicted variance v [m^2], or None; not finite or < 0 = no prediction.
+        target: ground truth [m]; NaN, infinite or <= 0 means there is none.
+        valid: bool, True = use; None = everywhere.
+
+    Raises:
+        ValueError: an argument has another shape than ``depth`` or the wrong type.
+    """
+    for name, value in (("depth", depth), ("variance", variance), ("target", target), ("valid", valid)):
+        if value is None:
+            continue
+        if value.shape != depth.shape:
+            raise ValueError(f"{name} must have the depth's shape {tuple(depth.shape)}, got {tuple(value.shape)}")
+        if name == "valid" and value.dtype != torch.bool:
+            raise ValueError(f"valid must be a bool mask (True = use), got {value.dtype}")
+        if name != "valid" and not torch.is_floating_point(value):
+            raise ValueError(f"{name} must be floating point, got {value.dtype}")
+
+    def flat(value: Tensor) -> NDArray[Any]:
+        return value.detach().to("cpu", torch.float64).flatten().numpy()
+
+    use = np.ones(depth.numel(), np.bool_) if valid is None else valid.cpu().flatten().numpy()
+    return Pixels(flat(depth), np.zeros(0) if variance is None else flat(variance), flat(target), use)
 
 
 def share(part: Tensor, whole: Tensor) -> Tensor:

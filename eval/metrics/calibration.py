@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,18 +9,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import SumMetric, share
-from ufmstar_torch.eval.metrics.pixels import Pixels
-
-
-def interval_confidence(depth: Tensor, variance: Tensor, delta: float) -> Tensor:
-    """[...] mass of N(d, v) on [(1 - delta) d, (1 + delta) d] = erf(delta |d| / sqrt(2 v)).
-
-    v = 0 is a point mass at d, which the interval holds: 1. A depth d <= 0 mirrors the interval.
-    """
-    positive = variance > 0
-    sigma = torch.where(positive, variance, torch.ones_like(variance)).sqrt()
-    mass = torch.erf(delta * depth.abs() / (math.sqrt(2) * sigma))
-    return torch.where(positive, mass, torch.ones_like(mass))
+from ufmstar_torch.eval.metrics.pixel_sums import add_ece_delta, add_ece_quantile
 
 
 class ECEDelta(SumMetric):
@@ -43,25 +31,14 @@ class ECEDelta(SumMetric):
     """
 
     OF_VARIANCE = "ECE_delta"
+    ADD = add_ece_delta
 
     def __init__(self, delta: float = 0.25, bins: int = 10, **kwargs: Any) -> None:
         if not 0 < delta < 1 or bins < 1:
             raise ValueError(f"delta must lie in (0, 1) and bins be >= 1, got delta={delta}, bins={bins}")
-        super().__init__({"delta": delta, "bins": bins}, **kwargs)
-        self.delta, self.bins = delta, bins
+        super().__init__({"delta": delta, "bins": bins}, (delta,), **kwargs)
         self.add_sums("confidence", shape=(bins,))
         self.add_counts("accurate", "pixels", shape=(bins,))
-
-    def sums_of(self, p: Pixels) -> dict[str, Tensor]:
-        confidence = interval_confidence(p.depth, p.variance, self.delta)
-        accurate = (p.target - p.depth).abs() <= self.delta * p.depth.abs()
-        # Bin b is [b/B, (b+1)/B); a confidence of exactly 1 belongs to the last.
-        index = (confidence * self.bins).long().clamp(max=self.bins - 1)
-        return {
-            "confidence": torch.bincount(index, weights=confidence, minlength=self.bins),
-            "accurate": torch.bincount(index[accurate], minlength=self.bins),
-            "pixels": torch.bincount(index, minlength=self.bins),
-        }
 
     def compute(self) -> dict[str, Tensor]:
         total = self.pixels.sum()
@@ -93,27 +70,16 @@ class ECEQuantile(SumMetric):
     """
 
     OF_VARIANCE = "ECE_q"
+    ADD = add_ece_quantile
 
     def __init__(self, levels: Sequence[float] | None = None, **kwargs: Any) -> None:
         q = quantile_levels(10) if levels is None else torch.tensor(list(levels), dtype=torch.float64)
         if q.numel() == 0 or not bool(((q >= 0) & (q <= 1)).all() and (q.diff() > 0).all()):
             raise ValueError(f"levels must rise within [0, 1], got {levels}")
-        super().__init__({"levels": q.tolist()}, **kwargs)
-        self.levels, self.thresholds = q, torch.special.ndtri(q)
+        super().__init__({"levels": q.tolist()}, (torch.special.ndtri(q).numpy(),), **kwargs)
+        self.levels = q
         self.add_counts("at_or_below", shape=(q.numel(),))
         self.add_counts("pixels")
-
-    def sums_of(self, p: Pixels) -> dict[str, Tensor | float]:
-        positive = p.variance > 0
-        sigma = torch.where(positive, p.variance, torch.ones_like(p.variance)).sqrt()
-        residual = p.target - p.depth
-        # v = 0: every quantile is d itself, so g is below all of them or above all.
-        side = torch.where(residual <= 0, -math.inf, math.inf).to(residual)
-        z = torch.where(positive, residual / sigma, side)
-        # right=False: the first b with z <= thresholds[b]; from there on g is at or below d + sqrt(v) thresholds[b].
-        first = torch.bucketize(z, self.thresholds.to(z.device), right=False)
-        at_or_below = torch.bincount(first, minlength=self.thresholds.numel() + 1).cumsum(0)[:-1]
-        return {"at_or_below": at_or_below, "pixels": len(z)}
 
     def compute(self) -> dict[str, Tensor]:
         levels = self.levels.to(self.pixels.device)

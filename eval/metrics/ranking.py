@@ -7,27 +7,13 @@ of one bin count as ties. What that can change is bounded: see each class.
 
 from __future__ import annotations
 
-import math
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import SumMetric
-from ufmstar_torch.eval.metrics.likelihood import gaussian_nll
-from ufmstar_torch.eval.metrics.pixels import Pixels
-
-# Variances and squared errors [m^2] between (0.1 mm)^2 and (100 m)^2 are distinguished; 0 and what is
-# smaller share the bin below, what is larger the bin above. Relative errors use the same bins.
-LOW, HIGH = 1e-8, 1e4
-
-
-def log_bin(value: Tensor, bins: int) -> Tensor:
-    """[...] int64 bin in [0, bins + 1] of values >= 0: 0 below ``LOW``, bins + 1 from ``HIGH`` on."""
-    position = (value.clamp(min=LOW) / LOW).log() * (bins / math.log(HIGH / LOW))
-    index = position.floor().clamp(max=bins).long() + 1
-    return torch.where(value < LOW, torch.zeros_like(index), index)
+from ufmstar_torch.eval.metrics.pixel_sums import add_joint, add_nll_by_error, add_sparsification
 
 
 def kept_mean(count: Tensor, total: Tensor, kept: Tensor) -> Tensor:
@@ -62,29 +48,14 @@ class Sparsification(SumMetric):
     """
 
     OF_VARIANCE = "AUSE"
+    ADD = add_sparsification
 
     def __init__(self, bins: int = 4096, **kwargs: Any) -> None:
         if bins < 1:
             raise ValueError(f"bins must be >= 1, got {bins}")
         super().__init__({"bins": bins}, **kwargs)
-        self.bins = bins
         self.add_counts("count", "count_squared", "count_relative", shape=(bins + 2,))
         self.add_sums("squared", "relative", "sum_squared", "sum_relative", shape=(bins + 2,))
-
-    def sums_of(self, p: Pixels) -> dict[str, Tensor]:
-        squared = (p.depth - p.target).square()
-        relative = (p.depth - p.target).abs() / p.target
-        by_v, by_s, by_r = (log_bin(x, self.bins) for x in (p.variance, squared, relative))
-        in_bins = partial(torch.bincount, minlength=self.bins + 2)
-        return {
-            "count": in_bins(by_v),
-            "squared": in_bins(by_v, squared),
-            "relative": in_bins(by_v, relative),
-            "count_squared": in_bins(by_s),
-            "sum_squared": in_bins(by_s, squared),
-            "count_relative": in_bins(by_r),
-            "sum_relative": in_bins(by_r, relative),
-        }
 
     def compute(self) -> dict[str, Tensor]:
         kept = 1 - torch.arange(50, dtype=torch.float64, device=self.count.device) / 50
@@ -122,18 +93,13 @@ class SpearmanCorrelation(SumMetric):
     """
 
     OF_VARIANCE = "Spearman's correlation"
+    ADD = add_joint
 
     def __init__(self, bins: int = 512, **kwargs: Any) -> None:
         if bins < 1:
             raise ValueError(f"bins must be >= 1, got {bins}")
         super().__init__({"bins": bins}, **kwargs)
-        self.bins = bins
         self.add_counts("joint", shape=(bins + 2, bins + 2))
-
-    def sums_of(self, p: Pixels) -> dict[str, Tensor]:
-        side = self.bins + 2
-        index = log_bin(p.variance, self.bins) * side + log_bin((p.depth - p.target).square(), self.bins)
-        return {"joint": torch.bincount(index, minlength=side * side).reshape(side, side)}
 
     def compute(self) -> dict[str, Tensor]:
         joint = self.joint.double()
@@ -169,20 +135,15 @@ class NLLByError(SumMetric):
     """
 
     OF_VARIANCE = "NLL by error"
+    ADD = add_nll_by_error
 
     def __init__(self, percentiles: int = 10, bins: int = 4096, **kwargs: Any) -> None:
         if percentiles < 1 or bins < 1:
             raise ValueError(f"percentiles and bins must be >= 1, got {percentiles} and {bins}")
         super().__init__({"percentiles": percentiles, "bins": bins}, **kwargs)
-        self.percentiles, self.bins = percentiles, bins
+        self.percentiles = percentiles
         self.add_counts("count", shape=(bins + 2,))
         self.add_sums("nll", "error", shape=(bins + 2,))
-
-    def sums_of(self, p: Pixels) -> dict[str, Tensor]:
-        positive = p.variance > 0
-        d, v, g = p.depth[positive], p.variance[positive], p.target[positive]
-        in_bins = partial(torch.bincount, log_bin((d - g).square(), self.bins), minlength=self.bins + 2)
-        return {"count": in_bins(), "nll": in_bins(gaussian_nll(d, v, g)), "error": in_bins((d - g).abs())}
 
     def compute(self) -> dict[str, Tensor]:
         steps = torch.arange(1, self.percentiles + 1, dtype=torch.float64, device=self.count.device)

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.metrics.ranking import HIGH, LOW
+from ufmstar_torch.eval.metrics.pixel_sums import HIGH, LOW
 from ufmstar_torch.recalibrate import ISOTONIC, SCALAR, Recalibration
 
 Array = NDArray[np.float64]

@@ -9,11 +9,9 @@ from typing import Any
 from torch import Tensor, nn
 
 from ufmstar_torch.eval.metrics.accuracy import RMSE, AbsRel, Delta1
-from ufmstar_torch.eval.metrics.base import SumMetric
+from ufmstar_torch.eval.metrics.base import SumMetric, flat_pixels
 from ufmstar_torch.eval.metrics.calibration import ECEDelta, ECEQuantile
 from ufmstar_torch.eval.metrics.likelihood import NLL, EntropyHistogram
-from ufmstar_torch.eval.metrics.one_pass import add_in_one_pass
-from ufmstar_torch.eval.metrics.pixels import check_maps
 from ufmstar_torch.eval.metrics.ranking import Sparsification, SpearmanCorrelation
 
 OURS, AUTHORS = "ours", "authors"
@@ -65,13 +63,9 @@ class SequenceMetrics(nn.Module):
         Raises:
             ValueError: shapes or types disagree, or a needed variance is missing.
         """
-        check_maps(depth, variance, target, valid)
-        on_cpu = all(value.is_cpu for value in (depth, variance, target, valid) if value is not None)
-        if on_cpu and all(metric.device.type == "cpu" for metric in self._all()):
-            add_in_one_pass(dict(self.metrics.items()), depth, variance, target, valid)
-        else:
-            for metric in self._all():
-                metric.update(depth, variance, target, valid)
+        pixels = flat_pixels(depth, variance, target, valid)
+        for metric in self._all():
+            metric.add(pixels)
 
     def compute(self) -> dict[str, float]:
         """The scalar figures by name: delta1, delta1_ratio, abs_rel, rmse [m], nll, ece_delta, ece_q, ...

@@ -18,8 +18,8 @@ from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.packed_sums import unpack
-from ufmstar_torch.eval.results.eval_folder import FAILED
-from ufmstar_torch.eval.results.record import Record
+from ufmstar_torch.eval.suite.folder import FAILED
+from ufmstar_torch.eval.suite.record import Record
 
 FORMAT = 1
 # The keys of ``Setting.to_dict()`` that are fields of Setting; all others are overrides of the config.

@@ -18,8 +18,8 @@ from ufmstar_torch.eval.report.data import Merged, Results
 from ufmstar_torch.eval.report.means import value_of
 from ufmstar_torch.eval.report.names import count
 from ufmstar_torch.eval.report.style import Look
-from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.run.colours import FAINT, INK
+from ufmstar_torch.eval.suite.record import Record
 
 Curves = Mapping[str, Sequence[float]]
 PER_LINE, MOST_SEQUENCES = 3, 12

@@ -22,8 +22,8 @@ from ufmstar_torch.eval.report import names, style
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, difference, mean_of
 from ufmstar_torch.eval.report.style import Look
-from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.run.colours import FAINT, INK, plain
+from ufmstar_torch.eval.suite.record import Record
 
 COUNT = "anchor_count"
 Rest = tuple[tuple[str, Any], ...]

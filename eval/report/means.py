@@ -11,7 +11,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.names import LOWER, Quantity
-from ufmstar_torch.eval.results.record import Record
+from ufmstar_torch.eval.suite.record import Record
 
 # Student's interval of fewer values rests on a normal distribution, which nobody checked: no interval is given.
 MIN_SEQUENCES = 5

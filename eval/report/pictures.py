@@ -20,9 +20,9 @@ from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.examples import Example, find_examples
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.report.rooms import Snapshot, choose_times, draw_room, find_rooms
-from ufmstar_torch.eval.results.worklist import WorkItem
 from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.panels import Bar, Box, GridRow, Panel, PanelScales, draw_grid
+from ufmstar_torch.eval.suite.work_items import WorkItem
 
 STRIP, BREAKDOWN, COMPARE, ROOM = "strip", "breakdown", "compare", "room"
 # So that a report of a hundred sequences stays one that can be read, and mailed.

@@ -10,7 +10,7 @@ from typing import Any
 
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.outputs import CURVES, ENSEMBLE, NETWORK, POSTERIOR
+from ufmstar_torch.eval.report.demo import CURVES, ENSEMBLE, NETWORK, POSTERIOR
 from ufmstar_torch.eval.report.table import markdown
 from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.eval.report.write import Report

@@ -1,7 +1,7 @@
-"""Output folders: which program a folder belongs to, what its work was started with, and which process holds it.
+"""Output folders: to whom a folder belongs, what it was started with, and which process holds it.
 
-A folder belongs to a program once it contains the manifest of that program's :class:`FolderKind`. Files that the
-program did not make are never touched.
+A folder belongs to a program once it contains the manifest of that program's :class:`FolderKind`. Files of other
+programs are never touched.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 _SHOWN = 5  # differences that a message names
 _POLL_SECONDS = 0.02
 _UNFINISHED = "not finished"
-# What a file system without locks answers.
+# Of a file system without locks.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 Manifest = Mapping[str, Any]
 
 
 class FolderError(ValueError):
-    """The output folder cannot be used as asked; the message names the option that helps."""
+    """The output folder cannot be used; the message names the option that helps."""
 
 
 @dataclass(frozen=True)
@@ -40,26 +40,25 @@ class FolderKind:
     program: str  # as "ufmstar run"; the manifest contains it
     noun: str  # for messages: "run", "evaluation", "training", "demo"
     manifest: str  # path of the manifest below the folder
-    clear: Callable[[Path], None]  # removes what earlier work left in a folder, but for the manifest
-    # of the manifest and the files beside it; None = work of this kind cannot be continued, and its manifest is
-    # replaced by a summary at the end.
+    clear: Callable[[Path], None]  # removes the files of earlier work, but for the manifest
+    # of the manifest and the files beside it; None = such work cannot be continued, and a summary replaces the manifest
+    # at the end.
     format: int | None = None
     lock: str | None = None  # path of the lock file below the folder; None = no lock
-    # "life" = the lock is held until the folder is closed, by one process; "opening" = only while the folder is opened,
-    # since several processes work in it.
+    # "life" = one process holds the lock until it closes the folder; "opening" = only while it opens the folder, since
+    # several processes work in it.
     held: Literal["life", "opening"] = "life"
     wait: float = 0.0  # longest time [s] to wait for the lock
     allowed: tuple[str, ...] = ()  # entries that may exist in a folder before its manifest does
-    # glob patterns below the folder of temporary files that a killed process may have left, and that no running process
-    # can own while the lock is held.
+    # glob patterns below the folder of temporary files of a killed process.
     temporary: tuple[str, ...] = (".*.tmp",)
     # of (a manifest, another one): the values of the first that must not change.
     identity: Callable[[Manifest, Manifest], Manifest] = lambda manifest, _: manifest["identity"]
-    # of (the manifest in the folder, the new one): what the folder contains from then on.
+    # of (the manifest in the folder, the new one): the manifest from then on.
     merge: Callable[[Manifest, Manifest], Manifest] = lambda then, _: then
 
     def new_manifest(self, content: Manifest) -> dict[str, Any]:
-        """The manifest of new work, as plain values; ``content`` is what the kind keeps beside program and format."""
+        """The manifest of new work, as plain values."""
         own = {"state": _UNFINISHED} if self.format is None else {"format": self.format}
         plain: dict[str, Any] = to_json({"program": self.program, **own, **content})
         return plain
@@ -78,12 +77,8 @@ class FolderKind:
             raise FolderError(text) from error
 
     def earlier(self, out: Path, *, resume: bool, overwrite: bool) -> bool:
-        """Whether the folder contains earlier work of the program.
-
-        Raises:
-            FolderError: it is a file, contains files that are not the program's, or earlier work and the options do not
-                say what to do with it. Of work that cannot be continued, what was interrupted is of no use to anybody.
-        """
+        """Whether the folder contains earlier work of the program. Raises FolderError: it is a file, contains files of
+        other programs, or contains earlier work and neither option is set."""
         if out.exists() and not out.is_dir():
             raise FolderError(f"--out {out} is a file, expected a folder")
         known, state = (out / self.manifest).is_file(), ""
@@ -104,7 +99,7 @@ class FolderKind:
         return True
 
     def _foreign(self, out: Path) -> list[Path]:
-        """Entries beside those that a process leaves which was killed before it wrote the manifest."""
+        """Entries beside those of a process that was killed before it wrote the manifest."""
         manifest = out / self.manifest
         own = {manifest, manifest.parent, *(out / name for name in self.allowed)}
         own |= set() if self.lock is None else {out / self.lock}
@@ -113,11 +108,11 @@ class FolderKind:
 
 
 class OutputFolder:
-    """An output folder that belongs to its program. Use :meth:`open`, and close it, or use it with ``with``.
+    """An output folder of a program. Use ``with OutputFolder.open(...)``, or close it.
 
     Attributes:
         path: the folder.
-        resumed: whether it contained earlier work that goes on.
+        resumed: whether it contained earlier work that continues.
     """
 
     def __init__(self, path: Path, *, resumed: bool, held: ExitStack) -> None:
@@ -127,22 +122,21 @@ class OutputFolder:
     def open(
         cls, out: Path, kind: FolderKind, content: Manifest, *, resume: bool = False, overwrite: bool = False
     ) -> OutputFolder:
-        """Prepare a folder for new work, or to go on with earlier work.
+        """Prepare a folder for new work, or to continue earlier work.
 
         Args:
             out: created if missing.
             kind: of the folder.
             content: of the manifest, beside program and format.
-            resume: go on with earlier work in the folder; without any, start.
-            overwrite: remove what earlier work left, and start.
+            resume: continue earlier work in the folder; without any, start.
+            overwrite: remove earlier work, and start.
 
         Raises:
-            FolderError: the folder contains earlier work and neither was asked for; other files; work that was
-                started with other values (the message names them); or another process holds it.
+            FolderError: as :meth:`FolderKind.earlier`; or the earlier work was started with other values (the message
+                names them), or another process holds the folder.
             OSError: the folder cannot be made or locked.
         """
         kind.earlier(out, resume=resume, overwrite=overwrite)
-        out.mkdir(parents=True, exist_ok=True)
         (out / kind.manifest).parent.mkdir(parents=True, exist_ok=True)
         with ExitStack() as held:
             if kind.lock is not None:

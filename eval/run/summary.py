@@ -10,9 +10,9 @@ from typing import Any
 
 from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM, RunMetrics
 from ufmstar_torch.eval.run import machine
-from ufmstar_torch.eval.run.files import to_json
+from ufmstar_torch.eval.run.files import to_json, write_json_atomic
+from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
-from ufmstar_torch.eval.run.run_job import RunJob
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.mixture import GaussianMixture
 
@@ -60,7 +60,7 @@ def write_summary(
         "versions": versions(),
     }
     plain: dict[str, Any] = to_json(summary)
-    folder.write_summary(plain)
+    write_json_atomic(folder.path / "summary.json", plain)
     return plain
 
 

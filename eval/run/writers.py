@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.run.files import write_together
-from ufmstar_torch.eval.sequences.images import read_map
 
 # Metres per count that a run may choose from, finest first: up to 65.5 m, 256 m (KITTI's), 655 m, 6.6 km.
 DEPTH_UNITS = (0.001, 1 / 256, 0.01, 0.1)
@@ -36,13 +35,16 @@ class FrameWriter:
     """Writes frames so that a run can be stopped at any moment and continued.
 
     The PNG scale is one for the whole run, so that a program that reads it once is right for all frames. It is chosen
-    from the first frame (see ``fitting_unit``), or read back from the frames on disk when a run is continued; sigma's
-    is a tenth of it. Pixels beyond the range are counted, and exact in the npz.
+    from the first frame (see ``fitting_unit``); sigma's is a tenth of it. Pixels beyond the range are counted, and
+    exact in the npz.
+
+    Args:
+        out_dir: the run's folder.
+        unit: of the depth PNGs of a run that is continued [m per count].
     """
 
-    def __init__(self, out_dir: str | Path) -> None:
-        self.out_dir = Path(out_dir)
-        self._unit: float | None = None
+    def __init__(self, out_dir: str | Path, unit: float | None = None) -> None:
+        self.out_dir, self.unit = Path(out_dir), unit
         for folder in ("frames", "depth", "sigma"):
             (self.out_dir / folder).mkdir(parents=True, exist_ok=True)
 
@@ -57,11 +59,6 @@ class FrameWriter:
     def finished(self, name: str) -> bool:
         """True if all files of the frame are there, and so complete."""
         return all(path.is_file() for path in self.paths(name).values())
-
-    def finished_frames(self) -> list[str]:
-        """The names of all finished frames, sorted."""
-        names = sorted(path.stem for path in (self.out_dir / "frames").glob("[!.]*.npz"))
-        return [name for name in names if self.finished(name)]
 
     def write(self, name: str, *, valid: Tensor, **given: Tensor | None) -> dict[str, int]:
         """Write one frame; none of its files appears before all are written. The maps are [H, W]; those that are None
@@ -80,7 +77,8 @@ class FrameWriter:
                 raise ValueError(f"{label} must have the depth's shape {d.shape}, got {value.shape}")
         if used.dtype != np.bool_:
             raise ValueError(f"valid must be a bool mask (True = use), got {used.dtype}")
-        paths, unit = self.paths(name), self._depth_unit(d, used)
+        paths, unit = self.paths(name), self.unit or fitting_unit(d[used])
+        self.unit = unit
         sigma = np.sqrt(np.where(v >= 0, v, np.nan))
         depth_png, lost_d = encode_length_png(d, used, unit, quantity="depth")
         sigma_png, lost_s = encode_length_png(sigma, used, unit / 10, quantity="sigma")
@@ -94,14 +92,6 @@ class FrameWriter:
             }
         )
         return {"depth": lost_d, "sigma": lost_s}
-
-    def _depth_unit(self, depth: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
-        """Metres per count of the depth PNGs, settled by the first frame of the run."""
-        if self._unit is None:
-            done = self.finished_frames()
-            stored = read_map(self.paths(done[0])["depth"], key="depth")[1] if done else None
-            self._unit = stored or fitting_unit(depth[valid])
-        return self._unit
 
 
 def read_frame(path: str | Path) -> dict[str, NDArray[Any]]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
 
-JOURNAL = "frames.jsonl"
+RECORDS = "frames.jsonl"
 
 
 class OwnOutput(NamedTuple):
@@ -27,8 +27,8 @@ def own_output(path: Path) -> OwnOutput | None:
     """The output of a run in a folder, or around it where it is OUT/frames or OUT/depth; None: it is none. Raises
     ValueError: a line of frames.jsonl is none of a run's; file and line are named."""
     for out in (path, path.parent) if path.name in ("frames", "depth") else (path,):
-        if (out / JOURNAL).is_file() and (out / "frames").is_dir():
-            records = read_journal((out / JOURNAL).read_bytes(), out / JOURNAL)
+        if (out / RECORDS).is_file() and (out / "frames").is_dir():
+            records = read_records((out / RECORDS).read_bytes(), out / RECORDS)
             done = [record for record in records if record["state"] == "done"]
             return OwnOutput(
                 out / "frames",
@@ -38,7 +38,7 @@ def own_output(path: Path) -> OwnOutput | None:
     return None
 
 
-def read_journal(content: bytes, file: Path) -> list[dict]:
+def read_records(content: bytes, file: Path) -> list[dict]:
     """The lines of frames.jsonl, each with "name" and "state", and "intrinsics" or "reason"; ``file`` names it in
     messages. Raises ValueError: another line; it is named."""
     records = []

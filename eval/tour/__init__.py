@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.tour.path import tour_path as tour_path
     from ufmstar_torch.eval.tour.sequence import export_tour as export_tour
     from ufmstar_torch.eval.tour.sequence import tour_sequence as tour_sequence
-    from ufmstar_torch.eval.tour.style import TourStyle as TourStyle
     from ufmstar_torch.eval.tour.tour import Tour as Tour
     from ufmstar_torch.eval.tour.tour import make_tour as make_tour
     from ufmstar_torch.eval.tour.view import TourView as TourView

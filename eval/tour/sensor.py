@@ -30,16 +30,16 @@ def develop(color: Tensor, seed: int | None = None) -> Tensor:
 
 
 def _sensed(light: Tensor, seed: int) -> Tensor:
-    """What a lens and a sensor make of it; random numbers are drawn on the host, the same for every device."""
+    """Exposure, blur, vignetting and noise of a lens and a sensor."""
     rng = torch.Generator().manual_seed(seed)
     _, height, width = light.shape
     draws = torch.randn(2, generator=rng)
     exposure = float(1 + _EXPOSURE_SPREAD * draws[0].clamp(-2, 2))
     strength = _VIGNETTE * float((0.5 + 0.25 * draws[1]).clamp(0, 1))
-    noise = torch.randn(light.shape, generator=rng).to(light.device)
+    noise = torch.randn(light.shape, generator=rng)
     blurred = _blurred(_blurred(light).transpose(1, 2)).transpose(1, 2)
-    y = torch.linspace(-1, 1, height, device=light.device)[:, None]
-    x = torch.linspace(-1, 1, width, device=light.device)
+    y = torch.linspace(-1, 1, height)[:, None]
+    x = torch.linspace(-1, 1, width)
     shaded = exposure * blurred * (1 - strength * (x * x + y * y) / 2)
     return shaded + noise * (_SHOT * shaded.clamp_min(0).sqrt() + _READ)
 

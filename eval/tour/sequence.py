@@ -11,11 +11,10 @@ import numpy as np
 import torch
 
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, make_sequence, parse_size
-from ufmstar_torch.eval.tour.box_room import intrinsics
 from ufmstar_torch.eval.tour.path import tour_path
-from ufmstar_torch.eval.tour.style import STYLES, TourStyle
+from ufmstar_torch.eval.tour.style import STYLES
 from ufmstar_torch.eval.tour.tour import Tour, make_tour
-from ufmstar_torch.eval.tour.view import TourView, render
+from ufmstar_torch.eval.tour.view import TourView, intrinsics, render
 
 PREFIX = "tour:"
 _FORM = "tour:SEED or tour:SEED?option=value&..., with the options style, frames, size, fov, path and sensor"
@@ -55,11 +54,10 @@ def tour_sequence(
     *,
     frames: int = 150,
     size: Size = (160, 224),
-    style: str | TourStyle = "home",
+    style: str = "home",
     fov: float = 70.0,
     path_seed: int | None = None,
     sensor: bool = True,
-    device: torch.device | str = "cpu",
 ) -> FrameSequence:
     """A tour as a sequence; frames are rendered when they are asked for.
 
@@ -67,11 +65,10 @@ def tour_sequence(
         seed: of the rooms, see :func:`make_tour`.
         frames: at least 1.
         size: (H, W) of images and depth maps.
-        style: ``home``, ``hall``, ``mixed``, or one's own.
+        style: ``home``, ``hall`` or ``mixed``.
         fov: horizontal field of view [degrees], 20 to 120.
         path_seed: see :func:`tour_path`.
         sensor: whether images have a sensor's exposure, vignetting and noise.
-        device: where it is rendered.
 
     Raises:
         ValueError: a value is out of its range.
@@ -83,13 +80,12 @@ def tour_sequence(
     tour = make_tour(seed, style)
     poses = tour_path(tour, frames, path_seed)
     K = intrinsics(size[0], size[1], fov)
-    renderer = _Renderer(tour.to(device), poses, K, size, sensor)
+    renderer = _Renderer(tour, poses, K, size, sensor)
     entries = [
         Entry(f"{i:06d}", poses[i].numpy(), partial(renderer.image, i), partial(renderer.depth, i), timestamp=i / FPS)
         for i in range(frames)
     ]
-    named = style if isinstance(style, str) else "own"
-    return make_sequence(f"tour-{seed}-{named}", "tour", entries, K, image_size=size, depth_size=size)
+    return make_sequence(f"tour-{seed}-{style}", "tour", entries, K, image_size=size, depth_size=size)
 
 
 class _Renderer:
@@ -101,11 +97,11 @@ class _Renderer:
 
     def image(self, index: int) -> np.ndarray:
         """[H, W, 3] uint8 RGB."""
-        return self._view(index).image.cpu().numpy()
+        return self._view(index).image.numpy()
 
     def depth(self, index: int) -> np.ndarray:
         """[H, W] float32 [m]."""
-        return self._view(index).depth.float().cpu().numpy()
+        return self._view(index).depth.float().numpy()
 
     def _view(self, index: int) -> TourView:
         if index not in self._kept:

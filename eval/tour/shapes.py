@@ -69,10 +69,6 @@ class Surfaces:
     def __len__(self) -> int:
         return self.kind.shape[0]
 
-    def to(self, device: torch.device | str) -> Surfaces:
-        """The same on another device."""
-        return Surfaces(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
-
 
 def part(
     kind: int,

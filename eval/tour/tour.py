@@ -47,16 +47,6 @@ class Tour:
     ways: tuple[Tensor, ...]  # [M, 2] float64 closed ways of x and z [m], see ``route.ways``
     camera_height: float  # above the floor [m]
 
-    @property
-    def device(self) -> torch.device:
-        """Where it is rendered."""
-        return self.rooms.device
-
-    def to(self, device: torch.device | str) -> Tour:
-        """The same tour on another device."""
-        names = ("rooms", "doors", "door_rooms", "surfaces", "lights", "volumes", "noise")
-        return replace(self, **{name: getattr(self, name).to(device) for name in names})
-
     def room_at(self, position: Tensor) -> Tensor:
         """The room at a position, or the nearest one (in a doorway, say).
 
@@ -75,27 +65,21 @@ class Tour:
         return self.room_styles[int(self.room_at(position))]
 
 
-def make_tour(seed: int, style: str | TourStyle = "home") -> Tour:
-    """Makes the rooms of a seed; the same ones everywhere. Those made last are kept in memory.
+@lru_cache(maxsize=8, typed=True)  # True is no seed
+def make_tour(seed: int, style: str = "home") -> Tour:
+    """Makes the rooms of a seed; the same ones everywhere.
 
     Args:
         seed: at least 0.
-        style: ``home``, ``hall``, ``mixed``, or one's own.
+        style: ``home``, ``hall`` or ``mixed``.
 
     Raises:
         ValueError: a negative seed, or no such style.
     """
     if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
         raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
-    return _kept(seed, style) if isinstance(style, str) else _make(seed, style_of(style))
+    chosen = style_of(style)
 
-
-@lru_cache(maxsize=8)
-def _kept(seed: int, style: str) -> Tour:
-    return _make(seed, style_of(style))
-
-
-def _make(seed: int, chosen: TourStyle) -> Tour:
     def stream(number: int) -> np.random.Generator:
         return np.random.default_rng([seed, number])
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.tour.intersect import entry
@@ -25,10 +27,16 @@ class TourView:
     valid: Tensor  # [H, W] bool whether there is one; everywhere, inside of a room
 
 
+def intrinsics(height: int, width: int, fov_degrees: float = 70.0) -> NDArray[np.float64]:
+    """[3, 3] a centred pinhole camera [px] with the given horizontal field of view."""
+    f = 0.5 * width / np.tan(np.radians(fov_degrees) / 2)
+    return np.array([[f, 0.0, (width - 1) / 2], [0.0, f, (height - 1) / 2], [0.0, 0.0, 1.0]])
+
+
 def render(
     tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int, *, frame_seed: int | None = None
 ) -> TourView:
-    """Renders one view, on the tour's device.
+    """Renders one view.
 
     Args:
         tour: what is seen.
@@ -58,17 +66,17 @@ def cast(
     """Depth [H, W] float64 [m], infinite where nothing is, and the primitives seen [H, W] int64, -1 for none.
 
     Args:
-        tour, T_world_cam, K, height, width: as :func:`render` takes them, on one device.
+        tour, T_world_cam, K, height, width: as :func:`render` takes them.
         cull: leave out where a primitive cannot be seen; the result is the same without, but slow.
     """
     if cull:
         seen = surface_windows(tour, T_world_cam, K, height, width)
     else:
         seen = [(i, (0, height, 0, width)) for i in range(len(tour.surfaces))]
-    u = torch.arange(width, dtype=torch.float64, device=tour.device)
-    v = torch.arange(height, dtype=torch.float64, device=tour.device)[:, None]
-    depth = torch.full((height, width), float("inf"), dtype=torch.float64, device=tour.device)
-    surface = torch.full((height, width), -1, dtype=torch.int64, device=tour.device)
+    u = torch.arange(width, dtype=torch.float64)
+    v = torch.arange(height, dtype=torch.float64)[:, None]
+    depth = torch.full((height, width), float("inf"), dtype=torch.float64)
+    surface = torch.full((height, width), -1, dtype=torch.int64)
     for (i, (top, bottom, left, right)), (kind, taper, o, M) in zip(
         seen, _rays(tour, T_world_cam, K, seen), strict=True
     ):
@@ -84,7 +92,7 @@ def _rays(
     tour: Tour, T_world_cam: Tensor, K: Tensor, seen: list[tuple[int, Window]]
 ) -> Iterator[tuple[int, float, list[float], list[list[float]]]]:
     """Kind, taper, camera o [3] and M [3, 3] of primitives, in whose unit coordinates a ray is o + t M (u, v, 1)."""
-    s, chosen = tour.surfaces, torch.tensor([i for i, _ in seen], dtype=torch.int64, device=tour.device)
+    s, chosen = tour.surfaces, torch.tensor([i for i, _ in seen], dtype=torch.int64)
     R, half = s.rotation[chosen], s.half[chosen]
     o = ((T_world_cam[:3, 3] - s.centre[chosen])[:, :, None] * R).sum(1) / half
     camera = (R[:, :, :, None] * T_world_cam[:3, None, :3]).sum(1) / half[:, :, None]
@@ -95,8 +103,8 @@ def _rays(
 def _directions(T_world_cam: Tensor, K: Tensor, height: int, width: int) -> Tensor:
     """[3, H W] float32 world directions of the pixels' rays, with depth 1."""
     M = (T_world_cam[:3, :3, None] * torch.linalg.inv(K)).sum(1)
-    u = torch.arange(width, dtype=torch.float64, device=M.device)
-    v = torch.arange(height, dtype=torch.float64, device=M.device)[:, None]
+    u = torch.arange(width, dtype=torch.float64)
+    v = torch.arange(height, dtype=torch.float64)[:, None]
     return torch.stack([(u * row[0] + (v * row[1] + row[2])).flatten().float() for row in M])
 
 
@@ -106,9 +114,9 @@ def _checked(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int
             raise ValueError(f"{name} must be a finite [{size}, {size}] matrix, got shape {tuple(value.shape)}")
     if height < 1 or width < 1:
         raise ValueError(f"height and width must be at least 1, got {height} and {width}")
-    pose = T_world_cam.to(tour.device, torch.float64)
+    pose = T_world_cam.to(torch.float64)
     p = pose[:3, 3]
     boxes = torch.cat([tour.rooms, tour.doors])
     if not bool(((boxes[:, 0] < p) & (p < boxes[:, 1])).all(1).any()):
         raise ValueError(f"T_world_cam must stand in a room or a doorway of the tour, got position {p.tolist()}")
-    return pose, K.to(tour.device, torch.float64)
+    return pose, K.to(torch.float64)

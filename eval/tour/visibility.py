@@ -23,7 +23,7 @@ def surface_windows(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, wid
     A primitive lies within the outline of its corners, and is seen through the doorways that lead to its room.
     """
     rooms = room_windows(tour, T_world_cam, K, height, width)
-    seen = torch.tensor([top < bottom for top, bottom, _, _ in rooms], device=tour.device)
+    seen = torch.tensor([top < bottom for top, bottom, _, _ in rooms])
     first, second = tour.surfaces.rooms.unbind(1)
     candidates = torch.nonzero(seen[first] | ((second != NOBODY) & seen[second.clamp_min(0)])).flatten()
     outlines = _outlines(tour.surfaces.corners[candidates], T_world_cam, K, height, width)
@@ -52,7 +52,7 @@ def room_windows(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width:
 
 def box_corners(boxes: Tensor) -> Tensor:
     """[N, 8, 3] of axis-aligned boxes [N, 2, 3], in the order of their signs as binary digits."""
-    pick = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], device=boxes.device)
+    pick = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
     return boxes.gather(1, pick.expand(len(boxes), 8, 3))
 
 

@@ -95,21 +95,10 @@ def find(gray: NDArray[np.uint8], count: int, spacing: float, followed: NDArray[
     # same from frame to frame.
     factor = 2 if gray.shape[1] >= _HALVED_FROM else 1
     searched = gray if factor == 1 else cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    free = _away_from((followed + 0.5) / factor - 0.5, round(spacing / factor), searched.shape)
+    free = np.full(searched.shape, 255, np.uint8)
+    for u, v in np.rint((followed + 0.5) / factor - 0.5).astype(int).tolist():
+        cv2.circle(free, (u, v), round(spacing / factor), 0, -1)
     corners = cv2.goodFeaturesToTrack(
         searched, count, _WEAKEST, spacing / factor, mask=free, useHarrisDetector=True, k=_HARRIS
     )
     return np.zeros((0, 2)) if corners is None else (corners[:, 0].astype(np.float64) + 0.5) * factor - 0.5
-
-
-def _away_from(position: NDArray[np.float64], radius: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """[H, W] 255 where no position [N, 2] is within a radius [px], 0 elsewhere: all discs drawn at once."""
-    height, width = shape
-    side = np.arange(-radius, radius + 1)
-    down, right = (offset - radius for offset in np.nonzero(side[:, None] ** 2 + side**2 <= radius**2))
-    margin = radius + 1  # discs may reach beyond the image; at least 1, so that it can be cut off again
-    wide = width + 2 * margin
-    free = np.full((height + 2 * margin, wide), 255, dtype=np.uint8)
-    u, v = np.rint(position).astype(np.int64).T + margin
-    free.ravel()[(v * wide + u)[:, None] + down * wide + right] = 0
-    return np.ascontiguousarray(free[margin:-margin, margin:-margin])

@@ -11,16 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.dense_keyframes import Keyframes
 from ufmstar_torch.anchors.dense_memory import Memory
 from ufmstar_torch.anchors.dense_poses import PoseErrors
+from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.tracker import Landmarks, checked
 from ufmstar_torch.checked import Checked, number
 
@@ -74,7 +74,7 @@ class DenseConfig(Checked):
     memory: float = number(0.8, "", "1", 0, 1, open_high=True)
 
 
-class DenseEvidence:
+class DenseEvidence(SavedState):
     """Measures the depth of a pixel in every cell of the image.
 
     Args:
@@ -89,6 +89,7 @@ class DenseEvidence:
     """
 
     needs_image = True
+    HELD: ClassVar = {"_size": "size", "_K": "K", "_depth": "depth", "_contradicted": "contradicted"}
 
     def __init__(self, config: DenseConfig | None = None) -> None:
         self.config = config if config is not None else DenseConfig()
@@ -107,29 +108,17 @@ class DenseEvidence:
         self._keyframes.reset()
         self._memory.reset()
         self._errors.reset()
-        self._camera: tuple[tuple[int, ...], NDArray[np.float64]] | None = None
+        self._size, self._K = np.zeros(2, np.int64), np.eye(3)  # of the images; no size before the first
         self._depth, self._contradicted = self.config.start_depth, 0
 
     def state(self) -> dict[str, Tensor]:
-        """A copy of all that is remembered, for :meth:`load_state`."""
-        size, K = ((0, 0), np.eye(3)) if self._camera is None else self._camera
-        numbers = torch.tensor([self._depth, self._contradicted], dtype=torch.float64)
-        held = {"size": torch.tensor(size), "K": torch.tensor(K), "numbers": numbers}
-        return held | self._keyframes.state() | self._memory.state() | self._errors.state()
+        """All that is remembered, for :meth:`load_state`; images are shared and must not be written to."""
+        return super().state() | self._keyframes.state() | self._memory.state() | self._errors.state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Go on where :meth:`state` was taken, with the same anchors to the last bit.
-
-        Raises:
-            ValueError: another number of keyframes.
-        """
-        self._keyframes.load_state(state)
-        self._memory.load_state(state)
-        self._errors.load_state(state)
-        height, width = state["size"].tolist()
-        self._camera = ((height, width), np.array(state["K"].numpy())) if height else None
-        self._depth, contradicted = state["numbers"].tolist()
-        self._contradicted = int(contradicted)
+        """Continue where :meth:`state` was taken; ValueError: another number of keyframes or landmarks."""
+        for part in (super(), self._keyframes, self._memory, self._errors):
+            part.load_state(state)
 
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
@@ -151,9 +140,9 @@ class DenseEvidence:
             ModuleNotFoundError: OpenCV is not installed.
         """
         gray, T, K = checked(image, T_world_cam, K)
-        if self._camera is None:
-            self._camera = gray.shape, K
-        elif gray.shape != self._camera[0] or not np.array_equal(K, self._camera[1]):
+        if not self._size.any():
+            self._size, self._K = np.array(gray.shape), K
+        elif gray.shape != tuple(self._size) or not np.array_equal(K, self._K):
             raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
         small, scale = _reduced(gray, self.config.width)
         result = self._measured(small, scale, T, scale @ K)
@@ -202,11 +191,10 @@ class DenseEvidence:
         if len(kept) >= _ENOUGH:
             step = (1 - self.config.memory) * np.log(np.median(1 / rho[kept]) / self._depth)
             self._depth *= float(np.exp(step))
-        confirmed = np.concatenate([self._memory.confirmed[both.slot[fine & trusted]], np.zeros(len(new), np.int64)])
         stated = variance[kept] + self._memory.apart * np.square(rho[kept])
         surface, alone = beside(small, pixel[kept], rho[kept], stated, cell)
         depth, position = 1 / rho[kept], (surface - scale[:2, 2]) / scale.diagonal()[:2]
-        return Landmarks(position, depth, (stated + alone) * depth**4, searched + known, confirmed)
+        return Landmarks(position, depth, (stated + alone) * depth**4, searched + known)
 
     def _search(self) -> Search:
         from ufmstar_torch.kernels.dense_cpu import Search

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from ufmstar_torch.anchors.saved_state import SavedState
 
 # A frame becomes a keyframe where the camera has moved by this share of the median depth, or turned so far [rad].
 _MOVED, _TURNED = 0.015, np.deg2rad(4.0)
@@ -17,8 +20,10 @@ _OFF = 2.5
 _OVERLAP = 0.5
 
 
-class Keyframes:
+class Keyframes(SavedState):
     """The last ``count`` keyframes: images in gray, and poses."""
+
+    HELD: ClassVar = {"_pose": "pose", "_added": "added"}
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -110,16 +115,9 @@ class Keyframes:
     def state(self) -> dict[str, Tensor]:
         """All that is remembered, for :meth:`load_state`; the images are shared and must not be written to."""
         images = {f"image{i}": torch.from_numpy(image) for i, image in enumerate(self._image)}
-        return images | {"pose": torch.tensor(self._pose), "added": torch.tensor(self._added)}
+        return images | super().state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Go on where :meth:`state` was taken.
-
-        Raises:
-            ValueError: another number of keyframes.
-        """
-        if len(state["pose"]) != self._count:
-            raise ValueError(f"state must be of {self._count} keyframes, got {len(state['pose'])}")
+        """Continue where :meth:`state` was taken; ValueError: another number of keyframes."""
+        super().load_state(state)
         self._image = [state[f"image{i}"].numpy() for i in range(self._count)]
-        self._pose = np.array(state["pose"].numpy())
-        self._added = int(state["added"])

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
+
+from ufmstar_torch.anchors.saved_state import SavedState
 
 # A landmark is measured again where the camera has moved by this share of its depth since; times one more for every
 # confirmation, up to _SELDOM.
@@ -42,7 +42,7 @@ class Sighted:
     due: NDArray[np.bool_]
 
 
-class Memory:
+class Memory(SavedState):
     """At most ``count`` landmarks.
 
     Args:
@@ -55,6 +55,19 @@ class Memory:
         confirmed: [count] in how many later views each was confirmed.
         frame: images so far.
     """
+
+    HELD: ClassVar = {
+        "_point": "landmark_point",
+        "_pose": "landmark_pose",
+        "_sigma": "landmark_sigma",
+        "_patch": "landmark_patch",
+        "_used": "landmark_used",
+        "confirmed": "landmark_confirmed",
+        "_failed": "landmark_failed",
+        "_seen": "landmark_seen",
+        "frame": "landmark_frame",
+        "apart": "landmark_apart",
+    }
 
     def __init__(self, count: int, fading: float) -> None:
         self._count, self._fading = count, fading
@@ -71,25 +84,6 @@ class Memory:
         self._used = np.zeros(n, dtype=np.bool_)
         self.confirmed, self._failed, self._seen = (np.zeros(n, np.int64) for _ in range(3))
         self.frame, self.apart = 0, _FIRST_APART
-
-    def state(self) -> dict[str, Tensor]:
-        """A copy of all that is remembered, for :meth:`load_state`."""
-        held = {name: torch.tensor(getattr(self, attribute)) for name, attribute in _HELD.items()}
-        numbers = torch.tensor([self.frame, self.apart], dtype=torch.float64)
-        return held | {"landmark_numbers": numbers}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Go on where :meth:`state` was taken.
-
-        Raises:
-            ValueError: another number of landmarks.
-        """
-        if len(state["landmark_point"]) != self._count:
-            raise ValueError(f"state must be of {self._count} landmarks, got {len(state['landmark_point'])}")
-        for name, attribute in _HELD.items():
-            setattr(self, attribute, np.array(state[name].numpy()))
-        frame, self.apart = state["landmark_numbers"].tolist()
-        self.frame = int(frame)
 
     def sighted(
         self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64], cell: int
@@ -206,15 +200,3 @@ def _beyond(square: NDArray[np.float64], variance: NDArray[np.float64]) -> float
         too_small = np.median(square / (variance + middle)) > _MEDIAN_SQUARE
         low, high = (middle, high) if too_small else (low, middle)
     return high
-
-
-_HELD = {
-    "landmark_point": "_point",
-    "landmark_pose": "_pose",
-    "landmark_sigma": "_sigma",
-    "landmark_patch": "_patch",
-    "landmark_used": "_used",
-    "landmark_confirmed": "confirmed",
-    "landmark_failed": "_failed",
-    "landmark_seen": "_seen",
-}

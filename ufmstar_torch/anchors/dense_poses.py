@@ -19,14 +19,13 @@ far as the pixels show d, and those of the camera's errors are what earlier fram
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
+from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.kernels.dense_cpu import Measured, Views
 from ufmstar_torch.kernels.poses_cpu import CAMERA, POSE, Shown, Solution, linearised, solved
 
@@ -63,13 +62,22 @@ class Fit:
     variance: NDArray[np.float64]
 
 
-class PoseErrors:
+class PoseErrors(SavedState):
     """What is known of the errors of the poses and of the camera.
 
     Args:
         baselines: number of baselines that are told apart.
         memory: share of the running estimates that remains after a frame.
     """
+
+    HELD: ClassVar = {
+        "_known": "pose_known",
+        "_variance": "pose_variance",
+        "_left": "pose_left",
+        "_disagreement": "pose_disagreement",
+        "_camera": "camera_error",
+        "_covariance": "camera_covariance",
+    }
 
     def __init__(self, baselines: int, memory: float) -> None:
         self._baselines, self._memory = baselines, memory
@@ -82,19 +90,6 @@ class PoseErrors:
         self._left = np.full(self._baselines, _FIRST_LEFT**2)  # [px^2]
         self._disagreement = 1.0
         self._camera, self._covariance = np.zeros(CAMERA), np.eye(CAMERA)
-
-    def state(self) -> dict[str, Tensor]:
-        """A copy of all that is known, for :meth:`load_state`."""
-        held = {name: torch.tensor(getattr(self, attribute)) for name, attribute in _HELD.items()}
-        numbers = torch.tensor([self._known, self._disagreement], dtype=torch.float64)
-        return held | {"pose_numbers": numbers}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Go on where :meth:`state` was taken."""
-        for name, attribute in _HELD.items():
-            setattr(self, attribute, np.array(state[name].numpy()))
-        known, self._disagreement = state["pose_numbers"].tolist()
-        self._known = bool(known)
 
     def positions(self, K: NDArray[np.float64], width: int, depth: float) -> NDArray[np.float64]:
         """[baselines] variance of a position in a keyframe by all errors [px^2], at a depth [m], in an image ``width``
@@ -213,11 +208,3 @@ def _medians(values: NDArray[np.float64], where: NDArray[np.bool_]) -> NDArray[n
     ordered = np.sort(np.where(where, values, np.inf), axis=0)
     middle = np.minimum(where.sum(0) // 2, len(values) - 1)
     return np.where(where.any(0), ordered[middle, np.arange(values.shape[1])], 0.0)
-
-
-_HELD = {
-    "pose_variance": "_variance",
-    "pose_left": "_left",
-    "camera_error": "_camera",
-    "camera_covariance": "_covariance",
-}

@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ufmstar_torch.arguments import require_float, require_mask, require_whole
+from ufmstar_torch.arguments import require_float, require_mask
 from ufmstar_torch.fixed_order import apply, product
 from ufmstar_torch.frame import FrameInput
 
@@ -34,14 +34,12 @@ class Anchors:
         depth: [B, N] along the optical axis [m].
         variance: [B, N] of ``depth`` [m^2].
         valid: [B, N] bool, True = use; None = all.
-        confirmed: [B, N] int64, in how many later views each was confirmed; None = unknown.
     """
 
     pixel: Tensor
     depth: Tensor
     variance: Tensor
     valid: Tensor | None = None
-    confirmed: Tensor | None = None
 
     @classmethod
     def from_points(
@@ -110,8 +108,8 @@ class Anchors:
 
     def to(self, device: torch.device | str) -> Anchors:
         """The same on another device."""
-        moved = (None if part is None else part.to(device) for part in (self.valid, self.confirmed))
-        return Anchors(self.pixel.to(device), self.depth.to(device), self.variance.to(device), *moved)
+        valid = None if self.valid is None else self.valid.to(device)
+        return Anchors(self.pixel.to(device), self.depth.to(device), self.variance.to(device), valid)
 
 
 @dataclass(frozen=True)
@@ -126,7 +124,6 @@ class AnchorInput:
         own_variance: [B, N] what the network itself claims there, A + E as far as they are used [m^2].
         valid: [B, N] bool: finite, depth > 0, 0 <= variance < depth^2, off from the prediction by a factor of at most
             100, on a valid pixel, not masked.
-        confirmed: [B, N] int64, in how many later views each was confirmed; None = unknown.
     """
 
     pixel: Tensor
@@ -136,7 +133,6 @@ class AnchorInput:
     variance: Tensor
     own_variance: Tensor
     valid: Tensor
-    confirmed: Tensor | None = None
 
 
 def claimed(own: Sequence[Tensor], index: Tensor, valid: Tensor) -> Tensor:
@@ -161,7 +157,7 @@ def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> 
     """The anchors, ready to be used; see :func:`check_anchors`.
 
     Args:
-        anchors: of the right shapes, in float64, ``confirmed`` in int64.
+        anchors: of the right shapes, in float64.
         frame, own: as :func:`check_anchors`.
     """
     pixel, depth, variance = anchors.pixel, anchors.depth, anchors.variance
@@ -185,7 +181,6 @@ def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> 
         variance=torch.where(valid, variance, zero),
         own_variance=claimed(own, index, valid),
         valid=valid,
-        confirmed=anchors.confirmed,
     )
 
 
@@ -215,12 +210,8 @@ def check_anchors(
     shape = [(b, pixel.shape[1])]
     depth = require_float("anchors.depth", anchors.depth, shape, frame.depth).detach().double()
     variance = require_float("anchors.variance", anchors.variance, shape, frame.depth).detach().double()
-    valid, confirmed = anchors.valid, anchors.confirmed
-    if valid is not None:
-        valid = require_mask("anchors.valid", valid, shape, frame.depth)
-    if confirmed is not None:
-        confirmed = require_whole("anchors.confirmed", confirmed, shape, frame.depth).long()
-    return kernel(Anchors(pixel, depth, variance, valid, confirmed), frame, own)
+    valid = None if anchors.valid is None else require_mask("anchors.valid", anchors.valid, shape, frame.depth)
+    return kernel(Anchors(pixel, depth, variance, valid), frame, own)
 
 
 def require_anchors(anchors: object) -> Anchors:

@@ -60,9 +60,8 @@ class StreamLandmarks:
         self._before = before
         room = max(len(landmarks.depth) for landmarks in result)
         each = [landmarks.anchors(K[i].numpy(), K[i], room) for i, landmarks in enumerate(result)]
-        known = [one.confirmed for one in each if one.confirmed is not None]
-        parts = {name: torch.cat([getattr(one, name) for one in each]) for name in _PARTS}
-        return Anchors(**parts, confirmed=torch.cat(known) if len(known) == b else None).to(image.device)
+        parts = (torch.cat([getattr(one, name) for one in each]) for name in _PARTS)
+        return Anchors(*parts).to(image.device)
 
     def undo(self, streams: Sequence[int] | None = None) -> None:
         """Forget the last image of these streams (None: of all): it was not used."""

@@ -7,8 +7,8 @@ keeps is of fixed size: a window of views, and the positions of at most ``max_po
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -17,6 +17,8 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.corners import find, follow
 from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.saved_state import SavedState
+from ufmstar_torch.checked import Checked, number
 
 if TYPE_CHECKING:
     from ufmstar_torch.kernels.triangulate_cpu import Triangulated
@@ -36,7 +38,7 @@ _NEAREST = 1e-3
 
 
 @dataclass(frozen=True)
-class TrackerConfig:
+class TrackerConfig(Checked):
     """How corners are found, followed and believed. Lengths in pixels are the camera's.
 
     Attributes:
@@ -59,39 +61,20 @@ class TrackerConfig:
         ValueError: an impossible value.
     """
 
-    max_points: int = 300
-    window: int = 10
-    min_views: int = 2
-    spacing: float = 14.0
-    back_tolerance: float = 0.5
-    pixel_noise: float = 1.0
-    max_error: float = 3.0
-    max_relative_sigma: float = 0.4
-    min_share: float = 0.2
+    max_points: int = number(300, "", "1", 1)
+    window: int = number(10, "", "1", 2)
+    min_views: int = number(2, "", "1", 2)
+    spacing: float = number(14.0, "", "px", 0, open_low=True)
+    back_tolerance: float = number(0.5, "", "px", 0, open_low=True)
+    pixel_noise: float = number(1.0, "", "px", 0, open_low=True)
+    max_error: float = number(3.0, "", "px", 0, open_low=True)
+    max_relative_sigma: float = number(0.4, "", "1", 0, open_low=True)
+    min_share: float = number(0.2, "", "1", 0, 1)
 
     def __post_init__(self) -> None:
-        for name, least in (("max_points", 1), ("window", 2), ("min_views", 2)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise ValueError(f"TrackerConfig.{name} must be a whole number of at least {least}, got {value!r}")
-        for name in ("spacing", "back_tolerance", "pixel_noise", "max_error", "max_relative_sigma"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < float("inf"):
-                raise ValueError(f"TrackerConfig.{name} must be a positive number, got {value!r}")
-        share = self.min_share
-        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 1:
-            raise ValueError(f"TrackerConfig.min_share must be a number from 0 to 1, got {share!r}")
+        super().__post_init__()
         if self.min_views > self.window:
             raise ValueError(f"TrackerConfig.min_views must be at most window = {self.window}, got {self.min_views}")
-
-    def to_dict(self) -> dict[str, Any]:
-        """The config as plain values."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> TrackerConfig:
-        """Rebuild a config from :meth:`to_dict`; an unknown key is a ``TypeError``."""
-        return cls(**values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +86,6 @@ class Landmarks:
         depth: [N] along the optical axis [m].
         variance: [N] of ``depth`` [m^2].
         tracked: corners followed into this image, of which these N passed all tests; of a map, its landmarks.
-        confirmed: [N] int64, in how many later views each was confirmed; None = unknown.
         none: why there is no landmark, where N = 0.
     """
 
@@ -111,7 +93,6 @@ class Landmarks:
     depth: NDArray[np.float64]
     variance: NDArray[np.float64]
     tracked: int
-    confirmed: NDArray[np.int64] | None = None
     none: str = "no parallax, or no earlier view that agrees"
 
     def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
@@ -130,18 +111,17 @@ class Landmarks:
         if room < n:
             raise ValueError(f"capacity must be at least the number of landmarks, {n}, got {capacity}")
 
-        def padded(values: NDArray, dtype: type = np.float64) -> Tensor:
-            full = np.zeros((1, room, *values.shape[1:]), dtype)
+        def padded(values: NDArray) -> Tensor:
+            full = np.zeros((1, room, *values.shape[1:]))
             full[0, :n] = values
             return torch.from_numpy(full).to(intrinsics.device)
 
         valid = torch.arange(room, device=intrinsics.device)[None] < n
-        confirmed = None if self.confirmed is None else padded(self.confirmed, np.int64)
-        result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, confirmed)
+        result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid)
         return result.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
 
-class LandmarkTracker:
+class LandmarkTracker(SavedState):
     """Follows corners from image to image and triangulates them.
 
     Args:
@@ -156,6 +136,14 @@ class LandmarkTracker:
     """
 
     needs_image = True
+    HELD: ClassVar = {
+        "_K": "K",
+        "_pixel": "pixel",
+        "_seen": "seen",
+        "_poses": "poses",
+        "_view": "view",
+        "_noise": "noise",
+    }
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
         self.config = config if config is not None else TrackerConfig()
@@ -169,8 +157,7 @@ class LandmarkTracker:
     def reset(self) -> None:
         """Forget everything."""
         n, w = self.config.max_points, self.config.window
-        self._gray: NDArray[np.uint8] | None = None
-        self._K: NDArray[np.float64] | None = None
+        self._gray, self._K = np.zeros((0, 0), np.uint8), np.eye(3)  # of the last image
         self._pixel = np.zeros((n, w, 2))
         self._seen = np.zeros((n, w), dtype=bool)
         self._poses = np.tile(np.eye(4), (w, 1, 1))
@@ -181,28 +168,12 @@ class LandmarkTracker:
     def state(self) -> dict[str, Tensor]:
         """All that is remembered, for :meth:`load_state`: the window, and the last image in gray, which is shared and
         must not be written to."""
-        gray = np.zeros((0, 0), dtype=np.uint8) if self._gray is None else self._gray
-        K = np.eye(3) if self._K is None else self._K
-        held = {"K": K, "pixel": self._pixel, "seen": self._seen, "poses": self._poses}
-        own = {"gray": torch.from_numpy(gray)} | {name: torch.tensor(value) for name, value in held.items()}
-        noise = torch.tensor(self._noise, dtype=torch.float64)
-        return own | {"view": torch.tensor(self._view), "noise": noise}
+        return {"gray": torch.from_numpy(self._gray)} | super().state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Go on where :meth:`state` was taken, with the same landmarks to the last bit.
-
-        Raises:
-            ValueError: another ``max_points`` or ``window``.
-        """
-        shape, own = tuple(state["pixel"].shape), self._pixel.shape
-        if shape != own:
-            raise ValueError(f"state must be of {own[0]} points in {own[1]} views, got {shape[0]} in {shape[1]}")
-        gray = state["gray"].numpy()
-        K, self._pixel, self._seen, self._poses = (
-            np.array(state[name].numpy()) for name in ("K", "pixel", "seen", "poses")
-        )
-        self._gray, self._K = (gray, K) if gray.size else (None, None)
-        self._view, self._noise = int(state["view"]), float(state["noise"])
+        """Continue where :meth:`state` was taken; ValueError: another ``max_points`` or ``window``."""
+        super().load_state(state)
+        self._gray = state["gray"].numpy()
         self._triangulated()
 
     def update(
@@ -225,7 +196,7 @@ class LandmarkTracker:
             ModuleNotFoundError: OpenCV is not installed.
         """
         gray, T, K = checked(image, T_world_cam, K)
-        if self._gray is not None and self._K is not None:
+        if self._gray.size:
             if gray.shape != self._gray.shape or not np.array_equal(K, self._K):
                 raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
             position, alive = self._followed(gray, T)
@@ -244,7 +215,7 @@ class LandmarkTracker:
     def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Positions [N, 2] in the new image and which corners could be followed there and back [N]."""
         position, alive = self._pixel[:, self._view].copy(), self._seen[:, self._view].copy()
-        if alive.any() and self._gray is not None:
+        if alive.any():
             start, expected = position[alive], self._expected(alive, T)
             position[alive], alive[alive] = follow(self._gray, gray, start, self.config.back_tolerance, expected)
         return position, alive
@@ -253,7 +224,6 @@ class LandmarkTracker:
         """Where the chosen corners of the last image should be in that of a camera T [4, 4]: each moves as its point
         does. One without a point has the others' median depth; None where too few have one."""
         last, K = self._poses[self._view], self._K
-        assert K is not None
         position, point = self._pixel[chosen, self._view], self._point[chosen]
         depth = (point - last[:3, 3]) @ last[:3, 2]
         known = np.isfinite(depth)
@@ -288,7 +258,7 @@ class LandmarkTracker:
         remembered."""
         chosen = self._seen[:, self._view] & (self._seen.sum(1) >= self.config.min_views)
         self._point = np.full((self.config.max_points, 3), np.nan)
-        if not chosen.any() or self._K is None:
+        if not chosen.any():
             return chosen, None
         from ufmstar_torch.kernels.triangulate_cpu import triangulate  # compiles when it is first needed
 

@@ -53,7 +53,7 @@ def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> 
     _check(*given, mask, *maps, FARTHEST_OFF, pixel, index, predicted, depth, variance, valid)
     at, usable = torch.from_numpy(index), torch.from_numpy(valid)
     p, d, g, s2 = (torch.from_numpy(value) for value in (pixel, predicted, depth, variance))
-    return AnchorInput(p, at, d, g, s2, claimed(own, at, usable), usable, anchors.confirmed)
+    return AnchorInput(p, at, d, g, s2, claimed(own, at, usable), usable)
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""What a run keeps of its frames: the sink that writes their maps, lines of frames.jsonl, checkpoint and summary."""
+"""The sink of ``ufmstar run``: writes every frame's maps and record, and now and then a checkpoint and the summary."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from ufmstar_torch.eval.engine.estimators import Estimate
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.rows import RowFrame
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
+from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.run_folder import Checkpoint, RunFolder
-from ufmstar_torch.eval.run.run_job import RunJob, saved_state
 from ufmstar_torch.eval.run.summary import GOING_ON, NEAR_ZERO, write_summary
 
 _MAPS = ("depth", "variance", "disagreement", "anchored", "bias", "posterior_depth", "posterior_variance")
 _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
-_SUMMARY_EVERY = 30.0  # [s] between two updates of the summary of a run that is going on
+_SUMMARY_EVERY = 30.0  # [s] between two summaries of an unfinished run
 
 
-class Journal(FrameSink):
-    """Writes every frame's maps to the run's folder, and commits it with the metrics' sums and the state that the next
-    one depends on (``FrameResult.state``); now and then the summary."""
+class FrameRecorder(FrameSink):
+    """Writes every frame's maps, adds its record to the run's folder, and hands the folder a checkpoint: position,
+    state after the frame (``FrameResult.state``) and the metrics' sums."""
 
     def __init__(self, job: RunJob, folder: RunFolder, metrics: RunMetrics) -> None:
         self._job, self._folder, self._metrics = job, folder, metrics
@@ -31,22 +31,23 @@ class Journal(FrameSink):
         self._saving = 0.0
 
     def begin(self, stream: FrameStream) -> None:
-        """The clock of this session starts."""
+        """Start the clock of this session."""
         self._first, self._started = stream.position, perf_counter()
         self._summarised = self._started
 
     def take(self, result: FrameResult) -> None:
-        """Write and commit a frame; raises OSError as ``FrameWriter.write`` and ``RunFolder.commit``."""
-        record, frames = self._written(result), result.number + 1 - self._first
+        """Write and record a frame; raises OSError as ``FrameWriter.write`` and ``RunFolder.add``."""
+        record, frames = self._record(result), result.number + 1 - self._first
         session = {"first": self._first, "frames": frames, "seconds": perf_counter() - self._started}
         checkpoint = Checkpoint(
             position=result.number + 1,
-            module=saved_state(result.state[UFM], bare=not self._job.source.needs_image),
+            unit=self._folder.writer.unit,
+            state=dict(result.state[UFM]),
             metrics=self._metrics.sums(),
             sessions=[*self._earlier, session],
         )
         before = perf_counter()
-        self._folder.commit(record, checkpoint)
+        self._folder.add(record, checkpoint)
         after = perf_counter()
         self._saving = 1000 * (after - before)
         if after - self._summarised > _SUMMARY_EVERY:
@@ -54,10 +55,10 @@ class Journal(FrameSink):
             self._summarised = perf_counter()
 
     def end(self) -> None:
-        """Store the last state, before pictures are drawn."""
+        """Store the last state before pictures are drawn."""
         self._folder.store()
 
-    def _written(self, result: FrameResult) -> dict[str, Any]:
+    def _record(self, result: FrameResult) -> dict[str, Any]:
         """The frame's line of frames.jsonl, once its maps are written."""
         about = {"index": result.index, "name": result.name}
         if UFM not in result.rows:
@@ -72,7 +73,7 @@ class Journal(FrameSink):
 def _figures(row: RowFrame) -> dict[str, Any]:
     """Counts and means of a frame."""
     estimate, prediction = row.estimate, row.prediction
-    statistics, own, K = estimate.statistics, prediction.variance, prediction.intrinsics.tolist()
+    statistics, network_variance, K = estimate.statistics, prediction.variance, prediction.intrinsics.tolist()
     assert statistics is not None
     assert estimate.variance is not None
     assert estimate.disagreement is not None
@@ -85,20 +86,19 @@ def _figures(row: RowFrame) -> dict[str, Any]:
         "rotation_deviation": float(statistics.rotation_deviation[0]),
         "mean_disagreement": _mean(estimate.disagreement, valid),
         "mean_sigma": _mean(std, valid),
-        "mean_network_sigma": None if own is None else _mean(own.cpu().sqrt(), valid),
+        "mean_network_sigma": None if network_variance is None else _mean(network_variance.cpu().sqrt(), valid),
         "near_zero": int(((std > 0) & (std < NEAR_ZERO)).sum()),
         "ground_truth": row.truth is not None,
     }
 
 
 def _times(result: FrameResult, row: RowFrame, writing: float, saving: float) -> dict[str, float]:
-    """By stage [ms]. "prepare" is what a prediction takes beside the network; "save" is that of the frame before, since
-    this frame's is not known yet. "cycle" is the time since the frame before: stages overlap."""
+    """By stage [ms]. "prepare" is the rest of the prediction beside the network. "save" is the frame before's: this
+    frame's is not known yet. "cycle" is the time since the frame before; stages overlap."""
     ms = result.ms
-    optional: dict[str, float] = {stage: row.ms[stage] for stage in ("network", "anchors") if stage in row.ms}
     return {
         "read": ms["read"],
-        **optional,
+        **{stage: row.ms[stage] for stage in ("network", "anchors") if stage in row.ms},
         "ufm": row.ms["uncertainty"],
         "metrics": ms["truth"] + ms["metrics"],
         "write": writing,
@@ -109,10 +109,10 @@ def _times(result: FrameResult, row: RowFrame, writing: float, saving: float) ->
 
 
 def _anchor_figures(row: RowFrame) -> dict[str, Any]:
-    """Of a run with anchors: what became of the frame's corners, and the means of B [m^2] and of r.
+    """With anchors: the frame's counts, and the means of B [m^2] and of r.
 
-    ``tracked`` were followed from the frame before, of which ``found`` were triangulated; ``usable`` lie on a pixel
-    with a depth, and ``used`` agree with others. Without any used, ``without`` is the reason. Of a map of landmarks,
+    ``tracked`` corners were followed from the frame before, ``found`` of them triangulated; ``usable`` lie on a pixel
+    with a depth, and ``used`` agree with others. ``without`` is the reason where none is used. Of a map of landmarks,
     ``tracked`` counts all, and ``found`` those in view.
     """
     anchors, estimate, statistics = row.anchors, row.estimate, row.estimate.statistics
@@ -129,7 +129,7 @@ def _anchor_figures(row: RowFrame) -> dict[str, Any]:
 
 
 def _posterior_figures(estimate: Estimate) -> dict[str, Any]:
-    """Of a run with a posterior: its mean sigma [m], and what held-out anchors say (``FrameStatistics``)."""
+    """With a posterior: its mean sigma [m], and the figures of held-out anchors (``FrameStatistics``)."""
     variance, statistics = estimate.posterior_variance, estimate.statistics
     if variance is None or statistics is None or statistics.calibration is None or statistics.unseen is None:
         return {}

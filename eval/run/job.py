@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ufmstar_torch.anchors.landmarks import LandmarkSource
 from ufmstar_torch.anchors.tracker import LandmarkTracker
@@ -22,11 +21,8 @@ from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.setting import TRACKED, Setting
 from ufmstar_torch.eval.run.run_folder import Checkpoint
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
-from ufmstar_torch.recalibrate import read_recalibration, split_name
+from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
-
-# A run on maps saves UfM*'s tensors under their own names, and no turn: its files have done so since the first version.
-_TURN, _UFM = "image_index", "ufm."
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +35,7 @@ class RunJob:
     config: UfMStarConfig  # of UfM*
     device: torch.device  # of UfM*
     settings: Mapping[str, Any]  # everything the user chose, as plain values, for the summary
-    recalibration: str = ""  # FILE@DIGEST of a map of the variance; "" = none
+    recalibration: Recalibration | None = None  # of the variance
     every: bool = False  # all members predict on every image, instead of one in turn
     video: bool = True  # whether to make preview.mp4
     sheet: bool = True  # whether to make contact_sheet.png
@@ -48,11 +44,10 @@ class RunJob:
 
     def row(self, checkpoint: Checkpoint) -> RowRunner:
         """UfM* on the source, in the state of a checkpoint."""
-        mapped = read_recalibration(self.recalibration) if self.recalibration else None
         row = RowRunner(
             UFM,
             self.source,
-            Gaussians(self.config, self.device, recalibration=mapped),
+            Gaussians(self.config, self.device, recalibration=self.recalibration),
             every=self.every,
             anchors=AnchorSource(Setting(anchors=TRACKED), Tracks(self.landmarks()))
             if self.config.anchors is not None
@@ -60,13 +55,12 @@ class RunJob:
             skips_faults=True,
             device=self.device,
         )
-        if checkpoint.module:
-            images = torch.tensor(checkpoint.position)
-            row.load_state(row_state(checkpoint.module, bare=not self.source.needs_image, images=images))
+        if checkpoint.state:
+            row.load_state(checkpoint.state)
         return row
 
     def ufm(self, checkpoint: Checkpoint) -> UfMStar:
-        """UfM* in the state of a checkpoint. A frame in hand may have changed the running one already."""
+        """UfM* in the state of a checkpoint; the running one may be some frames ahead."""
         estimator = self.row(checkpoint).estimator
         assert isinstance(estimator, Gaussians)
         return estimator.ufm
@@ -95,7 +89,7 @@ class RunJob:
             "ufm": self.config.to_dict(),
             "source": self.source_identity,
             "device": self.device.type,
-            **({"recalibration": split_name(self.recalibration)[1]} if self.recalibration else {}),
+            **({"recalibration": self.recalibration.to_dict()} if self.recalibration else {}),
         }
 
     def _first_frame(self) -> str | None:
@@ -106,15 +100,3 @@ class RunJob:
             return None
         maps = [array for array in (frame.image, frame.depth) if array is not None]
         return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in maps)).hexdigest()
-
-
-def saved_state(state: Mapping[str, Tensor], *, bare: bool) -> dict[str, Tensor]:
-    """The state of a run's row as state.pt holds it; ``bare``: of a run on maps."""
-    return {k.removeprefix(_UFM): v for k, v in state.items() if k != _TURN} if bare else dict(state)
-
-
-def row_state(saved: Mapping[str, Tensor], *, bare: bool, images: Tensor) -> dict[str, Tensor]:
-    """The row's state from what :func:`saved_state` returned; ``images`` that a run on maps has seen."""
-    if not bare:
-        return dict(saved)
-    return {_TURN: images, **{k if k.startswith("tracker.") else _UFM + k: v for k, v in saved.items()}}

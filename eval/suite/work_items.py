@@ -1,4 +1,4 @@
-"""The sequences that are evaluated, and how they are shared out."""
+"""The sequences that are evaluated, and the shards into which they are divided."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class WorkItem:
 
 @dataclass(frozen=True)
 class Shard:
-    """One of several equal parts of the work.
+    """One of several equal parts of the sequences.
 
     Raises:
         ValueError: no such part.
@@ -77,6 +77,9 @@ class Shard:
     def of(self, items: Sequence[WorkItem]) -> list[WorkItem]:
         """Its items: every n-th, so that all parts get neighbours of each."""
         return list(items[self.index - 1 :: self.count])
+
+
+ALL = Shard()
 
 
 def find_work(

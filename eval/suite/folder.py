@@ -1,13 +1,11 @@
-"""The output folder of ``ufmstar eval``: what is finished in it, and which process works on which sequence.
+"""The output folder of ``ufmstar eval``: what is finished in it.
 
 ```
-OUT/eval.json                       what is evaluated: suite, rows, networks, sequences, settings
-OUT/eval.lock                       held while eval.json is made or extended
-OUT/records/DATASET/SEQUENCE/.claim-N  names the process that works on the sequence; see ``claim``
+OUT/eval.json                          suite, rows, networks, sequences, settings
+OUT/eval.lock, eval-I-of-N.lock        held while eval.json is made or extended, and while shard I of N is evaluated
 OUT/records/DATASET/SEQUENCE/ROW.json  a record, written after ROW.pt: where it exists, both are complete
 OUT/records/DATASET/SEQUENCE/failed.json
 ```
-Several processes may work in one folder, on one computer or many that see it.
 """
 
 from __future__ import annotations
@@ -16,53 +14,66 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from ufmstar_torch.eval.engine.evaluate import RowResult
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.metrics.packed_sums import pack
-from ufmstar_torch.eval.results.claim import PATTERN, Claim, claim
-from ufmstar_torch.eval.results.record import FORMAT, Record
-from ufmstar_torch.eval.results.worklist import WorkItem
-from ufmstar_torch.eval.run.files import remove_temporaries, write_atomic, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
+from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, hold, remover
+from ufmstar_torch.eval.suite.record import FORMAT, Record
+from ufmstar_torch.eval.suite.work_items import ALL, Shard, WorkItem
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
 
 FAILED, CACHE = "failed.json", "cache"
 # What a report leaves; removed by --overwrite.
 _REPORT: tuple[str, ...] = ("efficiency.json", "results.json", "results.csv", "table.csv", "report.html")
 _REPORT += ("tables/*.md", "tables/*.tex", "figures/*.png", "figures/*.svg", "figures/*.json")
-_OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz", "room/*.npz", PATTERN)
+_OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz", "room/*.npz")
 
 
 class EvalFolder:
-    """An output folder of ``ufmstar eval``, which :meth:`open` makes; ``path`` is the folder."""
+    """An output folder of ``ufmstar eval``; ``path`` is the folder. :meth:`open` makes it, for use with ``with``."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, lock: BaseFileLock | None = None) -> None:
+        self.path, self._lock = path, lock
 
     @classmethod
-    def open(cls, out: Path, about: Mapping[str, Any], *, resume: bool, overwrite: bool) -> EvalFolder:
-        """Make the folder, or go on in it; see ``OutputFolder.open``. When going on, rows, sequences and networks of
-        ``about`` (eval.json) are added to those of the earlier evaluation; suite, settings and the networks of the same
-        base must be the same. The cache of predictions is never removed. Raises FolderError also where a process is at
-        one of the sequences."""
+    def open(
+        cls, out: Path, about: Mapping[str, Any], *, shard: Shard = ALL, resume: bool = False, overwrite: bool = False
+    ) -> EvalFolder:
+        """Make the folder, or continue in it; see ``OutputFolder.open``. When continuing, rows, sequences and networks
+        of ``about`` (eval.json) are added to those of the earlier evaluation; suite, settings and the networks of the
+        same base must be the same. The cache of predictions is never removed. Raises FolderError also where another
+        process evaluates the same shard, or any shard of a folder that is to be overwritten."""
         with OutputFolder.open(out, EVALUATION, about, resume=resume, overwrite=overwrite):
-            return cls(out)
+            lock = hold(out / f"eval-{shard.index}-of-{shard.count}.lock")
+        if lock is None:
+            raise FolderError(f"--out {out}: another process is evaluating shard {shard} there now")
+        return cls(out, lock)
+
+    def close(self) -> None:
+        """Release the shard."""
+        if self._lock is not None:
+            self._lock.release()
+
+    def __enter__(self) -> EvalFolder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def place(self, item: WorkItem) -> Path:
         """The folder of a sequence."""
         return self.path / "records" / item.folder
 
-    def claim(self, item: WorkItem, launch: str) -> Claim | None:
-        """Claim a sequence; None while another process has it. ``launch`` as :func:`claim` takes it."""
-        place = self.place(item)
-        place.mkdir(parents=True, exist_ok=True)
-        claimed = claim(place, launch)
-        if claimed is not None:
-            remove_temporaries(path for pattern in (".*.tmp", "*/.*.tmp") for path in place.glob(pattern))
-        return claimed
+    def is_finished(self, item: WorkItem, rows: Iterable[Row]) -> bool:
+        """Whether every row has a record, or the sequence has failed."""
+        return (self.place(item) / FAILED).exists() or not self.missing(item, rows)
 
     def missing(self, item: WorkItem, rows: Iterable[Row]) -> list[Row]:
         """The rows without a record; a record that cannot be read counts as none."""
@@ -96,7 +107,7 @@ class EvalFolder:
                     f"computed there (digest was {str(then)[:16]}, now {digest[:16]}); --overwrite starts again"
                 )
 
-    def keep(self, item: WorkItem, record: Record, result: RowResult) -> None:
+    def write(self, item: WorkItem, record: Record, result: RowResult) -> None:
         """Store a row, completely or not at all. Raises OSError: it cannot be written."""
         path = self.place(item) / f"{result.row.slug}.json"
         sums = {name: {key: pack(value) for key, value in states.items()} for name, states in result.sums.items()}
@@ -104,11 +115,12 @@ class EvalFolder:
         write_atomic(path.with_suffix(".pt"), lambda file: torch.save(sums, file), durable=True)
         record.save(path)
 
-    def fail(self, item: WorkItem, reason: str, rows: Sequence[Row], launch: str) -> None:
-        """Store why a sequence could not be evaluated."""
+    def fail(self, item: WorkItem, error: Exception | str, rows: Sequence[Row]) -> str:
+        """Store why rows of a sequence cannot be computed, and return a line about it."""
+        reason = " ".join(str(error).split()) or type(error).__name__
         about = {"dataset": item.dataset, "sequence": item.sequence, "reason": reason}
-        rest = {"rows": [row.slug for row in rows], "launch": launch}
-        write_json_atomic(self.place(item) / FAILED, {**about, **rest})
+        write_json_atomic(self.place(item) / FAILED, {**about, "rows": [row.slug for row in rows]})
+        return f"{item.label}: failed: {reason}"
 
     def failure(self, item: WorkItem) -> dict[str, Any] | None:
         """What :meth:`fail` has stored about a sequence; None if nothing."""
@@ -118,11 +130,11 @@ class EvalFolder:
         except FileNotFoundError:
             return None
         except ValueError:
-            return {"reason": f"{path} cannot be read", "rows": [], "launch": ""}
+            return {"reason": f"{path} cannot be read", "rows": []}
         return failure if isinstance(failure, dict) else None
 
     def failures(self, items: Iterable[WorkItem]) -> dict[str, str]:
-        """Why a sequence is broken, by its label."""
+        """Why a sequence cannot be judged, by its label."""
         stored = {item.label: self.failure(item) for item in items}
         return {label: str(failure.get("reason")) for label, failure in stored.items() if failure is not None}
 
@@ -154,20 +166,19 @@ def _union(first: list[Any], second: list[Any]) -> list[Any]:
 
 def _clear(out: Path) -> None:
     """Remove what an earlier evaluation and its report left, by their names; the cache stays. Raises FolderError: a
-    process is at one of its sequences."""
-    places = sorted({path.parent for path in out.glob(f"records/*/*/{PATTERN}")})
+    process evaluates a shard there."""
     with ExitStack() as held:
-        for place in places:
-            own = claim(place, "")
-            if own is None:
-                raise FolderError(f"--out {out}: another process is evaluating {place.name} there now")
-            held.enter_context(own)
+        for path in out.glob("eval-*-of-*.lock"):
+            lock = hold(path)
+            if lock is None:
+                raise FolderError(f"--out {out}: another process is evaluating there now ({path.name})")
+            held.callback(lock.release)
+        places = sorted(path for path in out.glob("records/*/*") if path.is_dir())
+        remover(*(f"records/*/*/{pattern}" for pattern in _OF_SEQUENCE), *_REPORT)(out)
     for place in places:
-        remover(*_OF_SEQUENCE)(place)
         for folder in (place / "examples", place / "room", place, place.parent, out / "records"):
             if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
-    remover(*_REPORT)(out)
 
 
 EVALUATION = FolderKind(

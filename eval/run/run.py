@@ -1,0 +1,135 @@
+"""``run``: a sequence through a depth source and UfM*, onto disk.
+
+A frame's files are complete or absent, and an interrupted run continues with the same results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ufmstar_torch.anchors.dense import DenseEvidence
+from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
+from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
+from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
+from ufmstar_torch.eval.engine.warm_up import warm_up_command
+from ufmstar_torch.eval.engine.writer_thread import WriterThread
+from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.run.job import RunJob
+from ufmstar_torch.eval.run.pictures import Finished, common_columns, draw_sheet, draw_video, mixture_writers
+from ufmstar_torch.eval.run.recorder import FrameRecorder
+from ufmstar_torch.eval.run.run_folder import RunFolder
+from ufmstar_torch.eval.run.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
+
+
+def run(
+    job: RunJob,
+    out: str | Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[Progress], None] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> dict[str, Any]:
+    """Run a job and leave its frames, pictures, mixture and summary in a folder.
+
+    KeyboardInterrupt and OSError (a full disk) end the run in order: finished frames stay, and the summary
+    states the reason. A frame that cannot be read, or whose pose or intrinsics are unusable, is skipped and counted.
+
+    Args:
+        job: what to run.
+        out: the folder; see ``RunFolder.open`` for whose it may be.
+        resume: continue an earlier run from its checkpoint.
+        overwrite: replace an earlier run.
+        progress: called at the start of each stage and after every frame.
+        stop: called before every frame; True ends the run as KeyboardInterrupt does.
+
+    Returns:
+        The content of summary.json; ``state`` is "finished", "interrupted" or "failed", ``reason`` says why.
+
+    Raises:
+        FolderError: the folder cannot be used.
+        OSError: the summary cannot be written.
+        Exception: whatever else the network or UfM* raise, after the summary was written.
+    """
+    with RunFolder.open(out, job.identity(), resume=resume, overwrite=overwrite) as folder:
+        write_summary(job, folder, *GOING_ON)
+        ending, outputs = (FAILED, "an error in the program"), {}
+        try:
+            _frames(job, folder, progress, stop)
+            ending = _ending(job, folder)
+            outputs = _outputs(job, folder, progress, stop)
+        except (KeyboardInterrupt, Stopped):
+            ending = INTERRUPTED, f"stopped by the user after {_counts(folder, job)}; --resume goes on"
+        except OSError as error:
+            ending = FAILED, f"{error}; stopped after {_counts(folder, job)}; --resume goes on"
+        except BaseException as error:
+            ending = FAILED, f"{type(error).__name__}: {error}"
+            raise
+        finally:
+            summary = write_summary(job, folder, *ending, outputs)
+    return summary
+
+
+def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
+    """The frames that are left."""
+
+    def compiling(done: int, total: int) -> None:
+        progress(Progress("kernels", done, total))
+
+    dense = job.config.anchors is not None and isinstance(job.landmarks(), DenseEvidence)
+    warm_up_command(job.config, job.device, compiling, images=job.source.needs_image, dense=dense)
+    row, metrics = job.row(folder.checkpoint), RunMetrics(UFM, folder.checkpoint.metrics)
+    stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=folder.checkpoint.position)
+    with WriterThread([metrics, FrameRecorder(job, folder, metrics)]) as writer:
+        stream.drive([writer, ProgressSink(progress, _skipped(folder))], stop=stop)
+
+
+def _ending(job: RunJob, folder: RunFolder) -> tuple[str, str]:
+    """Of a run that went through all frames."""
+    if any(record["state"] == "done" for record in folder.records):
+        return FINISHED, _counts(folder, job)
+    reasons = sorted({record["reason"] for record in folder.records})
+    return FAILED, f"no frame could be used: {'; '.join(reasons[:3])}"
+
+
+def _skipped(folder: RunFolder) -> int:
+    return sum(record["state"] == "skipped" for record in folder.records)
+
+
+def _counts(folder: RunFolder, job: RunJob) -> str:
+    skipped = _skipped(folder)
+    done = f"{len(folder.records) - skipped} of {len(job.indices)} frames"
+    return f"{done} ({skipped} skipped)" if skipped else done
+
+
+def _outputs(
+    job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]
+) -> dict[str, str | None]:
+    """Mixture, curves and pictures of all finished frames: by file, None if made, else why not."""
+    done = [record for record in folder.records if record["state"] == "done"]
+    if not done:
+        return {}
+    for name, write in mixture_writers(job.ufm(folder.checkpoint)).items():
+        write(folder.path / name)
+    write_json_atomic(folder.path / "curves.json", RunMetrics(UFM, folder.checkpoint.metrics).curves())
+    made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json"))
+    with_error = any(record["ground_truth"] for record in done) and not job.source.is_truth
+    finished = Finished(folder.path, job.sequence, done, with_error)
+    try:
+        if job.sheet or job.video:
+            columns = common_columns(finished)
+        if job.sheet:
+            draw_sheet(finished, columns, f"{job.sequence.name}: {_counts(folder, job)}")
+            made["contact_sheet.png"] = None
+        for drawn in draw_video(finished, columns) if job.video else ():
+            progress(Progress("pictures", drawn, len(done)))
+            if stop():
+                raise Stopped
+        if job.video:
+            made["preview.mp4"] = None
+    except ImportError as error:  # an optional package; the frames are what a run is for
+        expected = {"contact_sheet.png": job.sheet, "preview.mp4": job.video}
+        made |= {name: str(error) for name, requested in expected.items() if requested and name not in made}
+    return made

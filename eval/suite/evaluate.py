@@ -1,0 +1,125 @@
+"""One sequence of an evaluation: the rows without a record are computed and stored."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+
+from ufmstar_torch.eval.engine.anchors import landmark_digests
+from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, RowResult, evaluate_sequence
+from ufmstar_torch.eval.engine.judge import references
+from ufmstar_torch.eval.engine.progress import Progress
+from ufmstar_torch.eval.methods.method import ALONE
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.run.files import remove_temporaries
+from ufmstar_torch.eval.run.machine import hardware, versions
+from ufmstar_torch.eval.suite.examples import ExampleWriter
+from ufmstar_torch.eval.suite.folder import EvalFolder
+from ufmstar_torch.eval.suite.job import EvalJob
+from ufmstar_torch.eval.suite.record import Record
+from ufmstar_torch.eval.suite.work_items import WorkItem, content_digest
+from ufmstar_torch.recalibrate import Recalibration
+
+Evaluate = Callable[..., list[RowResult]]
+_NO_POSES = "its images have no poses: the rows of networks alone are finished, {} that compare views cannot be had"
+_FITTED = "{} recalibrated rows were fitted to this sequence and are not judged on it"
+
+
+def evaluate_item(
+    job: EvalJob,
+    item: WorkItem,
+    judge: Judge,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[Progress], object] = lambda _: None,
+    evaluate: Evaluate = evaluate_sequence,
+) -> str:
+    """Compute and store the missing rows of a sequence, or why they cannot be computed.
+
+    Args:
+        job: what is evaluated; its folder is open.
+        item: the sequence.
+        judge: of the job.
+        stop: called before every frame; nothing of the sequence is stored then.
+        progress: called at the start and after every frame.
+        evaluate: computes rows on a sequence; see ``evaluate_sequence``.
+
+    Returns:
+        A line about the sequence, "" where nothing was missing.
+
+    Raises:
+        Stopped: ``stop`` returned True.
+        FolderError: earlier results were computed from another sequence of that name.
+        CacheError, OSError: nothing can be written.
+    """
+    folder, started = EvalFolder(job.out), time.monotonic()
+    place, rows = folder.place(item), job.suite.rows
+    place.mkdir(parents=True, exist_ok=True)
+    remove_temporaries(path for pattern in (".*.tmp", "*/.*.tmp") for path in place.glob(pattern))
+    missing = folder.missing(item, rows)
+    try:
+        sequence = item.open()
+        digest = content_digest(sequence)
+        landmarks = landmark_digests(rows, sequence.folder)
+    except (*BROKEN, OSError) as error:
+        return folder.fail(item, error, missing)
+    folder.require_same_sequence(item, digest, landmarks)
+    posed = [row for row in rows if sequence.posed or row.method.fusion == ALONE]
+    possible = [row for row in posed if not _fitted_to(row, item)]
+    todo = [row for row in missing if row in possible]
+    line = ""
+    if todo:
+        sinks = [ExampleWriter(place)] if job.stores_examples(item) else []
+        needed = with_references(todo, possible)
+        try:
+            results = evaluate(sequence, needed, judge, sinks=sinks, stop=stop, progress=progress)
+        except BROKEN as error:
+            return folder.fail(item, error, missing)
+        made_of = {"sequence": digest, "device": str(judge.device)}
+        for result in results:
+            if result.row in todo:
+                own = {"landmarks": landmarks[result.row.slug]} if result.row.slug in landmarks else {}
+                folder.write(item, _record(job, item, judge, result, {**made_of, **own}), result)
+        frames, seconds = results[0].frames.get("done", 0), time.monotonic() - started
+        line = f"{item.label}: {len(todo)} rows, {frames} frames, {seconds:.1f} s"
+    if len(todo) < len(missing):
+        left_out = [row for row in missing if row not in possible]
+        reason = folder.fail(item, (_FITTED if sequence.posed else _NO_POSES).format(len(left_out)), left_out)
+        return f"{line}; {reason}" if line else reason
+    folder.succeeded(item)
+    return line
+
+
+def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:
+    """The missing rows and those whose confidence they are judged by, in the order of ``rows``."""
+    needed = {*missing, *(reference for row in missing for reference in references(row, rows))}
+    return [row for row in rows if row in needed]
+
+
+def _record(job: EvalJob, item: WorkItem, judge: Judge, result: RowResult, made_of: Mapping[str, Any]) -> Record:
+    """A row's figures with what they were computed from and with."""
+    row, network = result.row, judge.networks[result.row.method.base]
+    computed_with = {"versions": versions(), "machine": hardware(), "threads": torch.get_num_threads()}
+    return Record(
+        suite=job.suite.name,
+        dataset=item.dataset,
+        sequence=item.sequence,
+        network=network.label,
+        method=row.method.name,
+        setting=row.setting.to_dict(),
+        frames=result.frames,
+        figures=result.figures,
+        curves=result.curves,
+        state=result.state,
+        ms=result.ms,
+        provenance={**computed_with, "network": network.digest, "runtime": network.runtime, **made_of},
+    )
+
+
+def _fitted_to(row: Row, item: WorkItem) -> bool:
+    """Whether the row's recalibration was fitted to a sequence of this name."""
+    file = row.setting.recalibration
+    return bool(file) and item.label in Recalibration.from_json(file).sequences

@@ -1,0 +1,103 @@
+"""What is evaluated: a suite with its networks, on sequences, into a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ufmstar_torch.eval.engine.evaluate import Judge
+from ufmstar_torch.eval.engine.load import NetworkChoice
+from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.methods.suite import Suite
+from ufmstar_torch.eval.run.machine import hardware, versions
+from ufmstar_torch.eval.suite.cache import PredictionCache
+from ufmstar_torch.eval.suite.folder import CACHE
+from ufmstar_torch.eval.suite.work_items import WorkItem
+from ufmstar_torch.models.inference import Inference
+from ufmstar_torch.recalibrate import Recalibration
+
+
+@dataclass(frozen=True)
+class EvalJob:
+    """What is evaluated."""
+
+    suite: Suite  # its rows, of the bases that have a network
+    networks: Mapping[str, NetworkChoice]  # chosen, by base
+    items: tuple[WorkItem, ...]  # the sequences
+    out: Path  # the folder for everything that is written
+    missing_bases: tuple[str, ...] = ()  # bases of rows that were left out
+    frames: slice = field(default_factory=lambda: slice(None))  # which of each sequence
+    cache: Path | None = None  # folder of predictions; None = in ``out``
+    device: str = "cpu"  # "cpu", "cuda", "cuda:1"
+    confident: float = 0.5  # share of a frame's pixels of which a reference method counts as confident
+    bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
+    examples: int = 3  # of each data set, sequences of which a few frames are stored for pictures
+    samples: int | None = None  # passes of MC-Dropout
+    # runtime, precision: of the networks (``Inference``).
+    runtime: str = "auto"
+    precision: str = "float32"
+
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Bases with a network that no row of the suite has."""
+        return tuple(base for base in self.networks if base not in self.suite.bases)
+
+    def load(self, device: torch.device) -> dict[str, DepthSource]:
+        """The networks that the rows need. Raises FileNotFoundError, ValueError, ImportError, see
+        ``NetworkChoice.load``."""
+        passes = {} if self.samples is None else {"samples": self.samples}
+        needed = [self.networks[base] for base in self.suite.bases]
+        inference = Inference(self.runtime, self.precision)
+        return {choice.base: choice.load(device, inference=inference, **passes) for choice in needed}
+
+    def judge(self, networks: Mapping[str, DepthSource], device: torch.device) -> Judge:
+        """How sequences are judged by the loaded networks. Raises CacheError: the folder of predictions cannot be
+        written."""
+        store = PredictionCache(self.cache or self.out / CACHE)
+        return Judge(networks, device, store, self.frames, self.confident, self.bins)
+
+    def about(self, networks: Mapping[str, DepthSource]) -> dict[str, Any]:
+        """The content of eval.json."""
+        suite, f = self.suite, self.frames
+        bins = {} if self.bins == "ours" else {"bins": self.bins}
+        opening = {name: value for item in self.items for name, value in item.opening}
+        return {
+            "suite": suite.name,
+            "title": suite.title,
+            "sweep": list(suite.sweep),
+            "networks": {base: network.identity for base, network in networks.items()},
+            "rows": [row.to_dict() for row in suite.rows],
+            "datasets": sorted({item.dataset for item in self.items}),
+            "sequences": [{"dataset": item.dataset, "sequence": item.sequence} for item in self.items],
+            "missing_bases": list(self.missing_bases),
+            "settings": {"frames": [f.start, f.stop, f.step], "confident": self.confident, **bins, **opening},
+            "versions": versions(),
+            "machine": hardware(),
+        }
+
+    def stores_examples(self, item: WorkItem) -> bool:
+        """Whether the sequence is one of the first of its data set, from which pictures are drawn."""
+        same = [other for other in self.items if other.dataset == item.dataset]
+        return item in same[: self.examples]
+
+
+def with_recalibrations(suite: Suite, files: Sequence[str]) -> Suite:
+    """The suite with a row for each recalibration, behind the row to which it was fitted.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: a file is no recalibration, or was fitted to a row that the suite does not have.
+    """
+    for file in files:
+        fitted = Recalibration.from_json(file).row
+        row = next((row for row in suite.rows if row.label == fitted), None)
+        if row is None:
+            raise ValueError(f"--recalibration {file} was fitted to the row {fitted!r}, which the suite does not have")
+        recalibrated = replace(row, setting=replace(row.setting, recalibration=file))
+        at = suite.rows.index(row) + 1
+        suite = replace(suite, rows=(*suite.rows[:at], recalibrated, *suite.rows[at:]))
+    return suite

@@ -1,0 +1,39 @@
+"""A rendered walk for sources of landmarks, and the errors of what they return."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.open import open_sequence
+
+
+@functools.cache
+def walk():
+    """14 frames of 180 x 240; nobody may change them."""
+    return list(open_sequence("tour:5?frames=14&size=180x240"))
+
+
+@functools.cache
+def long_walks():
+    """Two times 60 frames of 240 x 320."""
+    names = ("tour:71?style=mixed&frames=60&size=240x320", "tour:72?frames=60&size=240x320")
+    return [list(open_sequence(name)) for name in names]
+
+
+def true_depth(frame, pixel):
+    u, v = np.rint(pixel).astype(int).T
+    return frame.depth[v, u]
+
+
+def surprise(frame, result):
+    """Errors of inverse depths over their standard deviations, absolute [N]."""
+    z = true_depth(frame, result.pixel)
+    return np.abs(1 / result.depth - 1 / z) * result.depth**2 / np.sqrt(result.variance)
+
+
+def run(source, frames, poses=None, images=None):
+    poses = [f.T_world_cam for f in frames] if poses is None else poses
+    images = [f.image for f in frames] if images is None else images
+    return [source.update(i, T, f.intrinsics) for i, T, f in zip(images, poses, frames, strict=True)]

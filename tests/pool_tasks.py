@@ -1,0 +1,29 @@
+"""A pool of processes whose tasks do what their items say. A module of its own, which the processes import."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from functools import partial
+from pathlib import Path
+
+from ufmstar_torch.eval.suite.shards import run_pool
+
+
+def pool(folder, items, stop=lambda: False):
+    """Whether all items were done by two processes, and the lines that were reported."""
+    lines: list[str] = []
+    return run_pool(partial(task, str(folder)), items, 2, 1, stop=stop, report=lines.append), lines
+
+
+def task(folder, item):
+    """Writes a file ITEM-PROCESS; then ends the process where the item is "kill", fails or waits."""
+    Path(folder, f"{item}-{os.getpid()}").touch()
+    if item == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    while item.startswith("wait"):
+        time.sleep(0.02)
+    if item == "fail":
+        raise OSError("disk full")
+    return f"{item} done"

@@ -1,0 +1,118 @@
+"""Tracked corners and dense evidence on rendered rooms, where every depth is known: what both must do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from landmark_runs import long_walks, run, surprise, true_depth, walk
+from scipy.spatial.transform import Rotation
+
+from ufmstar_torch.anchors import landmark_source
+from ufmstar_torch.anchors.dense import DenseConfig, DenseEvidence
+from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
+
+SMALL = {
+    "corners": lambda: LandmarkTracker(TrackerConfig(max_points=40, window=4)),
+    "dense": lambda: DenseEvidence(DenseConfig(keyframes=5, landmarks=150)),
+}
+
+
+@pytest.fixture(scope="module")
+def tour():
+    return walk()
+
+
+@pytest.fixture(params=SMALL)
+def kind(request):
+    return request.param
+
+
+def test_depths_are_right_and_as_uncertain_as_stated(tour, kind):
+    results = run(landmark_source(kind), tour)
+    counts = [len(r.depth) for r in results]
+    assert counts[0] == 0, "one view has no parallax"
+    assert counts[1] >= 10 if kind == "corners" else counts[1] == 0, "dense evidence needs two views that agree"
+    assert np.median(counts[6:]) >= {"corners": 20, "dense": 60}[kind]
+    errors = np.concatenate([np.abs(r.depth / true_depth(f, r.pixel) - 1) for f, r in zip(tour, results, strict=True)])
+    assert np.median(errors) < 0.06
+    sizes = np.concatenate([surprise(f, r) for f, r in zip(tour, results, strict=True)])
+    assert 0.4 < 1.4826 * np.median(sizes) < 2
+
+
+def test_a_standing_and_a_turning_camera_have_no_anchors(tour, kind):
+    frame, gray = tour[3], np.tile(tour[3].image[:, :, 0], (1, 3))
+    assert sum(len(r.depth) for r in run(landmark_source(kind), [frame] * 6)) == 0
+    source, K = landmark_source(kind), np.array([[1000.0, 0, 119.5], [0, 1000, 89.5], [0, 0, 1]])
+    for step in range(8):  # as a camera with a long focal length sees a turn: the image moves sideways
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_rotvec([0, np.arctan(6 * step / 1000), 0]).as_matrix()
+        image = np.ascontiguousarray(gray[:, 40 + 6 * step : 280 + 6 * step])
+        assert len(source.update(image, T, K).depth) == 0
+    if kind == "corners":
+        assert source.update(image, T, K).tracked > 20, "there was something to follow"
+
+
+def test_poses_that_contradict_the_images_give_few_anchors(tour, kind):
+    rng, wrong = np.random.default_rng(0), [f.T_world_cam.copy() for f in tour]
+    for T in wrong[2:]:  # two views alone can be wrong together
+        T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(rng.normal(0, np.deg2rad(4), 3)).as_matrix()
+    right, noisy = (sum(len(f.depth) for f in run(landmark_source(kind), tour, T)[4:]) for T in (None, wrong))
+    assert right > 200
+    assert noisy < 0.1 * right
+
+
+def test_a_saved_state_continues_and_a_reset_forgets_everything(tour, kind):
+    source, other, first, sizes = SMALL[kind](), SMALL[kind](), [], set()
+    for i, frame in enumerate(tour):
+        if i == 7:
+            state = source.state()
+            saved = {name: value.clone() for name, value in state.items()}
+        first.append(source.update(frame.image, frame.T_world_cam, frame.intrinsics))
+        sizes.add(tuple((name, tuple(value.shape)) for name, value in source.state().items()))
+    assert len(sizes) == 1, "memory is fixed"
+    assert all(torch.equal(state[name], value) for name, value in saved.items())
+    other.load_state(state)
+    source.reset()
+    for results, expected in ((run(other, tour[7:]), first[7:]), (run(source, tour), first)):
+        for a, b in zip(results, expected, strict=True):
+            for name in ("pixel", "depth", "variance"):
+                np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    with pytest.raises(ValueError, match="must have shape"):
+        landmark_source(kind).load_state(state)
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "error"),
+    [
+        ("image", np.zeros((180, 240, 3)), ValueError),
+        ("image", None, TypeError),
+        ("image", np.zeros((90, 120, 3), dtype=np.uint8), ValueError),
+        ("T_world_cam", np.full((4, 4), np.nan), ValueError),
+        ("K", np.zeros((3, 3)), ValueError),
+        ("K", np.diag([200.0, 200, 1]), ValueError),
+    ],
+)
+def test_wrong_input_leaves_a_source_as_it_was(tour, kind, argument, value, error):
+    one, other = SMALL[kind](), SMALL[kind]()
+    for frame in tour[:6]:
+        arguments = {"image": frame.image, "T_world_cam": frame.T_world_cam, "K": frame.intrinsics}
+        expected = one.update(**arguments)
+        if frame.index > 0:
+            with pytest.raises(error, match=argument):
+                other.update(**{**arguments, argument: value})
+        np.testing.assert_array_equal(other.update(**arguments).depth, expected.depth)
+
+
+@pytest.mark.slow
+def test_stated_variances_are_those_of_the_errors(kind):
+    sizes, errors, counts = [], [], []
+    for frames in long_walks():
+        for frame, result in zip(frames, run(landmark_source(kind), frames), strict=True):
+            sizes.extend(surprise(frame, result))
+            errors.extend(np.abs(result.depth / true_depth(frame, result.pixel) - 1))
+            counts.append(len(result.depth))
+    assert 0.8 < np.median(sizes) / 0.674 < 1.25
+    assert np.mean(np.array(sizes) > 5) < {"corners": 0.12, "dense": 0.05}[kind]
+    assert np.median(errors) < {"corners": 0.06, "dense": 0.015}[kind]
+    assert np.mean(counts) > {"corners": 80, "dense": 180}[kind]
