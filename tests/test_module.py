@@ -285,11 +285,12 @@ def test_growth_by_doubling_keeps_everything():
     assert small.mean.shape[1] == 2 ** int(np.ceil(np.log2(k)))
 
 
-def test_max_components_drops_the_farthest_in_both_tiers():
+@pytest.mark.parametrize("limit", [5, 14])
+def test_max_components_drops_the_farthest_in_both_tiers(limit):
     """As the mixture without a limit, less what is farthest from the camera; every component is counted."""
-    limited = CONFIG.replace(initial_capacity=2, max_components=5)
+    limited = CONFIG.replace(initial_capacity=2, max_components=limit)
     tiers = [UfMStar(limited.replace(backend=backend), dtype=torch.float64) for backend in ("torch", "numba")]
-    free, dropped, before = UfMStar(CONFIG, dtype=torch.float64), 0, 0
+    free, dropped, before, earlier = UfMStar(CONFIG, dtype=torch.float64), 0, 0, []
     for i in range(8):
         one, other = (ufm(*frame(i, torch.float64)) for ufm in tiers)
         assert int(one.statistics.dropped) == int(other.statistics.dropped)
@@ -298,7 +299,7 @@ def test_max_components_drops_the_farthest_in_both_tiers():
             torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12)
         s = one.statistics
         dropped += int(s.dropped)
-        assert int(s.components) == before + int(s.segments - s.matched) - int(s.dropped) <= 5
+        assert int(s.components) == before + int(s.segments - s.matched) - int(s.dropped) <= limit
         before = int(s.components)
         if not dropped:
             free(*frame(i, torch.float64))
@@ -308,13 +309,13 @@ def test_max_components_drops_the_farthest_in_both_tiers():
             k = int(free.mixture.components)
             where = torch.linalg.inv(free.T_world_first[0]) @ torch.tensor(POSES[i])
             far = (free.mixture.mean[0, : len(earlier)] - where[:3, 3]).square().sum(-1)
-            gone = far.sort(descending=True).indices[: k - 5]
-            kept = [n for n in range(k) if n not in gone.tolist()]
+            gone = far.sort(descending=True).indices[: k - limit]
+            kept = [n for n in range(k) if n not in gone.tolist()][:limit]
             torch.testing.assert_close(tiers[0].mixture.mean[0], free.mixture.mean[0, kept], rtol=1e-9, atol=1e-12)
             free = None
     assert dropped > 0
     assert free is None
-    assert tiers[0].mean.shape[1] == tiers[1].mean.shape[1] == 5
+    assert tiers[0].mean.shape[1] == tiers[1].mean.shape[1] == limit
 
 
 def test_of_equally_far_components_the_oldest_is_dropped_and_sums_follow():

@@ -70,8 +70,16 @@ class StatefulModule(nn.Module):
         chosen[given if given.numel() else given.long()] = True
         return chosen
 
+    def _settle(self) -> None:
+        """Write what is pending into the buffers, before they are saved, loaded, copied or moved."""
+
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        self._settle()
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """``.to()`` and friends, with the exceptions that the class states."""
+        self._settle()
         before = {name: getattr(self, name) for name in self.STATE}
         super()._apply(fn, recurse)
         for name, old in before.items():
@@ -129,6 +137,7 @@ class StatefulModule(nn.Module):
         missing: list[str], unexpected: list[str], errors: list[str],
     ) -> None:  # fmt: skip
         """Check the whole of a saved state, then take its shapes and copy its values: all of it or nothing."""
+        self._settle()
         expected = [prefix + name for name in (*self.STATE, "_extra_state")]
         absent = [key for key in expected if key not in state_dict]
         foreign = [key for key in state_dict if key.startswith(prefix) and key not in expected]
@@ -199,7 +208,7 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested values by dotted name, as segment.min_pixels."""
     found: dict[str, Any] = {}
     for name, value in values.items():
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) and value else {prefix + name: value}
     return found
 
 

@@ -4,7 +4,7 @@ The mixture is kept in the frame of each stream's first camera: poses are taken 
 float64, so large world coordinates never reach the float32 state, and what a frame does not update never changes.
 
 :class:`Step` is what ``UfMStar`` calls; :func:`step` is the reference. Its kernels can be replaced one by one
-(``step_kernels``); another implementation of the whole step has the same signature.
+(``step_parts``); another implementation of the whole step has the same signature.
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ from ufmstar_torch.output import FrameStatistics, StepOutput, given
 from ufmstar_torch.regress import Regression, moving_average
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.step_kernels import REFERENCE, Kernels
-from ufmstar_torch.step_kernels import StepObserver as StepObserver
+from ufmstar_torch.step_parts import REFERENCE, Kernels, StepObserver
 
 
 class Step(Protocol):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension
 from ufmstar_torch.extensions import extensions_of
 from ufmstar_torch.fixed_order import apply
-from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
+from ufmstar_torch.frame import FrameInput, check_frame, raise_faults, without_segments
 from ufmstar_torch.kernels.select import LateStep, select_check, select_sample, select_step
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
@@ -25,7 +25,8 @@ from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
 from ufmstar_torch.regress import Regression, regress, sample_size
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
-from ufmstar_torch.step import Step, StepObserver
+from ufmstar_torch.step import Step
+from ufmstar_torch.step_parts import StepObserver
 from ufmstar_torch.warm_up import warm_up
 
 
@@ -46,7 +47,7 @@ class UfMStar(StatefulModule):
         device: of the state until ``.to()``; it follows the first frame otherwise.
 
     Attributes:
-        observer: follows the stages of every step (``ufmstar_torch.step.StepObserver``), to time them; None = nothing.
+        observer: follows the stages of every step, to time them (``ufmstar_torch.step_parts.StepObserver``), or None.
 
     Example::
 
@@ -83,8 +84,6 @@ class UfMStar(StatefulModule):
         self.ALWAYS_FLOAT64 = (*UfMStar.ALWAYS_FLOAT64, *self._extensions.always_float64)
         for name, value in self._empty.tensors().items():
             self.register_buffer(name, value)
-
-    # ---- the algorithm ----
 
     def forward(
         self,
@@ -165,21 +164,15 @@ class UfMStar(StatefulModule):
     ) -> MeanUncertainty:
         """Like :meth:`forward`, but regress only a seeded sample of pixels: an average per image for
         active learning (section "Compute- and memory efficiency"); only the regression gets cheaper with fewer pixels.
-        An extension that needs whole maps does nothing here.
-
-        Without ``average`` it estimates the mean of this frame's V alone; the map of :meth:`forward` is averaged over
-        frames, and its mean differs (by 13 % in the median on recorded video).
+        An extension that needs whole maps does nothing here. The first views of a place have nothing to be compared
+        with: their mean is low (``MeanUncertainty.measured`` near 0), or NaN with ``config.unmeasured="nan"``.
 
         Args:
             pixels: size of the sample per image; or
             fraction: the same as a share of all pixels, in (0, 1]. Neither: 1000 pixels.
-            seed: of the sample, which nothing else decides but the image's size and its valid pixels: equal streams,
-                and frames with one seed, take the same pixels.
-            average: apply the exponential moving average at the sampled pixels.
-
-        The first views of a place have nothing to be compared with: their mean is low for want of evidence
-        (``MeanUncertainty.measured`` near 0). With ``config.unmeasured="nan"`` only measured pixels are averaged, and
-        an image without any gets NaN.
+            seed: of the sample, which depends on nothing else but the image's size and its valid pixels.
+            average: apply the exponential moving average at the sampled pixels, as :meth:`forward` does; else the mean
+                is that of this frame's V alone (by 13 % another one in the median on recorded video).
 
         Raises:
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
@@ -192,21 +185,14 @@ class UfMStar(StatefulModule):
         return MeanUncertainty(sample.mean, sample.error, sample.count, sample.measured, out.statistics)
 
     def warm_up(
-        self,
-        size: tuple[int, int],
-        *,
-        streams: int = 1,
-        progress: Callable[[int, int], object] | None = None,
+        self, size: tuple[int, int], *, streams: int = 1, progress: Callable[[int, int], object] | None = None
     ) -> None:
-        """Compile, or load from disk, all that the first frames of this size would otherwise wait for.
-
-        The state stays as it is: a module of its own takes two frames of a wall. On a machine's very first call that is
-        some twenty seconds on the CPU, later below a second.
+        """Compile all kernels, or load them from disk, by running two synthetic frames in a module of its own.
 
         Args:
             size: (H, W) of the depth maps [px].
             streams: B.
-            progress: is called with the stages that are done and all of them, to show that something happens.
+            progress: is called with the number of stages done and of all.
 
         Raises:
             ValueError: a size or number of streams that is not positive.
@@ -248,8 +234,6 @@ class UfMStar(StatefulModule):
             result = regress(mixture, local.to(dtype), self.config)
             return unmeasured.after_regression(result, None, self.config)[0]
 
-    # ---- the state ----
-
     @property
     def mixture(self) -> GaussianMixture:
         """M_i, [B, K], in the frame of each stream's first camera (``T_world_first`` takes it to the world)."""
@@ -266,9 +250,8 @@ class UfMStar(StatefulModule):
 
         Args:
             streams: indices, or a bool mask [B]; None = all, after which another batch size may follow.
-            keep_evidence: keep what extensions have learnt of a stream as a whole, as the recent error of this network:
-                a robot that starts in the same place again has an estimate at its first frames. What belongs to single
-                components goes with them. The batch size stays.
+            keep_evidence: keep what extensions have learnt of a stream as a whole, for a robot that starts in the same
+                place again. What belongs to single components goes with them. The batch size stays.
 
         Raises:
             IndexError: an index is out of range.
@@ -279,13 +262,10 @@ class UfMStar(StatefulModule):
         with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
             old, b = self.state, self.mean.shape[0]
             if streams is None:
-                new = self._initial(b if keep_evidence else 0, old.mean.device)
+                new = self._extensions.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
             else:
                 new = old.restarted(self._chosen(streams, b))
             self._store(new.tensors() | (dict(old.by_stream) if keep_evidence else {}))
-
-    def _initial(self, streams: int, device: torch.device) -> UfMStarState:
-        return self._extensions.initial(streams, self.config, self.mean.dtype, device)
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         self._empty.with_tensors(state).require(self.config, self._empty)
@@ -307,11 +287,11 @@ class UfMStar(StatefulModule):
         Args:
             frame: checked.
             given: what it brings for extensions, by name.
-            pixels: [B, n] indices into the flattened image to read the variance at; None = every pixel.
+            pixels: [B, n] indices into the flattened image; None = every pixel.
             average: apply the moving average.
 
         Returns:
-            The step's output; V [m^2], and maps of extensions by name, at every pixel [B, H, W] or [B, n].
+            The step's output; V [m^2] and maps of extensions by name, [B, H, W] or [B, n].
         """
         both = (frame.aleatoric, self.config.add_aleatoric), (frame.epistemic, self.config.add_epistemic)
         own = [value for value, counts in both if value is not None and counts]
@@ -332,7 +312,8 @@ class UfMStar(StatefulModule):
         # Normal tensors also under the caller's inference_mode: the state must outlive it.
         with outliving(), torch.no_grad(), full_precision(frame.depth.device):
             state = self._state_for(frame)
-            self._refuse_faults(frame)
+            if self.config.on_bad_frame == "raise":
+                raise_faults(frame)
             if self.observer is not None:
                 self.observer.stage("check")
             step = self._step(frame.depth.device.type)
@@ -342,36 +323,10 @@ class UfMStar(StatefulModule):
             state, out = extensions.after_frame(state, out, total)
             disagreement = extensions.disagreement(out.disagreement, chosen(frame.depth))
             self._store(state.tensors())
-            self._warn_without_segments(frame, out)
+            if not self._warned and (text := without_segments(frame, out.statistics, self.config)):
+                self._warned = True
+                warnings.warn(text, stacklevel=4)
         return out, total(disagreement), extensions.outputs()
-
-    def _refuse_faults(self, frame: FrameInput) -> None:
-        """Raise where a stream is at fault, unless faults are to be skipped."""
-        if self.config.on_bad_frame == "raise":
-            fault = frame.fault if frame.known_fault is None else frame.known_fault
-            if fault.device.type == "meta":
-                raise ValueError("depth lies on device meta, without values: set on_bad_frame='skip'")
-            raise_faults(fault.tolist())
-
-    def _warn_without_segments(self, frame: FrameInput, out: StepOutput) -> None:
-        """Warn once where a stream had depth but no segment; on the CPU only, elsewhere the look would wait."""
-        if self._warned or frame.depth.device.type != "cpu":
-            return
-        if all(out.statistics.segments.tolist()):
-            return
-        given = out.statistics.valid_pixels + frame.beyond + frame.out_of_range
-        empty = (given > 0) & (out.statistics.segments == 0)
-        if not bool(empty.any()):
-            return
-        self._warned = True
-        b = int(empty.nonzero()[0])
-        warnings.warn(
-            f"stream {b}: a frame has no segment, so nothing is compared between views: of {int(given[b])} pixels "
-            f"{int(frame.beyond[b])} lie beyond segment.max_depth = {self.config.segment.depth_limit} m and "
-            f"{int(frame.out_of_range[b])} outside the accepted ranges. Is the depth in metres, smooth, and the "
-            "intrinsics the depth map's? (said once)",
-            stacklevel=5,
-        )
 
     def _stored(self) -> UfMStarState:
         buffers = cast("dict[str, Tensor]", self._buffers)  # none is None; without the detour by ``__getattr__``
@@ -391,23 +346,12 @@ class UfMStar(StatefulModule):
             with outliving(), torch.no_grad():
                 self._store(self._kept_step[1].settled(self._stored(), self.config).tensors())
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        self._settle()
-        return super()._apply(fn, recurse)
-
-    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
-        self._settle()
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """A state that was saved without one of the extensions has learnt nothing for it."""
-        self._settle()
         weight = state_dict.get(prefix + "weight")
         if isinstance(weight, Tensor) and weight.dim() == 2:
-            for name, value in self._empty.by_component.items():
-                state_dict.setdefault(prefix + name, value.new_zeros(*weight.shape, *value.shape[2:]))
-            for name, value in self._empty.by_stream.items():
-                state_dict.setdefault(prefix + name, value.new_zeros(len(weight), *value.shape[1:]))
+            for name, value in self._empty.extended(*weight.shape).extensions.items():
+                state_dict.setdefault(prefix + name, value)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -419,7 +363,7 @@ class UfMStar(StatefulModule):
         state = self._stored()
         streams, device, mean = len(frame.depth), frame.depth.device, state.mean
         if len(mean) == 0:
-            return self._initial(streams, device)
+            return self._extensions.initial(streams, self.config, mean.dtype, device)
         if len(mean) != streams:
             raise ValueError(f"depth has {streams} streams but the state holds {len(mean)}: call reset() first")
         if mean.device != device:

@@ -43,7 +43,7 @@ class Module(Protocol):
 
 
 class _Stages:
-    """Counts the stages of the frames (``ufmstar_torch.step.StepObserver``), at whose first a stage compiles.
+    """Counts the stages of the frames (``ufmstar_torch.step_parts.StepObserver``), at whose first a stage compiles.
 
     Args:
         progress: see :func:`warm_up`.

@@ -24,7 +24,8 @@ from ufmstar_torch.posterior.update import update as update_posterior
 from ufmstar_torch.regress import SAMPLE_REFERENCE, SampleKernels
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
+from ufmstar_torch.step import Step, step
+from ufmstar_torch.step_parts import REFERENCE, Kernels, SegmentKernel
 
 _TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
 Wait = Callable[[], None]

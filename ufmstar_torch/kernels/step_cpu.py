@@ -37,7 +37,8 @@ from ufmstar_torch.output import StepOutput
 from ufmstar_torch.regress import distribute, moving_average
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.step import StepObserver, filled_in, frame_statistics
+from ufmstar_torch.step import filled_in, frame_statistics
+from ufmstar_torch.step_parts import StepObserver
 
 Floats = NDArray[np.floating[Any]]
 _NAMES = tuple(field.name for field in fields(GaussianMixture))

@@ -33,7 +33,8 @@ from ufmstar_torch.output import FrameStatistics, StepOutput
 from ufmstar_torch.segment import most_kept
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.step import Kernels, StepObserver, step
+from ufmstar_torch.step import step
+from ufmstar_torch.step_parts import Kernels, StepObserver
 
 _ROOM = 4 / 3  # slots for each that is needed, below which the mixture grows ahead of need
 
