@@ -17,12 +17,12 @@ from ufmstar_torch.extension import Extension
 from ufmstar_torch.extensions import extensions_of
 from ufmstar_torch.fixed_order import apply
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults, without_segments
-from ufmstar_torch.kernels.select import LateStep, select_check, select_sample, select_step
+from ufmstar_torch.kernels.select import LateStep, select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import StepOutput
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
-from ufmstar_torch.regress import Regression, regress, sample_size
+from ufmstar_torch.regress import Regression, regress, sample_mean, sample_pixels, sample_size
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
 from ufmstar_torch.step import Step
@@ -178,10 +178,9 @@ class UfMStar(StatefulModule):
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
-        kernels = select_sample(self.config.backend, frame.depth.device.type)
-        index, used = kernels.pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
+        index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
         out, variance, _ = self._observe(frame, given, index, average=average)
-        sample = kernels.mean(variance, out.measured >= unmeasured.HALF, used, out.statistics.valid_pixels)
+        sample = sample_mean(variance, out.measured >= unmeasured.HALF, used, out.statistics.valid_pixels)
         return MeanUncertainty(sample.mean, sample.error, sample.count, sample.measured, out.statistics)
 
     def warm_up(

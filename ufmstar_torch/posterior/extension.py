@@ -34,10 +34,10 @@ class PosteriorFrame(FrameExtension):
 
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
         """Learn from the frame's anchors, and correct the depth."""
+        assert self._config.posterior is not None
         claimed = total(out.disagreement).detach()
-        learnt, posterior = self._update(
-            state.by_stream["posterior"], self._anchors.frame, self._anchors.anchors, claimed
-        )
+        frame, anchors, packed = self._anchors.frame, self._anchors.anchors, state.by_stream["posterior"]
+        learnt, posterior = self._update(packed, frame, anchors, claimed, self._config.posterior)
         floor = self._config.variance_floor
         self._posterior = replace(posterior, variance=posterior.variance.clamp_min(floor))
         statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
