@@ -253,17 +253,6 @@ def test_state_saved_and_loaded_goes_on_to_the_bit():
     assert bool(whole.posterior.any())
 
 
-def test_a_state_saved_without_a_posterior_has_learnt_nothing_for_it():
-    old, new = UfMStar(UfMStarConfig(anchors=AnchorConfig())), UfMStar(CONFIG)
-    for depth, T, anchors in ufm_frames(2, streams=2):
-        old(depth, T, K, anchors=anchors)
-    with pytest.warns(UserWarning, match="posterior"):
-        new.load_state_dict(old.state_dict())
-    assert len(new.posterior) == 2
-    assert not new.posterior.any()
-    assert torch.equal(new.evidence, old.evidence)
-
-
 def test_streams_are_independent():
     together, alone = UfMStar(CONFIG), UfMStar(CONFIG)
     for depth, T, anchors in ufm_frames(streams=2):

@@ -17,11 +17,11 @@ from torch import Tensor, nn
 from ufmstar_torch.anchors.given import Anchors, require_anchors
 from ufmstar_torch.anchors.streams import Given, StreamLandmarks
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
-from ufmstar_torch.output import FrameStatistics, MeanUncertainty
+from ufmstar_torch.output import FrameStatistics, MeanUncertainty, UfMStarOutput
 from ufmstar_torch.prediction import DepthPrediction, infer, stated_range
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.stateful import outliving
-from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
+from ufmstar_torch.ufmstar import UfMStar
 
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
 Preprocess = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]

@@ -139,12 +139,6 @@ class UfMStarState:
         own = {name: changed[name] for name in self.names() if name in changed}
         return replace(self, **own, by_component=kept["by_component"], by_stream=kept["by_stream"])
 
-    def extended(self, streams: int, slots: int) -> UfMStarState:
-        """This state with tensors of extensions that have learnt nothing, for ``slots`` components of each stream."""
-        by_component = {n: v.new_zeros(streams, slots, *v.shape[2:]) for n, v in self.by_component.items()}
-        by_stream = {n: v.new_zeros(streams, *v.shape[1:]) for n, v in self.by_stream.items()}
-        return replace(self, by_component=by_component, by_stream=by_stream)
-
     def restarted(self, again: Tensor) -> UfMStarState:
         """The state with the streams of the mask ``again`` [B] as they were before their first frame."""
         start = {"T_world_first": torch.eye(4, dtype=torch.float64, device=again.device), "smoothed": torch.nan}

@@ -19,9 +19,7 @@ from ufmstar_torch.fixed_order import apply
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults, without_segments
 from ufmstar_torch.kernels.select import LateStep, select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
-from ufmstar_torch.output import StepOutput
-from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
+from ufmstar_torch.output import MeanUncertainty, StepOutput, UfMStarOutput
 from ufmstar_torch.regress import Regression, regress, sample_mean, sample_pixels, sample_size
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
@@ -104,9 +102,8 @@ class UfMStar(StatefulModule):
                 Accepted is [1e-6 m, 1e6 m], and at most ``config.segment.max_depth``: state the network's largest depth
                 there. Pixels beyond (``statistics.beyond``) or otherwise outside (``out_of_range``) are not valid, nor
                 are those that are NaN, infinite, zero or negative.
-            pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m]. Rotations off by at most
-                ``config.rotation_tolerance`` are projected onto SO(3) and reported.
-                Coordinates of up to 1e9 m are accepted.
+            pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m], coordinates up to 1e9 m. Rotations off by at
+                most ``config.rotation_tolerance`` are projected onto SO(3) and reported.
             intrinsics: [B, 3, 3] or [3, 3] in pixels of this depth map (not of the image: ``resize_intrinsics``), first
                 pixel's centre at (0, 0); a focal length of 0.01 to 1e7 px, and the principal point on the map.
             aleatoric: like ``depth``, the network's own variance A [m^2]; pixels where it does not lie in [0, 1e12] are
@@ -121,9 +118,8 @@ class UfMStar(StatefulModule):
 
         Raises:
             TypeError: wrong kind of argument or dtype.
-            ValueError: wrong shape or device; another number of streams than before (:meth:`reset` first);
-                a pose that is not rigid or bad intrinsics (``config.on_bad_frame == "skip"``: counted instead);
-                input of an extension that is off.
+            ValueError: wrong shape or device; another number of streams than before (:meth:`reset` first); a pose that
+                is not rigid, bad intrinsics (counted with ``on_bad_frame="skip"``); input of an extension that is off.
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         out, variance, further = self._observe(frame, given)
@@ -162,17 +158,15 @@ class UfMStar(StatefulModule):
         average: bool = False,
         **given: Any,
     ) -> MeanUncertainty:
-        """Like :meth:`forward`, but regress only a seeded sample of pixels: an average per image for
-        active learning (section "Compute- and memory efficiency"); only the regression gets cheaper with fewer pixels.
-        An extension that needs whole maps does nothing here. The first views of a place have nothing to be compared
-        with: their mean is low (``MeanUncertainty.measured`` near 0), or NaN with ``config.unmeasured="nan"``.
+        """An average per image for active learning (section "Compute- and memory efficiency"): like :meth:`forward`, but
+        only a sample of pixels is regressed. First views have nothing to be compared with: their mean is low
+        (``measured`` near 0), or NaN with ``unmeasured="nan"``. Extensions that need whole maps do nothing here.
 
         Args:
             pixels: size of the sample per image; or
             fraction: the same as a share of all pixels, in (0, 1]. Neither: 1000 pixels.
             seed: of the sample, which depends on nothing else but the image's size and its valid pixels.
-            average: apply the exponential moving average at the sampled pixels, as :meth:`forward` does; else the mean
-                is that of this frame's V alone (by 13 % another one in the median on recorded video).
+            average: apply the moving average, as :meth:`forward` does; else the mean is that of this frame's V alone.
 
         Raises:
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
@@ -202,9 +196,6 @@ class UfMStar(StatefulModule):
     def query(self, points: Tensor, frame: str = "world") -> Regression:
         """The disagreement at any 3D point, from the present mixture, without touching the state.
 
-        With ``config.regression == "neighbourhood"`` the boxes are cut along the axes of the first camera, where
-        :meth:`forward` cuts them along those of the present one.
-
         Args:
             points: [B, N, 3] [m].
             frame: "world" (the poses' frame) or "first" (each stream's first camera).
@@ -223,6 +214,7 @@ class UfMStar(StatefulModule):
             raise ValueError("query needs a mixture: call the module on a frame first")
         if points.dim() != 3 or points.shape[0] != streams or points.shape[2] != 3:
             raise ValueError(f"points must be [{streams}, N, 3], got {tuple(points.shape)}")
+        # A neighbourhood's boxes are cut along the axes of the first camera here, of the present one in a frame.
         with torch.no_grad(), full_precision(points.device):
             local = points.detach()
             if frame == "world":
@@ -281,19 +273,10 @@ class UfMStar(StatefulModule):
     def _observe(
         self, frame: FrameInput, given: Mapping[str, Any], pixels: Tensor | None = None, *, average: bool = True
     ) -> tuple[StepOutput, Tensor, dict[str, Tensor]]:
-        """Process a frame: run the step and keep its state.
-
-        Args:
-            frame: checked.
-            given: what it brings for extensions, by name.
-            pixels: [B, n] indices into the flattened image; None = every pixel.
-            average: apply the moving average.
-
-        Returns:
-            The step's output; V [m^2] and maps of extensions by name, [B, H, W] or [B, n].
-        """
-        both = (frame.aleatoric, self.config.add_aleatoric), (frame.epistemic, self.config.add_epistemic)
-        own = [value for value, counts in both if value is not None and counts]
+        """Run the step, and keep its state. Returns its output, V [m^2], and maps of extensions by name, at every pixel
+        [B, H, W], or at ``pixels`` [B, n] of the flattened image. ``given``: what a frame brings for extensions."""
+        parts = (frame.aleatoric, self.config.add_aleatoric), (frame.epistemic, self.config.add_epistemic)
+        own = [value for value, counts in parts if value is not None and counts]
 
         def chosen(value: Tensor) -> Tensor:
             return value if pixels is None else torch.gather(value.flatten(1), 1, pixels)
@@ -344,14 +327,6 @@ class UfMStar(StatefulModule):
         if self._kept_step is not None and isinstance(self._kept_step[1], LateStep):
             with outliving(), torch.no_grad():
                 self._store(self._kept_step[1].settled(self._stored(), self.config).tensors())
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        """A state that was saved without one of the extensions has learnt nothing for it."""
-        weight = state_dict.get(prefix + "weight")
-        if isinstance(weight, Tensor) and weight.dim() == 2:
-            for name, value in self._empty.extended(*weight.shape).extensions.items():
-                state_dict.setdefault(prefix + name, value)
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy starts with a step of its own."""

@@ -22,6 +22,7 @@ from torch import Tensor
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import NONE, FrameExtensions
 from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.fuse import make_room
 from ufmstar_torch.kernels.triton import append as ends
 from ufmstar_torch.kernels.triton.append import append, cameras
 from ufmstar_torch.kernels.triton.correspond import candidates, match_bits
@@ -114,18 +115,11 @@ class DeviceStep:
         observer: StepObserver | None = None,
     ) -> tuple[UfMStarState, StepOutput]:
         plain = config.disagreement == "w2" and config.regression == "exact"
-        if (
-            config.anchors is not None
-            or config.overlap_weighted
-            or not plain
-            or pixels is not None
-            or observer is not None
-        ):
+        if extensions.columns or config.overlap_weighted or not plain or pixels is not None or observer is not None:
             state = self._with_room(state, config, ahead=most_kept(SegmentInput.of_frame(frame, config)))
-            fixed = replace(config, max_components=state.mixture.capacity)
             updated, out = step(
-                state, frame, fixed, pixels=pixels, smooth=smooth, extensions=extensions, observer=observer,
-                kernels=self._kernels,
+                state, frame, config, pixels=pixels, smooth=smooth, extensions=extensions, observer=observer,
+                kernels=self._kernels, grow=False,
             )  # fmt: skip
             waiting = None if _full(state.mixture.capacity, config) else Waiting.after(out.statistics.components)
         else:
@@ -194,7 +188,12 @@ def device_step(
     counts = torch.zeros(ends.COUNTS, b, dtype=torch.int64, device=frame.depth.device)
     bits, matched = match_bits(previous, new, config, counts[ends.PAIRS])
     mixture = fuse_bits(state.mixture, current, here.to_first, (bits, new.index, previous.place, new.count), config)
-    full = _full(mixture.capacity, config)
+    full, gone = _full(mixture.capacity, config), torch.zeros_like(frame.fault)
+    if full and config.max_components is not None:
+        coming = (current.valid & (current.mean[..., 2] > config.near_plane) & ~matched).sum(1)
+        position = here.to_first[1]
+        room = make_room(mixture, {}, mixture.components, coming, position, config.max_components)
+        mixture, gone = room.mixture, room.dropped
     left, needed = append(
         mixture, current, here.to_first, matched, counts, near_plane=config.near_plane, again=False, last=full
     )
@@ -206,7 +205,7 @@ def device_step(
         matched=counts[ends.MATCHED],
         pairs=counts[ends.PAIRS],
         new=counts[ends.NEW],
-        dropped=counts[ends.DROPPED],
+        dropped=counts[ends.DROPPED] + gone,
         valid_pixels=counts[ends.VALID],
         beyond=frame.beyond,
         out_of_range=frame.out_of_range,
