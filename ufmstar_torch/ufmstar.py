@@ -158,7 +158,7 @@ class UfMStar(StatefulModule):
         average: bool = False,
         **given: Any,
     ) -> MeanUncertainty:
-        """An average per image for active learning (section "Compute- and memory efficiency"): like :meth:`forward`, but
+        """An average per image for active learning (section "Compute- and memory efficiency"): :meth:`forward`, but
         only a sample of pixels is regressed. First views have nothing to be compared with: their mean is low
         (``measured`` near 0), or NaN with ``unmeasured="nan"``. Extensions that need whole maps do nothing here.
 
