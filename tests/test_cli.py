@@ -276,6 +276,13 @@ def test_other_weights_under_the_same_name_do_not_go_on(ufmstar, path, tmp_path,
     assert ufmstar(*words, "--overwrite")[0] == 0
 
 
+def test_members_must_want_the_same_input(ufmstar, path, tmp_path, brightness):
+    brightness.width = iter((32, 33)).__next__
+    code, _, err = ufmstar("run", path, "--model", "any", "--weights", *brightness.files, "--out", tmp_path / "out")
+    assert code == 2
+    assert "same input" in err
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, brightness, number):
     words = ("run", path, "--model", "any", "--weights", *brightness.files, *QUICK)

@@ -252,7 +252,7 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
     run(map_job(tour, config, lambda frame: too_far(frame, stop_at=5)), parts)
     assert run(map_job(tour, config), parts, resume=True)["posterior"] == summary["posterior"]
     posterior, plain = summary["posterior"], summary["metrics"]
-    assert posterior["metrics"]["rmse"] < 0.7 * plain["rmse"]
+    assert posterior["metrics"]["rmse"] < 0.8 * plain["rmse"]
     assert posterior["metrics"]["ece_delta"] < plain["ece_delta"]
     assert posterior["unseen"] > 0
     assert "posterior  " in run_table(summary)
