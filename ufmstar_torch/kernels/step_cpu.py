@@ -171,15 +171,25 @@ def _match(
 ) -> tuple[tuple[NDArray[Any], ...], list[_Pairs]]:
     """Step 3: of the state after the frame, camera-to-world of the first camera, started, frames and skipped; and what
     each stream matches."""
-    camera = array(frame.fault), array(frame.T_world_cam), array(frame.intrinsics)
-    before = tuple(array(value) for value in (state.T_world_first, state.started, state.frames, state.skipped))
-    after = tuple(map(np.empty_like, before))
+    fine, poses, cameras = array(frame.fault) == 0, array(frame.T_world_cam), array(frame.intrinsics)
+    first_before, started, frames, skipped = map(
+        array, (state.T_world_first, state.started, state.frames, state.skipped)
+    )
+    first = np.empty_like(first_before)
     mixture = tuple(array(value) for value in (state.mean, state.covariance, state.weight))
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
     least = min(EPSILON[frame.depth.dtype], EPSILON[state.covariance.dtype] if config.anchors is not None else 1.0)
     reach = config.prior_weight, least if config.regression == "exact" else 0.0
-    given = (camera, before, after, mixture, segments[:3], frame.size, thresholds, reach)
-    return after, [_Pairs(*found) for found in each(match, [(b, *given) for b in range(len(frame.depth))])]
+    calls = [
+        (
+            (bool(fine[b]), poses[b], cameras[b]), bool(started[b]), first_before[b], first[b],
+            tuple(value[b] for value in mixture), tuple(value[b] for value in segments[:3]),
+            frame.size, thresholds, reach,
+        )
+        for b in range(len(fine))
+    ]  # fmt: skip
+    after = first, started | fine, frames + fine, skipped + ~fine
+    return after, [_Pairs(*found) for found in each(match, calls)]
 
 
 def _join(
@@ -194,12 +204,13 @@ def _join(
     slots = tuple(array(getattr(state, name)) for name in _NAMES)
     needed = max(pair.occupied + pair.created for pair in pairs)
     capacity = _capacity(slots[0].shape[1], needed, config.max_components)
-    updated = tuple(np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype) for value in slots)
+    updated = tuple(_extended(value, capacity) for value in slots)
     settings = config.overlap_weighted, float(np.finfo(slots[1].dtype).eps)
-    fused = array(frame.T_world_cam), first, slots, updated, (*segments[:3], segments[5])
+    poses, given = array(frame.T_world_cam), (*segments[:3], segments[5])
     calls = [
         (
-            b, *fused, pair[:3], _distance(b, pair, segments, config), pair.new, pair.occupied, pair.near, pair.here,
+            poses[b], first[b], tuple(value[b] for value in updated), tuple(value[b] for value in given), pair[:3],
+            _distance(b, pair, segments, config), pair.new, pair.occupied, pair.near, pair.here,
             settings, 3 if config.anchors is not None else 1,
         )
         for b, pair in enumerate(pairs)
@@ -208,6 +219,14 @@ def _join(
     mixture = dict(zip(_NAMES, map(torch.from_numpy, updated), strict=True))
     seen = [Seen(pair.here, *one[1:]) for pair, one in zip(pairs, joined, strict=True)]
     return _Joined(mixture, [one[0] for one in joined], seen)
+
+
+def _extended(value: NDArray[Any], capacity: int) -> NDArray[Any]:
+    """A copy of slots [B, K, ...] with empty ones behind them up to the capacity."""
+    out = np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype)
+    present = value.shape[1]
+    out[:, :present], out[:, present:] = value, 0
+    return out
 
 
 def _learn(
