@@ -7,20 +7,19 @@ import math
 
 import numpy as np
 
-SIDE, HATS, GLOBALS = 28, 3, 4
+SIDE, FEATURES = 28, 4
 START = {
-    "amplitude": (1.0, 20.0, 0.1, 100.0),
-    "roughness": (0.0025, 60.0, 1e-4, 0.04),
-    "noise": (1.0, 60.0, 0.25, 16.0),
-    "unseen": (0.05, 30.0, 0.0, 16.0),
+    "roughness": (0.0025, 40.0, 1e-4, 0.04),
+    "noise": (1.0, 40.0, 0.25, 16.0),
+    "unseen": (0.1, 40.0, 0.0, 16.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
-PRIOR, DRIFT = np.array([0.5, 0.45, 0.2, 0.2]) ** 2, np.array([0.06, 0.06, 0.04, 0.03]) ** 2
-MEMORY = 0.5 ** (1 / 20)
+PRIOR, DRIFT, MEMORY = 0.5**2, 0.05**2, 0.5 ** (1 / 20)
+REACH, RADIUS, WEAK, CLIP = 1.0, 5 / 28, 0.25**2, 9.0
 
 
 def start():
-    return {"frames": 0, "m0": 0.0, "b": np.zeros(4), "C": np.diag(PRIOR),
+    return {"frames": 0, "m0": 0.0, "b": np.zeros(4), "C": PRIOR * np.eye(4),
             "sums": {k: [v * n, n] for k, (v, n, _, _) in START.items()}}  # fmt: skip
 
 
@@ -54,17 +53,12 @@ def links(logs):
                 if r + dr < rows and c + dc < cols:
                     d = abs(logs[r + dr, c + dc] - logs[r, c])
                     i = r * cols + c
-                    yield i, i + dr * cols + dc, 0.004 + 2 * d * d, 1 / n + 2 * max(d - 0.03, 0)
+                    yield i, i + dr * cols + dc, 0.004 + 2 * d * d, 1 / n + d
 
 
 def features(logs, u, v):
     """logs less m_0; u and v from 0 to 1."""
-    return np.array([1, logs, 2 * u - 1, 2 * v - 1, *(hat(u, i) * hat(v, j) for j in range(HATS) for i in range(HATS))])
-
-
-def hat(x, i):
-    """The i-th coarse bilinear function at x in [0, 1]: 1 at its node, 0 from the next ones on."""
-    return max(1 - abs(x * (HATS - 1) - i), 0.0)
+    return np.array([1, logs, 2 * u - 1, 2 * v - 1])
 
 
 def node_features(logs):
@@ -75,20 +69,18 @@ def node_features(logs):
 
 
 def joint_prior(logs, state):
-    """Mean and precision of (b, hats, f)."""
-    n, m0, amplitude = logs.size, logs.mean(), ratio(state, "amplitude")
+    """Mean and precision of (b, f)."""
+    n, m0, q = logs.size, logs.mean(), FEATURES
     T = np.eye(4)
     T[0, 1] = m0 - state["m0"] if state["frames"] else 0.0
     C = T @ state["C"] @ T.T
     if state["frames"]:
         C = C + np.diag(DRIFT * np.clip(1 - np.diag(C) / PRIOR, 0, 1))
-    q = GLOBALS + HATS * HATS
     Q = np.zeros((q + n, q + n))
     Q[:4, :4] = np.linalg.inv(C)
-    Q[4:q, 4:q] = np.eye(q - 4) / (0.01 * amplitude)
-    Q[q:, q:] = np.eye(n) * 0.5 / amplitude
+    Q[q:, q:] = np.eye(n) * 0.5
     for i, j, variance, _ in links(logs):
-        w = 1 / (variance * amplitude)
+        w = 1 / variance
         for a, b, s in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
             Q[q + a, q + b] += s * w
     mean = np.zeros(q + n)
@@ -109,19 +101,14 @@ def design(x, node, n):
     return H
 
 
-def pull(t):
-    t = min(max(t, -0.7), 2.0)
-    return 1 - 1.5 * t if abs(t) < 1e-3 else (1 - math.exp(-t)) * math.exp(-t) / t
-
-
 def distances(logs, source):
-    """Dijkstra, up to 2."""
+    """Dijkstra, up to ``REACH``."""
     n = logs.size
     near = [[] for _ in range(n)]
     for i, j, _, length in links(logs):
         near[i].append((j, length))
         near[j].append((i, length))
-    way, heap = np.full(n, 2.0), [(0.0, i) for i in source]
+    way, heap = np.full(n, REACH), [(0.0, i) for i in source]
     for i in source:
         way[i] = 0.0
     while heap:
@@ -154,32 +141,29 @@ def update(state, depth, claimed, pixel, g, variance):
         around = depth[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]
         around = np.log(around[around > 0])
         blur[k] = (around.max() - around.min()) / 2
-    other = roughness + blur**2
+    noise = stated + roughness + blur**2
     x = np.array([features(math.log(d[k]) - m0, u[k], v[k]) for k in range(N)])
     H = design(x, node, n)
-    weight = 1 / (stated + other)
-    for round_ in range(3):
+    weight = 1 / noise
+    for round_ in range(2):
         mean, C = condition(mean0, Q, H, y, weight)
         fit, var = H @ mean, np.einsum("ij,jk,ik->i", H, C, H)
         left = np.maximum(1 - weight * var, 0.05)
         residual, var = (y - fit) / left, var / left
-        noise = other + stated / np.array([pull(-r) for r in residual])
         total = var + noise
-        if round_ < 2:
+        if round_ < 1:
             weight = 5 / (4 + residual**2 / total) / noise
-    away = distances(logs, set(node[weight * 0.09 >= 1]))
+    away = distances(logs, set(node[weight * WEAK >= 1]))
     count = np.bincount(node, minlength=n)[node]
-    square = np.minimum(residual**2, 9 * total) / 0.995
+    square = np.minimum(residual**2, CLIP * total)
     new = {}
     for name, part in (("roughness", np.full(N, roughness)), ("noise", stated)):
         weights = (part / total) ** 2 / count
         unit = ratio(state, name) / np.maximum(part, 1e-12)
         new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
-    counted = 0.45 * np.nan_to_num(claimed)
-    new |= discs(
-        state, logs, Q, mean0, H, y, weight, noise, node, u, v, np.array([counted[r, c] for c, r in at]) / d**2
-    )
-    q = GLOBALS + HATS * HATS
+    counted = np.nan_to_num(claimed)
+    at_anchors = np.array([counted[r, c] for c, r in at]) / d**2
+    new |= discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, at_anchors)
     after = {"frames": state["frames"] + 1, "m0": m0, "b": mean[:4], "C": C[:4, :4], "sums": {}}
     for name, (value, prior, low, high) in START.items():
         above, below = state["sums"][name]
@@ -188,34 +172,16 @@ def update(state, depth, claimed, pixel, g, variance):
         after["sums"][name] = [min(max(above, low * below), high * below), below]
     HX = design(X, np.arange(n), n)
     spread = np.einsum("ij,jk,ik->i", HX, C, HX) + roughness
-    spread = (
-        0.5 * local(logs.shape, node, residual**2 / total, noise) * spread
-        + 0.0009
-        + away * (0.02 + ratio(state, "unseen"))
-    )
-    offset, share = HX[:, 4:] @ mean[4:], np.minimum(away / 0.6, 1)
+    spread = spread + away * ratio(state, "unseen")
+    offset, share = HX[:, 4:] @ mean[4:], away / REACH
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
     spread += [tail(*each) for each in zip(share, offset, around, strict=True)]
-    return after, *read(depth, counted, logs, mean[:q], offset, spread, share)
-
-
-def local(shape, node, z2, noise):
-    """Mean z^2 of the anchors in 5 x 5 cells, each cell and certain anchor counted alike, and of two of z^2 = 1."""
-    out, count = np.empty(shape), np.bincount(node, minlength=shape[0] * shape[1])
-    for r in range(shape[0]):
-        for c in range(shape[1]):
-            above = below = 2.0
-            for k, i in enumerate(node):
-                if abs(i // shape[1] - r) <= 2 and abs(i % shape[1] - c) <= 2:
-                    weight = 1 / (1 + noise[k] / 0.04) / count[i]
-                    above, below = above + weight * min(z2[k], 9), below + weight
-            out[r, c] = above / below
-    return out.ravel()
+    return after, *read(depth, counted, logs, mean[:4], offset, spread, share)
 
 
 def y_variance(shape, node, y, noise, used, centre):
-    """Of the used anchors around every node, each cell and certain anchor counted alike, weighted by a Gaussian of .12
-    of the image, and of one of variance .25 about ``centre``."""
+    """Of the used anchors around every node, each cell and certain anchor counted alike, weighted by a Gaussian of
+    ``RADIUS`` of the image, and of one of variance .25 about ``centre``."""
     out, count = np.empty(shape), np.bincount(node, minlength=shape[0] * shape[1])
     for r in range(shape[0]):
         for c in range(shape[1]):
@@ -223,7 +189,7 @@ def y_variance(shape, node, y, noise, used, centre):
             for k, i in enumerate(node):
                 if used[k]:
                     far = ((i // shape[1] - r) / shape[0]) ** 2 + ((i % shape[1] - c) / shape[1]) ** 2
-                    weights.append(math.exp(-far / 0.12**2 / 2) / (1 + noise[k] / 0.04) / count[i])
+                    weights.append(math.exp(-far / RADIUS**2 / 2) / (1 + noise[k] / WEAK) / count[i])
                     values.append(y[k])
             middle = np.average(values, weights=weights)
             out[r, c] = (np.average((np.array(values) - middle) ** 2, weights=weights)) + 0.25 / sum(weights)
@@ -231,9 +197,9 @@ def y_variance(shape, node, y, noise, used, centre):
 
 
 def tail(share, offset, around):
-    """(.03 + .08 share) E[(e^(n - offset) - 1)^2], n normal; e^-offset at most 4."""
-    a, q = 0.04 + 1.6 * around, min(math.exp(-offset), 4)
-    return (0.03 + 0.08 * share) * (q * q * math.exp(2 * a) - 2 * q * math.exp(a / 2) + 1)
+    """.03 (1 + 2 share) E[(e^(n - offset) - 1)^2], n normal; e^-offset at most 100."""
+    a, q = 2 * around, min(math.exp(-offset), 100)
+    return 0.03 * (1 + 2 * share) * (q * q * math.exp(2 * a) - 2 * q * math.exp(a / 2) + 1)
 
 
 def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
@@ -241,7 +207,7 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
     for k in range(3):
         number = state["frames"] * 3 + k + 1
         cu, cv = (number * 0.7548776662466927) % 1, (number * 0.5698402909980532) % 1
-        held |= (u - cu) ** 2 + (v - cv) ** 2 < (5 / 28) ** 2
+        held |= (u - cu) ** 2 + (v - cv) ** 2 < RADIUS**2
     rest = ~held
     if rest.sum() < 5:
         held[:] = False
@@ -249,16 +215,14 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
     fit, var = H @ mean, np.einsum("ij,jk,ik->i", H, C, H)
     away = distances(logs, set(node[rest]))[node]
     total, error = var + noise, (y - fit) ** 2
-    square = np.minimum(error, 9 * total) / 0.995
-    believed = np.where(held, 1 / (1 + noise / 0.04), 0.0)
+    believed = np.where(held, 1 / (1 + noise / WEAK), 0.0)
     area = believed / np.maximum(np.bincount(node, believed, minlength=logs.size)[node], 1e-12)
-    share, around = np.minimum(away / 0.6, 1), y_variance(logs.shape, node, y, noise, rest, mean[0])[node]
-    offset = H[:, GLOBALS:] @ mean[GLOBALS:]
-    final = 0.5 * var + noise + 0.0009 + away * (0.02 + ratio(state, "unseen")) + share * claimed
+    share, around = away / REACH, y_variance(logs.shape, node, y, noise, rest, mean[0])[node]
+    offset = H[:, FEATURES:] @ mean[FEATURES:]
+    final = total + away * ratio(state, "unseen") + share * claimed
     final += [tail(*each) for each in zip(share, offset, around, strict=True)]
     return {
-        "amplitude": ((area * (square - noise) / total).sum(), (area * var / total).sum() / ratio(state, "amplitude")),
-        "unseen": ((area * (np.minimum(error, 4) - total)).sum(), (area * away).sum()),
+        "unseen": ((area * (error - total)).sum(), (area * away).sum()),
         "calibration": ((area * error / final).sum(), area.sum()),
     }
 

@@ -190,7 +190,8 @@ class Gaussians(Estimator):
             features = torch.stack([a, torch.ones_like(a)], dim=1)
         used = DepthPrediction(depth, a, e)
         out = self.model.update(used, T_world_cam, predicted.intrinsics, features=features, anchors=anchors)
-        self._anchors = int(out.statistics.anchors_used[0])
+        anchors_used = out.statistics.anchors_used
+        self._anchors = 0 if anchors_used is None else int(anchors_used[0])
         answer = {name: getattr(out, name) for name in _OF_OUTPUT}
         if self._corrected or self._posterior:
             answer["depth"], answer["variance"] = out.posterior() if self._posterior else out.corrected()
@@ -221,7 +222,9 @@ class Gaussians(Estimator):
             "smoothing_bytes": self.ufm.smoothed.nbytes,
         }
         if self.ufm.config.anchors is not None:
-            kept["bytes"] += (count + 1) * self.ufm.overall_evidence.nbytes + self.ufm.posterior.nbytes
+            state = self.ufm.state
+            sums = sum(value[:, :1].nbytes for value in state.by_component.values())
+            kept["bytes"] += count * sums + sum(value.nbytes for value in state.by_stream.values())
             kept["anchors"] = self._anchors
         return kept
 

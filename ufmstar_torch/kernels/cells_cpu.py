@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.kernels.compile_cpu import kept
 from ufmstar_torch.kernels.field_cpu import Floats, fast
-from ufmstar_torch.posterior.model import Model
 
 # What is claimed may be NaN.
 with_nan = kept(fastmath={"contract", "reassoc", "nsz", "arcp"})
@@ -40,22 +39,9 @@ def _add_up(logs, valid, total, count):
                 count[row, c] += used
 
 
-def features(logs: Floats, u: Floats, v: Floats, hats: int) -> Floats:
-    """[N, F] of log d - m_0 [N] at u and v [N] from 0 to 1, as in ``ufmstar_torch.posterior.grid``."""
-    out = np.empty((len(logs), 4 + hats * hats))
-    _fill(logs, u, v, hats, out)
-    return out
-
-
-@fast
-def _fill(logs, u, v, hats, out):
-    for k in range(len(out)):
-        row = out[k]
-        row[0], row[1], row[2], row[3] = 1.0, logs[k], 2 * u[k] - 1, 2 * v[k] - 1
-        for i in range(hats):
-            across = max(1 - abs(u[k] * (hats - 1) - i), 0.0)
-            for j in range(hats):
-                row[4 + j * hats + i] = across * max(1 - abs(v[k] * (hats - 1) - j), 0.0)
+def features(logs: Floats, u: Floats, v: Floats) -> Floats:
+    """[N, 4] of log d - m_0 [N] at u and v [N] from 0 to 1, as in ``ufmstar_torch.posterior.grid``."""
+    return np.stack([np.ones_like(logs), logs, 2 * u - 1, 2 * v - 1], 1)
 
 
 def ranges(depth: NDArray[Any], valid: NDArray[np.bool_], index: NDArray[np.int64]) -> Floats:
@@ -80,9 +66,9 @@ def _highest_over_lowest(depth, valid, index, out):
 
 def read(
     depth: NDArray[Any], valid: NDArray[np.bool_], logs: NDArray[Any], claimed: NDArray[Any], nodes: Floats,
-    coefficients: Floats, mean: float, size: tuple[int, int], model: Model,
+    coefficients: Floats, mean: float, size: tuple[int, int], limits: tuple[float, float],
 ) -> tuple[NDArray[Any], NDArray[Any]]:  # fmt: skip
-    """As :func:`ufmstar_torch.posterior.read.read`, with log d and all that UfM* claims."""
+    """As :func:`ufmstar_torch.posterior.read.read`, with log d; ``limits`` are its contrast and its largest y."""
     rows, cols = size
     width = depth.shape[1]
     u = (np.arange(width) + 0.5) / width
@@ -93,8 +79,8 @@ def read(
     y, spread = np.empty_like(logs), np.empty_like(logs)
     base = coefficients[0] - coefficients[1] * mean + coefficients[2] * (2 * u - 1)
     slopes = coefficients[1], coefficients[3]
-    limits = model.alike**2, model.claimed, model.largest
-    _pixels(depth, valid, logs, claimed, left, right, between - before, base, slopes, limits, y, spread)
+    squared = limits[0] ** 2, limits[1]
+    _pixels(depth, valid, logs, claimed, left, right, between - before, base, slopes, squared, y, spread)
     factor = np.exp(y, out=y)
     return depth * factor, spread * factor * factor
 
@@ -107,7 +93,7 @@ def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limi
     counts. The four weights s/(1 + D^2) have the quotients of s times the other three denominators.
     """
     height, rows = len(logs), len(left)
-    alike, claim, largest = limits
+    alike, largest = limits
     by_depth, by_row = slopes
     for i in range(height):
         v = (i + 0.5) / height
@@ -128,4 +114,4 @@ def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limi
             unseen = w0 * n0[3, j] + w1 * n1[3, j] + w2 * n2[3, j] + w3 * n3[3, j]
             value = base[j] + by_depth * g + by_row * (2 * v - 1) + offset * share
             ys[j] = min(max(value, -largest), largest) if used[j] else np.nan
-            out[j] = (own * d * d + unseen * (claim * V if V == V else 0.0)) * share
+            out[j] = (own * d * d + unseen * (V if V == V else 0.0)) * share

@@ -17,7 +17,7 @@ from ufmstar_torch.kernels.compile_cpu import kept, kernel, part
 
 WINDOW = 32
 # Right-hand sides: the features and y, and zeros to a multiple of four.
-RIGHT = 16
+RIGHT = 8
 _WIDTH = WINDOW + RIGHT
 
 # Kernels (``compile_cpu``) in which sums have any order, and neither infinity nor NaN occurs.
@@ -161,7 +161,7 @@ def solve(diagonal: Floats, right: Floats, down: Floats, columns: Floats, cols: 
 
 @fast
 def _eliminate(diagonal, right, down, columns, cols, window, factor):
-    """Row j of the factor [n, 48] has the entries of the window's nodes at their places, then the right-hand sides."""
+    """Row j of the factor [n, 40] has the entries of the window's nodes at their places, then the right-hand sides."""
     n = len(diagonal)
     for j in range(-cols, n):
         if j + cols < n:

@@ -18,25 +18,24 @@ from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.cells_cpu import cell_means, features, ranges, read
 from ufmstar_torch.kernels.field_cpu import Field, Floats, Observed, Prior, at, distance, given
 from ufmstar_torch.kernels.threads_cpu import each
-from ufmstar_torch.posterior.model import FEATURES, GLOBALS, MODEL
-from ufmstar_torch.posterior.running import RATIOS
-from ufmstar_torch.posterior.update import Posterior
-
-_VALUE, _WEIGHT, _LEAST, _LARGEST = np.array(list(RATIOS.values())).T
-_NAMES = {name: i for i, name in enumerate(RATIOS)}
+from ufmstar_torch.posterior.config import PosteriorConfig
+from ufmstar_torch.posterior.grid import SIDE
+from ufmstar_torch.posterior.read import LARGEST
+from ufmstar_torch.posterior.running import FEATURES, RATIOS, ratios
+from ufmstar_torch.posterior.update import LEAST_LEFT, LEAST_REST, STEPS, Posterior
 
 
 def update(
-    packed: Tensor, frame: FrameInput, anchors: AnchorInput | None, claimed: Tensor
-) -> tuple[Tensor, Posterior]:  # fmt: skip
+    packed: Tensor, frame: FrameInput, anchors: AnchorInput | None, claimed: Tensor, config: PosteriorConfig
+) -> tuple[Tensor, Posterior]:
     """As :func:`ufmstar_torch.posterior.update.update`, for CPU tensors."""
     maps = [x.detach().contiguous().numpy() for x in (packed.double(), frame.depth, frame.valid, claimed)]
     streams = zip(*maps, _anchors(anchors, len(packed)), strict=True)
-    results = each(_of_stream, list(streams))
+    results = each(functools.partial(_of_stream, config), list(streams))
     kept, depth, variance = (np.stack([result[i] for result in results]) for i in range(3))
-    sums = [_Running.of(row) for row in kept]
-    calibration = [r.ratios["calibration"] if r.below[_NAMES["calibration"]] > 0 else np.nan for r in sums]
-    unseen = [r.growth for r in sums]
+    sums = [_Running.of(row, config) for row in kept]
+    calibration = [r.ratios["calibration"] if r.below[-1] > 0 else np.nan for r in sums]
+    unseen = [r.ratios["unseen"] for r in sums]
     outputs = [torch.from_numpy(x) for x in (depth, variance, np.array(calibration), np.array(unseen))]
     return torch.from_numpy(kept).to(packed.dtype), Posterior(*outputs)
 
@@ -65,6 +64,7 @@ def _anchors(anchors: AnchorInput | None, streams: int) -> list[_Anchors | None]
 class _Running(NamedTuple):
     """One stream's :class:`ufmstar_torch.posterior.running.Running`."""
 
+    config: PosteriorConfig
     frames: float
     mean: float
     above: Floats
@@ -74,31 +74,30 @@ class _Running(NamedTuple):
     ratios: dict[str, float]
 
     @classmethod
-    def of(cls, packed: Floats) -> _Running:
-        n = len(RATIOS)
-        above, below = packed[2 : 2 + n], packed[2 + n : 2 + 2 * n]
-        b, covariance = packed[2 + 2 * n :][:GLOBALS], packed[2 + 2 * n + GLOBALS :].reshape(GLOBALS, GLOBALS)
+    def of(cls, packed: Floats, config: PosteriorConfig) -> _Running:
+        above, below, b, covariance = np.split(packed[2:], np.cumsum([RATIOS, RATIOS, FEATURES]))
+        covariance, priors = covariance.reshape(FEATURES, FEATURES), ratios(config)
+        value, weight, least, largest = np.array(list(priors.values())).T
         if packed[0] == 0:
-            above, below, covariance = _VALUE * _WEIGHT, _WEIGHT, np.diag(MODEL.prior) ** 2
-        ratios = np.where(below > 0, above / np.maximum(below, 1e-12), _VALUE).clip(_LEAST, _LARGEST)
-        return cls(packed[0], packed[1], above, below, b, covariance, dict(zip(RATIOS, ratios.tolist(), strict=True)))
-
-    @property
-    def growth(self) -> float:
-        return MODEL.growth + self.ratios["unseen"]
+            above, below, covariance = value * weight, weight, config.prior_sigma**2 * np.eye(FEATURES)
+        known = np.where(below > 0, above / np.maximum(below, 1e-12), value).clip(least, largest)
+        by_name = dict(zip(priors, known.tolist(), strict=True))
+        return cls(config, packed[0], packed[1], above, below, b, covariance, by_name)
 
     def added(self, sums: dict[str, tuple[float, float]]) -> tuple[Floats, Floats]:
-        above, below = np.array([sums[name] for name in RATIOS]).T
-        n = MODEL.memory * self.below + (1 - MODEL.memory) * _WEIGHT + below
-        total = MODEL.memory * self.above + (1 - MODEL.memory) * _WEIGHT * _VALUE + above
-        return np.minimum(np.maximum(total, _LEAST * n), _LARGEST * n), n
+        value, weight, least, largest = np.array(list(ratios(self.config).values())).T
+        memory, (above, below) = 0.5 ** (1 / self.config.half_life), np.array([sums[name] for name in self.ratios]).T
+        n = memory * self.below + (1 - memory) * weight + below
+        total = memory * self.above + (1 - memory) * weight * value + above
+        return np.minimum(np.maximum(total, least * n), largest * n), n
 
     def expected(self, mean: float) -> tuple[Floats, Floats]:
-        T = np.eye(GLOBALS)
+        T = np.eye(FEATURES)
         T[0, 1] = mean - self.mean if self.frames else 0.0
-        walked, prior = T @ self.covariance @ T.T, np.square(MODEL.prior)
+        walked = T @ self.covariance @ T.T
         if self.frames:
-            walked = walked + np.diag(np.square(MODEL.drift) * (1 - walked.diagonal() / prior).clip(0, 1))
+            left = (1 - walked.diagonal() / self.config.prior_sigma**2).clip(0, 1)
+            walked = walked + np.diag(self.config.drift**2 * left)
         return T @ self.coefficients, walked
 
 
@@ -115,69 +114,69 @@ class _Grid(NamedTuple):
     far_down: Floats
 
     @classmethod
-    def of(cls, log_depth: Floats, rows: int, cols: int) -> _Grid:
+    def of(cls, log_depth: Floats, rows: int, cols: int, config: PosteriorConfig) -> _Grid:
         across, along = np.full((2, rows, cols), np.inf)
         across[:, :-1] = np.abs(np.diff(log_depth.reshape(rows, cols), axis=1))
         along[:-1] = np.abs(np.diff(log_depth.reshape(rows, cols), axis=0))
         edges = across.ravel(), along.ravel()
-        right, down = (MODEL.flat + MODEL.edge * x**2 for x in edges)
-        climbs = (MODEL.climb * np.maximum(x - MODEL.smooth, 0) for x in edges)
-        far = (1 / n + climb for n, climb in zip((cols, rows), climbs, strict=True))
+        right, down = (config.link_variance + config.edge_variance * x**2 for x in edges)
+        far = (1 / n + edge for n, edge in zip((cols, rows), edges, strict=True))
         return cls(rows, cols, log_depth, float(log_depth.mean()), right, down, *far)
 
 
 class _Scene(NamedTuple):
     """The reference's ``_Scene`` of one stream, without padding."""
 
+    config: PosteriorConfig
     grid: _Grid
     prior: Prior
     observed: Observed
     stated: Floats
-    other: Floats
+    noise: Floats
 
     def counted(self, values: Floats) -> Floats:
         node = self.observed.node
         summed: Floats = np.bincount(node, values, len(self.grid.log_depth)).astype(np.float64)
         return summed[node]
 
-    def believed(self, near: _Near) -> Floats:
-        return 1 / (1 + near.noise / MODEL.weak**2)
+    def believed(self) -> Floats:
+        return 1 / (1 + self.noise / self.config.weak_sigma**2)
 
 
-class _Near(NamedTuple):
-    """The reference's ``_Near`` of one stream."""
+class _LeftOut(NamedTuple):
+    """The reference's ``_LeftOut`` of one stream."""
 
-    noise: Floats
-    left_out: Floats
+    residual: Floats
     total: Floats
 
 
 def _of_stream(
-    packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any], given_: _Anchors | None
-) -> tuple[Floats, NDArray[Any], NDArray[Any]]:
+    config: PosteriorConfig, packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any],
+    given_: _Anchors | None,
+) -> tuple[Floats, NDArray[Any], NDArray[Any]]:  # fmt: skip
     """What is known after the frame; depth and variance."""
-    running, anchors = _Running.of(packed), _NONE if given_ is None else given_
+    running, anchors = _Running.of(packed, config), _NONE if given_ is None else given_
     some = len(anchors.depth) > 0
     if given_ is None and not running.frames:
         return packed, np.where(valid, depth, np.nan).astype(depth.dtype), claimed
     with np.errstate(all="ignore"):  # what is not valid is not read
         logs = np.log(depth)
-    rows, cols = (min(MODEL.side, n) for n in depth.shape)
-    grid = _Grid.of(cell_means(logs, valid, rows, cols), rows, cols)
+    rows, cols = (min(SIDE, n) for n in depth.shape)
+    grid = _Grid.of(cell_means(logs, valid, rows, cols), rows, cols, config)
     scene = _scene(grid, depth, valid, anchors, running)
-    field, weight, near = _fitted(scene)
-    away = _away(scene, weight * MODEL.evidence**2 >= 1)
-    kept = _learnt(scene, field, weight, near, _relative(claimed, anchors), running) if some else packed
+    field, left_out, weight = _fitted(scene)
+    away = _away(scene, weight * config.weak_sigma**2 >= 1)
+    kept = _learnt(scene, field, weight, left_out, _relative(claimed, anchors), running) if some else packed
     node = np.arange(rows * cols)
-    x = features(grid.log_depth - grid.mean, (node % cols + 0.5) / cols, (node // cols + 0.5) / rows, MODEL.hats)
+    x = features(grid.log_depth - grid.mean, (node % cols + 0.5) / cols, (node // cols + 0.5) / rows)
     mean, variance = at(field, node, x)
-    b = field.coefficients[:GLOBALS]
-    variance = MODEL.inflation * _local(scene, near) * (variance + running.ratios["roughness"])
-    share, offset = np.minimum(away / MODEL.far, 1), mean - (x[:, :GLOBALS] * b).sum(1)
-    variance = variance + MODEL.common + away * running.growth
-    variance = variance + _tail(share, offset, _spread(scene, near, np.ones(len(near.noise), np.bool_), b[0]))
+    b = field.coefficients
+    share, offset = away / config.reach, mean - (x * b).sum(1)
+    variance = variance + running.ratios["roughness"] + away * running.ratios["unseen"]
+    variance = variance + _tail(scene, share, offset, _spread(scene, np.ones(len(scene.noise), np.bool_), b[0]))
     nodes = np.stack([grid.log_depth, offset, variance, share], 1)
-    return kept, *read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), MODEL)
+    limits = config.edge_contrast, LARGEST
+    return kept, *read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), limits)
 
 
 def _scene(
@@ -185,68 +184,41 @@ def _scene(
 ) -> _Scene:  # fmt: skip
     (u, v), log_depth = ((anchors.pixel + 0.5) / depth.shape[::-1]).T.copy(), np.log(anchors.predicted)
     column, row = ((x * n).astype(np.int64).clip(0, n - 1) for x, n in ((u, grid.cols), (v, grid.rows)))
-    x = features(log_depth - grid.mean, u, v, MODEL.hats)
+    x = features(log_depth - grid.mean, u, v)
     observed = Observed(row * grid.cols + column, x, np.log(anchors.depth) - log_depth)
     stated = running.ratios["noise"] * anchors.variance / anchors.depth**2
-    other = running.ratios["roughness"] + (ranges(depth, valid, anchors.at_pixel) / 2) ** 2
-    return _Scene(grid, _prior(grid, running), observed, stated, other)
+    noise = stated + running.ratios["roughness"] + (ranges(depth, valid, anchors.at_pixel) / 2) ** 2
+    return _Scene(running.config, grid, _prior(grid, running), observed, stated, noise)
 
 
 def _prior(grid: _Grid, running: _Running) -> Prior:
-    amplitude = running.ratios["amplitude"]
-    mean, (coefficients, covariance) = np.zeros(FEATURES), running.expected(grid.mean)
-    mean[:GLOBALS] = coefficients
-    P = np.diag(np.full(FEATURES, 1 / (MODEL.hat * amplitude)))
-    P[:GLOBALS, :GLOBALS] = np.linalg.inv(covariance)
-    diagonal = np.full(len(grid.log_depth), MODEL.kappa / amplitude)
-    right, down = 1 / (grid.right * amplitude), 1 / (grid.down * amplitude)
-    return Prior(diagonal, right, down, mean, P, grid.cols)
+    mean, covariance = running.expected(grid.mean)
+    diagonal = np.full(len(grid.log_depth), running.config.precision)
+    return Prior(diagonal, 1 / grid.right, 1 / grid.down, mean, np.linalg.inv(covariance), grid.cols)
 
 
-def _fitted(scene: _Scene) -> tuple[Field, Floats, _Near]:
-    weight = 1 / (scene.stated + scene.other)
-    for round_ in range(MODEL.rounds + 1):
-        field = given(scene.prior, scene.observed, weight)
-        mean, variance = at(field, scene.observed.node, scene.observed.features)
-        left = np.maximum(1 - weight * variance, MODEL.least_left)
-        residual, variance = (scene.observed.value - mean) / left, variance / left
-        noise = scene.other + scene.stated / _pull(-residual)
-        near = _Near(noise, residual, variance + noise)
-        if round_ < MODEL.rounds:
-            weight = (MODEL.student + 1) / (MODEL.student + residual**2 / near.total) / noise
-    return field, weight, near
+def _fitted(scene: _Scene) -> tuple[Field, _LeftOut, Floats]:
+    nu = scene.config.degrees_of_freedom
+    _, left_out = _with_weights(scene, 1 / scene.noise)
+    weight = (nu + 1) / (nu + left_out.residual**2 / left_out.total) / scene.noise
+    return *_with_weights(scene, weight), weight
 
 
-def _pull(t: Floats) -> Floats:
-    t = t.clip(MODEL.nearer, MODEL.farther)
-    small = np.abs(t) < 1e-3
-    safe = np.where(small, 1.0, t)
-    return np.where(small, 1 - 1.5 * t, -np.expm1(-safe) * np.exp(-safe) / safe)
+def _with_weights(scene: _Scene, weight: Floats) -> tuple[Field, _LeftOut]:
+    field = given(scene.prior, scene.observed, weight)
+    mean, variance = at(field, scene.observed.node, scene.observed.features)
+    left = np.maximum(1 - weight * variance, LEAST_LEFT)
+    return field, _LeftOut((scene.observed.value - mean) / left, variance / left + scene.noise)
 
 
-def _local(scene: _Scene, near: _Near) -> Floats:
-    each = scene.believed(near) / scene.counted(np.ones(len(near.noise)))
-    z2 = np.minimum(near.left_out**2 / near.total, MODEL.clip)
-    grid, reach = scene.grid, MODEL.near
-    padded = np.zeros((2, grid.rows + 2 * reach, grid.cols + 2 * reach))
-    for sums, values in zip(padded, (each * z2, each), strict=True):
-        nodes = np.bincount(scene.observed.node, values, grid.rows * grid.cols)
-        sums[reach:-reach, reach:-reach] = nodes.reshape(grid.rows, grid.cols)
-    columns = np.sum([padded[:, i : i + grid.rows] for i in range(2 * reach + 1)], 0)
-    around = np.sum([columns[:, :, i : i + grid.cols] for i in range(2 * reach + 1)], 0)
-    z2, weight = around.reshape(2, -1) + MODEL.alone
-    return z2 / weight
-
-
-def _spread(scene: _Scene, near: _Near, used: NDArray[np.bool_], mean: float) -> Floats:
-    each = np.where(used, scene.believed(near) / scene.counted(np.ones(len(near.noise))), 0.0)
-    grid, y = scene.grid, scene.observed.value
+def _spread(scene: _Scene, used: NDArray[np.bool_], mean: float) -> Floats:
+    each = np.where(used, scene.believed() / scene.counted(np.ones(len(scene.noise))), 0.0)
+    grid, y, width = scene.grid, scene.observed.value, scene.config.radius
     sums = [np.bincount(scene.observed.node, x, grid.rows * grid.cols) for x in (each, each * y, each * y**2)]
     nodes = np.stack(sums).reshape(3, grid.rows, grid.cols)
-    weight, first, second = (_window(grid.rows, MODEL.window) @ nodes @ _window(grid.cols, MODEL.window)).reshape(3, -1)
-    total = weight + MODEL.few
-    middle = (first + MODEL.few * mean) / total
-    moment = (second + MODEL.few * (mean**2 + MODEL.prior[0] ** 2)) / total
+    weight, first, second = (_window(grid.rows, width) @ nodes @ _window(grid.cols, width)).reshape(3, -1)
+    middle = (first + mean) / (weight + 1)
+    moment = (second + mean**2 + scene.config.prior_sigma**2) / (weight + 1)
     spread: Floats = np.maximum(moment - middle**2, 0)
     return spread
 
@@ -257,77 +229,66 @@ def _window(count: int, width: float) -> Floats:
     return np.exp(-(((at_[:, None] - at_) / width) ** 2) / 2)
 
 
-def _tail(share: Floats, offset: Floats, spread: Floats) -> Floats:
-    a, q = MODEL.least_spread + MODEL.spread * spread, np.exp(np.minimum(-offset, MODEL.most))
-    return (MODEL.wrong + MODEL.other * share) * (q * q * np.exp(2 * a) - 2 * q * np.exp(a / 2) + 1)
+def _tail(scene: _Scene, share: Floats, offset: Floats, spread: Floats) -> Floats:
+    v, q = scene.config.spread * spread, np.exp(np.minimum(-offset, LARGEST))
+    return scene.config.wrong * (1 + 2 * share) * (q * q * np.exp(2 * v) - 2 * q * np.exp(v / 2) + 1)
 
 
 def _away(scene: _Scene, evidence: NDArray[np.bool_]) -> Floats:
     grid = scene.grid
     source = np.zeros(len(grid.log_depth), np.bool_)
     source[scene.observed.node[evidence]] = True
-    return distance(source, grid.far_right, grid.far_down, grid.cols, MODEL.limit)
+    return distance(source, grid.far_right, grid.far_down, grid.cols, scene.config.reach)
 
 
 def _relative(claimed: NDArray[Any], anchors: _Anchors) -> Floats:
     V = claimed.ravel()[anchors.at_pixel].astype(np.float64)
-    return MODEL.claimed * np.where(np.isnan(V), 0.0, V) / anchors.predicted**2
+    return np.where(np.isnan(V), 0.0, V) / anchors.predicted**2
 
 
 def _learnt(
-    scene: _Scene, field: Field, weight: Floats, near: _Near, claimed: Floats, running: _Running
+    scene: _Scene, field: Field, weight: Floats, left_out: _LeftOut, claimed: Floats, running: _Running
 ) -> Floats:  # fmt: skip
     """Packed."""
-    above, below = running.added(
-        _of_neighbours(scene, near, running) | _of_discs(scene, weight, near, claimed, running)
-    )
-    b, covariance = field.coefficients[:GLOBALS], field.covariance[:GLOBALS, :GLOBALS]
-    return np.concatenate([[running.frames + 1, scene.grid.mean], above, below, b, covariance.ravel()])
+    above, below = running.added(_of_neighbours(scene, left_out, running) | _of_discs(scene, weight, claimed, running))
+    first = [running.frames + 1, scene.grid.mean]
+    return np.concatenate([first, above, below, field.coefficients, field.covariance.ravel()])
 
 
-def _of_neighbours(scene: _Scene, near: _Near, running: _Running) -> dict[str, tuple[float, float]]:
-    square = np.minimum(near.left_out**2, MODEL.clip * near.total) / MODEL.clipped
-    excess, once = square - near.total, 1 / scene.counted(np.ones(len(square)))
-    roughness = np.full(len(square), running.ratios["roughness"])
+def _of_neighbours(scene: _Scene, left_out: _LeftOut, running: _Running) -> dict[str, tuple[float, float]]:
+    variance = left_out.total
+    excess = np.minimum(left_out.residual**2, scene.config.clip * variance) - variance
+    once = 1 / scene.counted(np.ones(len(variance)))
     sums = {}
-    for name, part in (("roughness", roughness), ("noise", scene.stated)):
-        w = once * (part / near.total) ** 2
+    for name, part in (("roughness", np.full(len(variance), running.ratios["roughness"])), ("noise", scene.stated)):
+        w = once * (part / variance) ** 2
         unit = running.ratios[name] / np.maximum(part, 1e-12)
         sums[name] = float((w * (part + excess) * unit).sum()), float(w.sum())
     return sums
 
 
-def _of_discs(
-    scene: _Scene, weight: Floats, near: _Near, claimed: Floats, running: _Running
-) -> dict[str, tuple[float, float]]:
+def _of_discs(scene: _Scene, weight: Floats, claimed: Floats, running: _Running) -> dict[str, tuple[float, float]]:
     held = _discs(scene, running.frames)
     rest = ~held
-    held = held & (np.count_nonzero(rest) >= MODEL.left)
+    held = held & (np.count_nonzero(rest) >= LEAST_REST)
     field = given(scene.prior, scene.observed, weight * rest)
-    mean, variance = at(field, scene.observed.node[held], scene.observed.features[held])
-    away, noise = _away(scene, rest)[scene.observed.node[held]], near.noise[held]
-    tot, error = variance + noise, (scene.observed.value[held] - mean) ** 2
-    square = np.minimum(error, MODEL.clip * tot) / MODEL.clipped
-    believed = np.where(held, scene.believed(near), 0.0)
-    area, claimed = (believed / np.maximum(scene.counted(believed), 1e-12))[held], claimed[held]
-    final = MODEL.inflation * variance + noise + MODEL.common + away * running.growth
-    share, b = np.minimum(away / MODEL.far, 1), field.coefficients[:GLOBALS]
-    offset = mean - (scene.observed.features[held, :GLOBALS] * b).sum(1)
-    spread = _spread(scene, near, rest, b[0])[scene.observed.node[held]]
-    final = final + share * claimed + _tail(share, offset, spread)
-    sums = {
-        "amplitude": (area * (square - noise) / tot, area * variance / tot / running.ratios["amplitude"]),
-        "unseen": (area * (np.minimum(error, MODEL.square) - tot), area * away),
-        "calibration": (area * error / final, area),
-    }
+    node, x = scene.observed.node[held], scene.observed.features[held]
+    mean, variance = at(field, node, x)
+    away, variance = _away(scene, rest)[node], variance + scene.noise[held]
+    error = (scene.observed.value[held] - mean) ** 2
+    believed = np.where(held, scene.believed(), 0.0)
+    area = (believed / np.maximum(scene.counted(believed), 1e-12))[held]
+    share, b = away / scene.config.reach, field.coefficients
+    tail = _tail(scene, share, mean - (x * b).sum(1), _spread(scene, rest, b[0])[node])
+    stated = variance + away * running.ratios["unseen"] + share * claimed[held] + tail
+    sums = {"unseen": (area * (error - variance), area * away), "calibration": (area * error / stated, area)}
     return {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}
 
 
 def _discs(scene: _Scene, frames: float) -> NDArray[np.bool_]:
-    at_ = (scene.observed.features[:, 2:4] + 1) / 2
+    at_, discs = (scene.observed.features[:, 2:4] + 1) / 2, scene.config.discs
     inside = np.zeros(len(at_), np.bool_)
-    for disc in range(MODEL.discs):
-        number = frames * MODEL.discs + disc + 1
-        centre = np.array([(number * step) % 1 for step in (MODEL.step_u, MODEL.step_v)])
-        inside |= ((at_ - centre) ** 2).sum(1) < MODEL.radius**2
+    for disc in range(discs):
+        centre = np.array([((frames * discs + disc + 1) * step) % 1 for step in STEPS])
+        inside |= ((at_ - centre) ** 2).sum(1) < scene.config.radius**2
     return inside

@@ -1,7 +1,8 @@
 """The nodes on which the error of a depth map is estimated: cells of the image, and how closely neighbours are linked.
 
-The image is cut into at most 28 x 28 cells. Neighbouring nodes are linked the more loosely, the more the predicted
-depth differs between them: across an edge of the depth map the network may err by another factor.
+The image is cut into at most 28 x 28 cells (the compiled field has room for 31 in a row). Neighbouring nodes are linked
+the more loosely, the more the predicted depth differs between them: across an edge of the depth map the network may err
+by another factor.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, pad
 
 from ufmstar_torch.frame import FrameInput
-from ufmstar_torch.posterior.model import MODEL
+from ufmstar_torch.posterior.config import PosteriorConfig
+
+SIDE = 28
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Grid:
         mean: [B] m_0, mean of ``log_depth``.
         right, down: [B, R C] variance of the difference of y to the next node in the row, in the column; infinite where
             there is none.
-        far_right, far_down: [B, R C] lengths of the same links, infinite likewise.
+        far_right, far_down: [B, R C] lengths of the same links, a cell and the difference of log d; infinite likewise.
     """
 
     size: tuple[int, int]
@@ -38,9 +41,9 @@ class Grid:
     far_down: Tensor
 
     @classmethod
-    def of(cls, frame: FrameInput) -> Grid:
+    def of(cls, frame: FrameInput, config: PosteriorConfig) -> Grid:
         """The nodes of a frame, float64."""
-        rows, cols = (min(MODEL.side, n) for n in frame.size)
+        rows, cols = (min(SIDE, n) for n in frame.size)
         valid = frame.valid.double()[:, None]
         logs = torch.where(frame.valid, frame.depth, torch.ones_like(frame.depth)).log().double()[:, None] * valid
         covered = adaptive_avg_pool2d(valid, (rows, cols)).flatten(1)
@@ -53,9 +56,9 @@ class Grid:
         along = pad(shaped[:, 1:] - shaped[:, :-1], (0, 0, 0, 1), value=torch.inf).flatten(1)
         return cls(
             (rows, cols), log_depth, log_depth.mean(1),
-            MODEL.flat + MODEL.edge * across.square(), MODEL.flat + MODEL.edge * along.square(),
-            1 / cols + MODEL.climb * (across.abs() - MODEL.smooth).clamp_min(0),
-            1 / rows + MODEL.climb * (along.abs() - MODEL.smooth).clamp_min(0),
+            config.link_variance + config.edge_variance * across.square(),
+            config.link_variance + config.edge_variance * along.square(),
+            1 / cols + across.abs(), 1 / rows + along.abs(),
         )  # fmt: skip
 
     def node(self, pixel: Tensor, size: tuple[int, int]) -> Tensor:
@@ -70,7 +73,7 @@ class Grid:
         return _features(log_depth - self.mean[:, None], *_relative(pixel, size))
 
     def features(self) -> Tensor:
-        """[B, R C, F] the features at the nodes: 1, log d - m_0, u and v from -1 to 1, and 3 x 3 bilinear hats."""
+        """[B, R C, F] the features at the nodes: 1, log d - m_0, u and v from -1 to 1."""
         rows, cols = self.size
         v, u = torch.meshgrid(_centres(rows, self.mean), _centres(cols, self.mean), indexing="ij")
         shape = self.log_depth.shape
@@ -88,10 +91,4 @@ def _relative(pixel: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
 
 
 def _features(log_depth: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    ones = torch.ones_like(log_depth)
-    hats = [_hat(u, i) * _hat(v, j) for j in range(MODEL.hats) for i in range(MODEL.hats)]
-    return torch.stack([ones, log_depth, 2 * u - 1, 2 * v - 1, *hats], -1)
-
-
-def _hat(x: Tensor, i: int) -> Tensor:
-    return (1 - (x * (MODEL.hats - 1) - i).abs()).clamp_min(0)
+    return torch.stack([torch.ones_like(log_depth), log_depth, 2 * u - 1, 2 * v - 1], -1)

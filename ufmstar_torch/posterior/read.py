@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
-from ufmstar_torch.posterior.model import GLOBALS, MODEL
+from ufmstar_torch.anchors.given import FARTHEST_OFF
+
+# No correction by more than this log factor: anchors that are off by more are not valid.
+LARGEST = math.log(FARTHEST_OFF)
 
 
 def read(
     depth: Tensor, valid: Tensor, claimed: Tensor, nodes: Tensor, coefficients: Tensor, mean: Tensor,
-    size: tuple[int, int],
+    size: tuple[int, int], contrast: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Depth and variance at every pixel.
 
-    The four nodes around it count by their bilinear weights and by 1/(1 + (D/.1)^2), with D the difference between the
-    pixel's log d and the node's.
+    The four nodes around it count by their bilinear weights and by 1/(1 + (D/contrast)^2); D is the difference between
+    the pixel's log d and the node's.
 
     Args:
         depth, valid: [B, H, W].
@@ -24,6 +29,7 @@ def read(
         coefficients: [B, 4] of 1, log d - m_0, u, v.
         mean: [B] m_0.
         size: R and C of the nodes.
+        contrast: difference of log d at which a node counts half.
 
     Returns:
         Depth d e^y [m] and variance (d e^y)^2 (v + share claimed/d^2) [m^2], [B, H, W] in depth's dtype, NaN where not
@@ -40,14 +46,14 @@ def read(
     for row, by_row in ((top, 1 - below), ((top + 1).clamp_max(rows - 1), below)):
         for column, by_column in ((left, 1 - beside), ((left + 1).clamp_max(cols - 1), beside)):
             at = nodes[:, (row[:, None] * cols + column).flatten()].view(b, height, width, 4)
-            alike = 1 / (1 + ((logs - at[..., 0]) / MODEL.alike).square())
+            alike = 1 / (1 + ((logs - at[..., 0]) / contrast).square())
             weight = by_row[:, None] * by_column * alike
             total = total + weight
             sums = sums + weight * at[..., 1:].permute(3, 0, 1, 2)
     offset, variance, unseen = sums / total
-    c = coefficients[:, None, None].expand(b, height, width, GLOBALS).unbind(-1)
+    c = coefficients[:, None, None].expand(b, height, width, 4).unbind(-1)
     y = c[0] + c[1] * (logs - mean[:, None, None]) + c[2] * (2 * u - 1) + c[3] * (2 * v - 1)[:, None] + offset
-    corrected = d * y.clamp(-MODEL.largest, MODEL.largest).exp()
+    corrected = d * y.clamp(-LARGEST, LARGEST).exp()
     spread = corrected.square() * (variance + unseen * claimed.double() / d.square())
     corrected, spread = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in (corrected, spread))
     return corrected, spread

@@ -2,39 +2,32 @@
 
 At an anchor of depth g the network's error is y = log(g/d). Over the image it is modelled as
 
-    y = b . (1, log d - m_0, u, v) + hats + f,
+    y = b . (1, log d - m_0, u, v) + f,
 
-with b carried from frame to frame as a random walk, three by three coarse bilinear hats, and a Gaussian field f on a
-grid whose links loosen across edges of the predicted depth (``grid``, ``field``). An anchor observes it with the
-variance
+with b carried from frame to frame as a random walk and a Gaussian field f on a grid whose links loosen across edges of
+the predicted depth (``grid``, ``field``). An anchor observes y with the variance
 
     n = roughness + blur^2 + noise s^2/g^2,
 
 where blur is half the range of log d among the pixel's neighbours, and ``noise`` the factor by which anchors state
-their variances too small. The error of an anchor without parallax is normal in 1/g and not in log g: with t the
-prediction beyond the anchor, its part of n is divided by (1 - e^-t) e^-t / t, so that a weak anchor pulls what is too
-near, and hardly what is too far. Two rounds of Student-t weights (5/(4 + z^2), z from the leave-one-out residual) take
-outliers out.
+their variances too small. Student-t weights (nu + 1)/(nu + z^2), z from the leave-one-out residual, take outliers out.
 
-Variance of y at a node:
+Variance of y at a node, with share = min(1, distance/reach):
 
-    local/2 (the field's + roughness) + .03^2 + distance (.02 + unseen) + .45 share V/d^2 + (.03 + .08 share) tail
+    the field's + roughness + unseen distance + share V/d^2 + p (1 + 2 share) tail.
 
-with share = min(1, distance/.6).
+The distance from evidence is geodesic, in widths of the image, and differences of log d lengthen it: on tours the
+variance of the error grows in proportion to it. ``unseen`` is learnt (``running``) from anchors of discs that move over
+the image: the field is fitted without them, and they count by area and not by number, since corners cluster on what is
+well textured. ``unseen`` is what their squared error is beyond the rest, over their distance. V = M + A + E counts
+where evidence is far.
 
-``local`` is the mean z^2 of the leave-one-out residuals of the anchors in the cells around: the error is rougher on one
-surface than on another. The distance from evidence is geodesic, in widths of the image, and depth edges lengthen it: on
-tours the variance of the error grows in proportion to it. All amplitudes are learnt (``running``) from anchors of three
-discs that move over the image: the field is fitted without them, and they count by area and not by number, since
-corners cluster on what is well textured. ``unseen`` is what their squared error is beyond the rest, over their
-distance. V = M + A + E counts where evidence is far. .03^2 is the common scale of the poses.
+``tail`` is the second moment about the posterior depth if the local correction f does not hold, because the evidence is
+wrong or lies on another surface. Then y - b . x is normal with the variance v, and the depth log-normal:
 
-``tail`` is the second moment about the posterior depth if the local correction o, hats + f, does not hold, because the
-evidence is wrong or lies on another surface. Then y - b . x is normal with the variance a, and the depth log-normal:
+    tail = E[(e^(n - f) - 1)^2] = q^2 e^(2 v) - 2 q e^(v/2) + 1,      q = e^-f <= 100,      n ~ N(0, v).
 
-    tail = E[(e^(n - o) - 1)^2] = q^2 e^(2 a) - 2 q e^(a/2) + 1,      q = e^-o <= 4,      n ~ N(0, a).
-
-a is .04 and 1.6 times the variance of the anchors' y around, of a Gaussian window. So no pixel is more certain than
+v is ``spread`` times the variance of the anchors' y around, of a Gaussian window. So no pixel is more certain than
 contradictory evidence allows, and a depth that was pulled far below the global correction is less certain than one
 above it.
 
@@ -49,25 +42,32 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from ufmstar_torch.anchors.given import AnchorInput
 from ufmstar_torch.fixed_order import total
 from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.distance import distance
 from ufmstar_torch.posterior.field import Field, Observed, Prior
 from ufmstar_torch.posterior.grid import Grid
-from ufmstar_torch.posterior.model import FEATURES, GLOBALS, MODEL
-from ufmstar_torch.posterior.read import read
-from ufmstar_torch.posterior.running import RATIOS, Running
+from ufmstar_torch.posterior.read import LARGEST, read
+from ufmstar_torch.posterior.running import Running, ratios
+
+# Least share of 1 - w v, by which a residual is divided to leave its anchor out: an anchor alone would divide by 0.
+LEAST_LEFT = 0.05
+# With fewer anchors beside the discs, nothing is held out: the field would be the prior.
+LEAST_REST = 5
+# The frame's number moves the discs along this sequence of low discrepancy (R2, Roberts).
+STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
 class PosteriorUpdate(Protocol):
     """See :func:`update`; ``kernels/posterior_cpu`` is the compiled one."""
 
     def __call__(
-        self, packed: Tensor, frame: FrameInput, anchors: AnchorInput | None, claimed: Tensor, /
-    ) -> tuple[Tensor, Posterior]: ...
+        self, packed: Tensor, frame: FrameInput, anchors: AnchorInput | None, claimed: Tensor,
+        config: PosteriorConfig, /,
+    ) -> tuple[Tensor, Posterior]: ...  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -92,19 +92,21 @@ class _Scene:
     """A frame's nodes and anchors, before they are fitted.
 
     Attributes:
+        config: of the posterior.
         grid: the nodes.
         prior: of b and f.
         observed: the anchors.
         stated: [B, N] noise s^2/g^2 of y, as learnt.
-        other: [B, N] roughness and blur^2.
+        noise: [B, N] n, with roughness and blur^2.
         valid: [B, N] bool.
     """
 
+    config: PosteriorConfig
     grid: Grid
     prior: Prior
     observed: Observed
     stated: Tensor
-    other: Tensor
+    noise: Tensor
     valid: Tensor
 
     @classmethod
@@ -116,8 +118,8 @@ class _Scene:
             torch.where(anchors.valid, anchors.depth.log() - log_depth, torch.zeros_like(log_depth)),
         )  # fmt: skip
         stated = running.ratio("noise")[:, None] * anchors.variance / anchors.depth.square()
-        other = running.ratio("roughness")[:, None] + (_range(frame, anchors) / 2).square()
-        return cls(grid, _prior(grid, running), observed, stated, other, anchors.valid)
+        noise = stated + running.ratio("roughness")[:, None] + (_range(frame, anchors) / 2).square()
+        return cls(running.config, grid, _prior(grid, running), observed, stated, noise, anchors.valid)
 
     def counted(self, values: Tensor) -> Tensor:
         """[B, N] values, summed over the anchors of the same cell."""
@@ -125,23 +127,21 @@ class _Scene:
         nodes = torch.zeros_like(self.grid.log_depth).scatter_add(1, self.observed.node, kept)
         return torch.gather(nodes, 1, self.observed.node)
 
-    def believed(self, near: _Near) -> Tensor:
+    def believed(self) -> Tensor:
         """[B, N] by how much an anchor counts for what is learnt: less the noisier it is, 0 where not valid."""
-        return torch.where(self.valid, 1 / (1 + near.noise / MODEL.weak**2), torch.zeros_like(near.noise))
+        return torch.where(self.valid, 1 / (1 + self.noise / self.config.weak_sigma**2), torch.zeros_like(self.noise))
 
 
 @dataclass(frozen=True)
-class _Near:
-    """What the anchors say of each other.
+class _LeftOut:
+    """Each anchor, predicted by the field of the others.
 
     Attributes:
-        noise: [B, N] n, without parallax as it counts for the present residual.
-        left_out: [B, N] residual from the field of the other anchors.
+        residual: [B, N] of y.
         total: [B, N] variance that is predicted for it.
     """
 
-    noise: Tensor
-    left_out: Tensor
+    residual: Tensor
     total: Tensor
 
 
@@ -150,6 +150,7 @@ def update(
     frame: FrameInput,
     anchors: AnchorInput | None,
     claimed: Tensor,
+    config: PosteriorConfig,
 ) -> tuple[Tensor, Posterior]:
     """Process a frame.
 
@@ -158,34 +159,34 @@ def update(
         frame: checked.
         anchors: of the frame, or None.
         claimed: [B, H, W] V of UfM* without B [m^2], NaN where not valid.
+        config: the constants.
 
     Returns:
         What was learnt up to this frame, and the posterior. A stream without a usable anchor keeps its state.
     """
     given = anchors is not None
     anchors = anchors if anchors is not None and anchors.valid.shape[1] else _none(frame)
-    running, grid, claimed_share = Running.of(packed), Grid.of(frame), MODEL.claimed * claimed.nan_to_num()
+    running, grid, known_claim = Running.of(packed, config), Grid.of(frame, config), claimed.nan_to_num()
     scene = _Scene.of(grid, frame, anchors, running)
-    field, weight, near = _fitted(scene)
-    away = _away(scene, anchors.valid & (weight * MODEL.evidence**2 >= 1))
-    share = (away / MODEL.far).clamp_max(1)
-    after = _learnt(scene, field, weight, near, _relative(claimed_share, frame, anchors), running)
+    field, left_out, weight = _fitted(scene)
+    away = _away(scene, anchors.valid & (weight * config.weak_sigma**2 >= 1))
+    after = _learnt(scene, field, weight, left_out, _relative(known_claim, anchors), running)
     features, b = grid.features(), field.coefficients
-    mean, variance = field.at(torch.arange(features.shape[1], device=b.device).expand_as(share), features)
-    offset = mean - (features[..., :GLOBALS] * b[:, None, :GLOBALS]).sum(-1)
-    variance = MODEL.inflation * _local(scene, near) * (variance + running.ratio("roughness")[:, None])
-    variance = variance + MODEL.common + away * running.growth()[:, None]
-    variance = variance + _tail(share, offset, _spread(scene, near, anchors.valid, b[:, 0]))
+    mean, variance = field.at(torch.arange(features.shape[1], device=b.device).expand_as(away), features)
+    offset, share = mean - (features * b[:, None]).sum(-1), away / config.reach
+    variance = variance + running.ratio("roughness")[:, None] + away * running.ratio("unseen")[:, None]
+    variance = variance + _tail(scene, share, offset, _spread(scene, anchors.valid, b[:, 0]))
     nodes = torch.stack([grid.log_depth, offset, variance, share], -1)
-    depth, spread = read(frame.depth, frame.valid, claimed_share, nodes, b[:, :GLOBALS], grid.mean, grid.size)
+    maps = frame.depth, frame.valid, known_claim
+    depth, spread = read(*maps, nodes, b, grid.mean, grid.size, config.edge_contrast)
     some = anchors.valid.any(1)
     known = (some | (running.frames > 0) | given)[:, None, None]
     plain = torch.where(frame.valid, frame.depth, torch.nan)
     kept = torch.where(some[:, None], after.packed().to(packed.dtype), packed)
-    now = Running.of(kept)
+    now = Running.of(kept, config)
     calibration = torch.where(now.below["calibration"] > 0, now.ratio("calibration"), torch.nan)
     return kept, Posterior(
-        torch.where(known, depth, plain), torch.where(known, spread, claimed), calibration, now.growth()
+        torch.where(known, depth, plain), torch.where(known, spread, claimed), calibration, now.ratio("unseen")
     )
 
 
@@ -199,16 +200,9 @@ def _none(frame: FrameInput) -> AnchorInput:
 
 def _prior(grid: Grid, running: Running) -> Prior:
     """Of b and f, in the frame to come."""
-    amplitude = running.ratio("amplitude")[:, None]
     mean, covariance = running.expected(grid.mean)
-    b, hats = len(mean), FEATURES - GLOBALS
-    P = covariance.new_zeros(b, FEATURES, FEATURES)
-    P[:, :GLOBALS, :GLOBALS] = torch.linalg.inv_ex(covariance).inverse
-    P[:, GLOBALS:, GLOBALS:] = torch.diag_embed((1 / (MODEL.hat * amplitude)).expand(b, hats))
-    return Prior(
-        (MODEL.kappa / amplitude).expand_as(grid.log_depth), 1 / (grid.right * amplitude), 1 / (grid.down * amplitude),
-        torch.nn.functional.pad(mean, (0, hats)), P, grid.size[1],
-    )  # fmt: skip
+    diagonal = torch.full_like(grid.log_depth, running.config.precision)
+    return Prior(diagonal, 1 / grid.right, 1 / grid.down, mean, torch.linalg.inv_ex(covariance).inverse, grid.size[1])
 
 
 def _range(frame: FrameInput, anchors: AnchorInput) -> Tensor:
@@ -226,145 +220,116 @@ def _range(frame: FrameInput, anchors: AnchorInput) -> Tensor:
     return high - low
 
 
-def _fitted(scene: _Scene) -> tuple[Field, Tensor, _Near]:
-    """The field, the anchors' weights in it, and what they say of each other."""
-    zero = torch.zeros_like(scene.stated)
-    weight = torch.where(scene.valid, 1 / (scene.stated + scene.other), zero)
-    for round_ in range(MODEL.rounds + 1):
-        field = Field.given(scene.prior, scene.observed, weight)
-        mean, variance = field.at(scene.observed.node, scene.observed.features)
-        left = (1 - weight * variance).clamp_min(MODEL.least_left)
-        residual, variance = (scene.observed.value - mean) / left, variance / left
-        noise = scene.other + scene.stated / _pull(-residual)
-        near = _Near(noise, residual, variance + noise)
-        if round_ < MODEL.rounds:
-            student = (MODEL.student + 1) / (MODEL.student + residual.square() / near.total)
-            weight = torch.where(scene.valid, student / noise, zero)
-    return field, weight, near
+def _fitted(scene: _Scene) -> tuple[Field, _LeftOut, Tensor]:
+    """The field, how well it predicts each anchor from the others, and the anchors' weights in it."""
+    zero, nu = torch.zeros_like(scene.noise), scene.config.degrees_of_freedom
+    weight = torch.where(scene.valid, 1 / scene.noise, zero)
+    _, left_out = _with_weights(scene, weight)
+    student = (nu + 1) / (nu + left_out.residual.square() / left_out.total)
+    weight = torch.where(scene.valid, student / scene.noise, zero)
+    return *_with_weights(scene, weight), weight
 
 
-def _pull(t: Tensor) -> Tensor:
-    """(1 - e^-t) e^-t / t, the weight of an anchor from which the prediction is t beyond in log depth."""
-    t = t.clamp(MODEL.nearer, MODEL.farther)
-    small = t.abs() < 1e-3
-    safe = torch.where(small, torch.ones_like(t), t)
-    return torch.where(small, 1 - 1.5 * t, -torch.expm1(-safe) * torch.exp(-safe) / safe)
+def _with_weights(scene: _Scene, weight: Tensor) -> tuple[Field, _LeftOut]:
+    field = Field.given(scene.prior, scene.observed, weight)
+    mean, variance = field.at(scene.observed.node, scene.observed.features)
+    left = (1 - weight * variance).clamp_min(LEAST_LEFT)
+    return field, _LeftOut((scene.observed.value - mean) / left, variance / left + scene.noise)
 
 
-def _local(scene: _Scene, near: _Near) -> Tensor:
-    """[B, n] mean z^2 of the leave-one-out residuals around every node."""
-    each = scene.believed(near) / scene.counted(torch.ones_like(near.noise)).clamp_min(1)
-    z2 = (near.left_out.square() / near.total).clamp_max(MODEL.clip)
-    nodes = torch.zeros(2, *scene.grid.log_depth.shape, dtype=each.dtype, device=each.device)
-    nodes = nodes.scatter_add(2, scene.observed.node.expand(2, -1, -1), torch.stack([each * z2, each]))
-    side = 2 * MODEL.near + 1
-    around = avg_pool2d(nodes.unflatten(2, scene.grid.size), side, 1, MODEL.near, divisor_override=1).flatten(2)
-    return (around[0] + MODEL.alone) / (around[1] + MODEL.alone)
-
-
-def _spread(scene: _Scene, near: _Near, used: Tensor, mean: Tensor) -> Tensor:
-    """[B, n] variance of y among the anchors of the mask [B, N] around every node, with a prior about ``mean`` [B]."""
-    each = torch.where(used, scene.believed(near) / scene.counted(torch.ones_like(near.noise)).clamp_min(1), 0.0)
+def _spread(scene: _Scene, used: Tensor, mean: Tensor) -> Tensor:
+    """[B, n] variance of y among the anchors of the mask [B, N] around every node, and one anchor of the prior variance
+    about ``mean`` [B]."""
+    each = torch.where(used, scene.believed() / scene.counted(torch.ones_like(scene.noise)).clamp_min(1), 0.0)
     y, (rows, cols) = scene.observed.value, scene.grid.size
     nodes = torch.zeros(3, *scene.grid.log_depth.shape, dtype=each.dtype, device=each.device)
     values = torch.stack([each, each * y, each * y.square()])
     nodes = nodes.scatter_add(2, scene.observed.node.expand(3, -1, -1), values).unflatten(2, (rows, cols))
-    around = (_window(rows, mean) @ nodes @ _window(cols, mean)).flatten(2)
-    centre, prior = mean[:, None], MODEL.prior[0] ** 2
-    total = around[0] + MODEL.few
-    middle = (around[1] + MODEL.few * centre) / total
-    return ((around[2] + MODEL.few * (centre.square() + prior)) / total - middle.square()).clamp_min(0)
+    width = scene.config.radius
+    weight, first, second = (_window(rows, width, mean) @ nodes @ _window(cols, width, mean)).flatten(2)
+    centre, prior = mean[:, None], scene.config.prior_sigma**2
+    middle = (first + centre) / (weight + 1)
+    return ((second + centre.square() + prior) / (weight + 1) - middle.square()).clamp_min(0)
 
 
-def _window(count: int, like: Tensor) -> Tensor:
+def _window(count: int, width: float, like: Tensor) -> Tensor:
     """[count, count] weight of a row of nodes, or column, for another one."""
     at = torch.arange(count, dtype=like.dtype, device=like.device) / count
-    return (-((at[:, None] - at) / MODEL.window).square() / 2).exp()
+    return (-((at[:, None] - at) / width).square() / 2).exp()
 
 
-def _tail(share: Tensor, offset: Tensor, spread: Tensor) -> Tensor:
+def _tail(scene: _Scene, share: Tensor, offset: Tensor, spread: Tensor) -> Tensor:
     """Variance over the squared depth by what the local correction ``offset`` may have wrong."""
-    a, q = MODEL.least_spread + MODEL.spread * spread, (-offset).clamp_max(MODEL.most).exp()
-    second = q.square() * (2 * a).exp() - 2 * q * (a / 2).exp() + 1
-    return (MODEL.wrong + MODEL.other * share) * second
+    v, q = scene.config.spread * spread, (-offset).clamp_max(LARGEST).exp()
+    second = q.square() * (2 * v).exp() - 2 * q * (v / 2).exp() + 1
+    return scene.config.wrong * (1 + 2 * share) * second
 
 
 def _away(scene: _Scene, evidence: Tensor) -> Tensor:
     """[B, n] how far every node is from the anchors of the mask [B, N], in widths of the image."""
     grid = scene.grid
     source = torch.zeros_like(grid.log_depth).scatter_add(1, scene.observed.node, evidence.to(grid.log_depth)) > 0
-    return distance(source, grid.far_right, grid.far_down, grid.size[1], MODEL.limit)
+    return distance(source, grid.far_right, grid.far_down, grid.size[1], scene.config.reach)
 
 
-def _relative(claimed: Tensor, frame: FrameInput, anchors: AnchorInput) -> Tensor:
+def _relative(claimed: Tensor, anchors: AnchorInput) -> Tensor:
     """[B, N] V/d^2 at the anchors."""
     at = torch.gather(claimed.flatten(1), 1, anchors.index).double()
     return torch.where(anchors.valid, at / anchors.predicted.square(), torch.zeros_like(at))
 
 
 def _learnt(
-    scene: _Scene, field: Field, weight: Tensor, near: _Near, claimed: Tensor, running: Running,
+    scene: _Scene, field: Field, weight: Tensor, left_out: _LeftOut, claimed: Tensor, running: Running,
 ) -> Running:  # fmt: skip
     """What is known after the frame."""
-    sums = _of_neighbours(scene, near, running) | _of_discs(scene, weight, near, claimed, running)
-    added = {name: running.added(name, *sums[name]) for name in RATIOS}
-    return Running(
-        running.frames + 1, scene.grid.mean,
-        {name: above for name, (above, _) in added.items()}, {name: below for name, (_, below) in added.items()},
-        field.coefficients[:, :GLOBALS], field.covariance[:, :GLOBALS, :GLOBALS],
-    )  # fmt: skip
+    sums = _of_neighbours(scene, left_out, running) | _of_discs(scene, weight, claimed, running)
+    added = {name: running.added(name, *sums[name]) for name in ratios(scene.config)}
+    above, below = ({name: pair[i] for name, pair in added.items()} for i in range(2))
+    after = running.frames + 1, scene.grid.mean, above, below, field.coefficients, field.covariance
+    return Running(scene.config, *after)
 
 
-def _of_neighbours(scene: _Scene, near: _Near, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
+def _of_neighbours(scene: _Scene, left_out: _LeftOut, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
     """Sums for roughness and noise from leave-one-out residuals: what they are beyond the rest of their variance, each
     weighted by the squared share that the quantity has in it."""
-    square = torch.minimum(near.left_out.square(), MODEL.clip * near.total) / MODEL.clipped
-    excess, once = square - near.total, torch.where(scene.valid, 1 / scene.counted(torch.ones_like(square)), 0.0)
+    variance = left_out.total
+    excess = torch.minimum(left_out.residual.square(), scene.config.clip * variance) - variance
+    once = torch.where(scene.valid, 1 / scene.counted(torch.ones_like(excess)), 0.0)
     sums = {}
     for name, part in (("roughness", running.ratio("roughness")[:, None]), ("noise", scene.stated)):
-        w = once * (part / near.total).square()
+        w = once * (part / variance).square()
         unit = running.ratio(name)[:, None] / part.clamp_min(1e-12)
         sums[name] = (total(w * (part + excess) * unit, 1), total(w, 1))
     return sums
 
 
-def _of_discs(
-    scene: _Scene, weight: Tensor, near: _Near, claimed: Tensor, running: Running
-) -> dict[str, tuple[Tensor, Tensor]]:
-    """Sums for amplitude, unseen and calibration from anchors whose whole region is left out."""
+def _of_discs(scene: _Scene, weight: Tensor, claimed: Tensor, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
+    """Sums for unseen and calibration from anchors whose whole region is left out."""
     held = _discs(scene, running.frames) & scene.valid
     rest = scene.valid & ~held
-    held = held & (rest.sum(1, keepdim=True) >= MODEL.left)
+    held = held & (rest.sum(1, keepdim=True) >= LEAST_REST)
     field = Field.given(scene.prior, scene.observed, weight * rest)
     mean, variance = field.at(scene.observed.node, scene.observed.features)
     away = torch.gather(_away(scene, rest), 1, scene.observed.node)
-    tot = variance + near.noise
-    error = (scene.observed.value - mean).square()
-    square = torch.minimum(error, MODEL.clip * tot) / MODEL.clipped
-    believed = torch.where(held, scene.believed(near), 0.0)
+    error, variance = (scene.observed.value - mean).square(), variance + scene.noise
+    believed = torch.where(held, scene.believed(), 0.0)
     area = believed / scene.counted(believed).clamp_min(1e-12)
-    final = MODEL.inflation * variance + near.noise + MODEL.common + away * running.growth()[:, None]
-    b, share = field.coefficients, (away / MODEL.far).clamp_max(1)
-    offset = mean - (scene.observed.features[..., :GLOBALS] * b[:, None, :GLOBALS]).sum(-1)
-    spread = torch.gather(_spread(scene, near, rest, b[:, 0]), 1, scene.observed.node)
-    final = final + share * claimed + _tail(share, offset, spread)
+    share, b = away / scene.config.reach, field.coefficients
+    offset = mean - (scene.observed.features * b[:, None]).sum(-1)
+    spread = torch.gather(_spread(scene, rest, b[:, 0]), 1, scene.observed.node)
+    stated = variance + away * running.ratio("unseen")[:, None] + share * claimed
+    stated = stated + _tail(scene, share, offset, spread)
     return {
-        "amplitude": (
-            total(area * (square - near.noise) / tot, 1),
-            total(area * variance / tot, 1) / running.ratio("amplitude"),
-        ),
-        "unseen": (total(area * (error.clamp_max(MODEL.square) - tot), 1), total(area * away, 1)),
-        "calibration": (total(area * error / final, 1), total(area, 1)),
+        "unseen": (total(area * (error - variance), 1), total(area * away, 1)),
+        "calibration": (total(area * error / stated, 1), total(area, 1)),
     }
 
 
 def _discs(scene: _Scene, frames: Tensor) -> Tensor:
     """[B, N] whether an anchor lies in one of the frame's discs."""
-    at = (scene.observed.features[..., 2:4] + 1) / 2
+    at, discs = (scene.observed.features[..., 2:4] + 1) / 2, scene.config.discs
     inside = torch.zeros_like(scene.valid)
-    for disc in range(MODEL.discs):
-        centre = torch.stack(
-            [((frames * MODEL.discs + disc + 1) * step) % 1 for step in (MODEL.step_u, MODEL.step_v)], -1
-        )
-        inside = inside | ((at - centre[:, None]).square().sum(-1) < MODEL.radius**2)
+    for disc in range(discs):
+        centre = torch.stack([((frames * discs + disc + 1) * step) % 1 for step in STEPS], -1)
+        inside = inside | ((at - centre[:, None]).square().sum(-1) < scene.config.radius**2)
     return inside
