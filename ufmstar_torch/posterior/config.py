@@ -25,7 +25,7 @@ class PosteriorConfig(Checked):
         unseen: variance of y a width of the image from evidence, before it is learnt
         prior_weight: anchors for which these values count
         half_life: age after which what an anchor taught counts half
-        clip: largest z^2 of an anchor in what is learnt of the roughness and the noise
+        clip: largest z^2 of an anchor in what is learnt of amplitude, roughness and noise
         weak_sigma: an anchor whose noise has this standard deviation counts half by area; a noisier one is no evidence
         reach: distance from the evidence from which on a node has none
         discs: discs of anchors that are held out in a frame

@@ -1,9 +1,10 @@
 """What the posterior learns of a stream: sums with a half-life, and the last frame's coefficients.
 
-Everything here is learnt from anchors alone, in frames that have some: how much anchors and network differ from one
-pixel to the next (roughness), by what factor the anchors' variances are stated too small (noise), how fast the error
-grows with the distance from evidence (unseen), and how well held-out anchors were predicted (calibration). Each is a
-ratio of two sums that fade towards a prior, so that a few anchors do not decide.
+Everything here is learnt from anchors alone, in frames that have some: how far the network's error varies (amplitude),
+how much anchors and network differ from one pixel to the next (roughness), by what factor the anchors' variances are
+stated too small (noise), how fast the error grows with the distance from evidence (unseen), and how well held-out
+anchors were predicted (calibration). Each is a ratio of two sums that fade towards a prior, so that a few anchors do
+not decide.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ def ratios(config: PosteriorConfig) -> dict[str, Ratio]:
     """The ratios by name. Nothing is known of the calibration, a mean z^2, before the first frame."""
     weight = config.prior_weight
     return {
+        "amplitude": Ratio(1.0, weight, 0.1, 100.0),
         "roughness": Ratio(config.roughness**2, weight, 0.01**2, 0.2**2),
         "noise": Ratio(1.0, weight, 0.25, 16.0),
         "unseen": Ratio(config.unseen, weight, 0.0, 16.0),
