@@ -9,18 +9,18 @@ import numpy as np
 
 SIDE, FEATURES = 28, 4
 START = {
-    "amplitude": (1.0, 40.0, 0.1, 100.0),
-    "roughness": (0.0025, 40.0, 1e-4, 0.04),
-    "noise": (1.0, 40.0, 0.25, 16.0),
-    "unseen": (0.1, 40.0, 0.0, 16.0),
+    "amplitude": (1.0, 20.0, 0.1, 100.0),
+    "roughness": (0.0025, 20.0, 1e-4, 0.04),
+    "noise": (1.0, 20.0, 0.25, 16.0),
+    "unseen": (0.1, 20.0, 0.0, 16.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
-PRIOR, DRIFT, MEMORY = 0.5**2, 0.05**2, 0.5 ** (1 / 20)
+PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
 REACH, RADIUS, WEAK, CLIP = 1.0, 5 / 28, 0.25**2, 9.0
 
 
 def start():
-    return {"frames": 0, "m0": 0.0, "b": np.zeros(4), "C": PRIOR * np.eye(4),
+    return {"frames": 0, "m0": 0.0, "b": np.zeros(4), "C": np.diag(PRIOR),
             "sums": {k: [v * n, n] for k, (v, n, _, _) in START.items()}}  # fmt: skip
 
 

@@ -79,7 +79,7 @@ class _Running(NamedTuple):
         covariance, priors = covariance.reshape(FEATURES, FEATURES), ratios(config)
         value, weight, least, largest = np.array(list(priors.values())).T
         if packed[0] == 0:
-            above, below, covariance = value * weight, weight, config.prior_sigma**2 * np.eye(FEATURES)
+            above, below, covariance = value * weight, weight, np.diag(config.prior_variance)
         known = np.where(below > 0, above / np.maximum(below, 1e-12), value).clip(least, largest)
         by_name = dict(zip(priors, known.tolist(), strict=True))
         return cls(config, packed[0], packed[1], above, below, b, covariance, by_name)
@@ -96,7 +96,7 @@ class _Running(NamedTuple):
         T[0, 1] = mean - self.mean if self.frames else 0.0
         walked = T @ self.covariance @ T.T
         if self.frames:
-            left = (1 - walked.diagonal() / self.config.prior_sigma**2).clip(0, 1)
+            left = (1 - walked.diagonal() / self.config.prior_variance).clip(0, 1)
             walked = walked + np.diag(self.config.drift**2 * left)
         return T @ self.coefficients, walked
 

@@ -75,7 +75,7 @@ class Running:
         new = frames == 0
         start = [r.value * r.weight for r in priors.values()] + [r.weight for r in priors.values()]
         above, below = torch.where(new, sums.new_tensor(start), sums).split(RATIOS, 1)
-        P = config.prior_sigma**2 * torch.eye(FEATURES, dtype=packed.dtype, device=packed.device)
+        P = torch.diag(packed.new_tensor(config.prior_variance))
         return cls(
             config, frames[:, 0], mean[:, 0], dict(zip(priors, above.unbind(1), strict=True)),
             dict(zip(priors, below.unbind(1), strict=True)), coefficients,
@@ -106,7 +106,8 @@ class Running:
         T = torch.eye(FEATURES, dtype=mean.dtype, device=mean.device).repeat(len(mean), 1, 1)
         T[:, 0, 1] = torch.where(self.frames > 0, mean - self.mean, torch.zeros_like(mean))
         walked = T @ self.covariance @ T.mT
-        left = (1 - walked.diagonal(dim1=1, dim2=2) / self.config.prior_sigma**2).clamp(0, 1)
+        prior = mean.new_tensor(self.config.prior_variance)
+        left = (1 - walked.diagonal(dim1=1, dim2=2) / prior).clamp(0, 1)
         started = (self.frames > 0).to(mean)[:, None]
         grown = torch.diag_embed(self.config.drift**2 * left * started)
         return (T @ self.coefficients[..., None])[..., 0], walked + grown
