@@ -2,7 +2,7 @@
 
 Weights that come as an ONNX file run in ONNX Runtime on the processor, and on a GPU where it has its
 provider. Everything else runs in torch: ``Backbone`` networks with channels last, FastDepth with its batch norms folded
-(docs/results/benchmark.md has the times). The results equal those of the loaded network up to rounding.
+(docs/results/speed.md has the times). The results equal those of the loaded network up to rounding.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Merging in NumPy float64 loops, from the derivation in docs/results/growth.md; imports neither torch nor the package.
+"""Merging in NumPy float64 loops, from the derivation in ufmstar_torch/merge.py; imports neither torch nor the package.
 
 Components are dicts as in ``oracle`` with one more entry, "sums": the sums over anchors.
 """

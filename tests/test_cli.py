@@ -97,90 +97,51 @@ def test_help_loads_nothing_beyond_the_package():
     assert done.stdout.splitlines()[-1] == "['ufmstar_torch'] False"
 
 
+# The words behind ``ufmstar run SEQUENCE --out OUT``, or a whole line, and what the message contains.
 MISTAKES = {
-    "unknown command": (["walk"], "no command 'walk', there are demo, run, eval,"),
-    "no sequence": (["run"], "sequence"),
-    "no out": (["run", "{path}", "--depth", "self"], "out"),
-    "no such sequence": (["run", "/nowhere", "--depth", "self", "--out", "{out}"], "no such file or folder: /nowhere"),
-    "no depth": (["run", "{path}", "--out", "{out}"], "--model NAME --weights FILE"),
-    "two depths": (["run", "{path}", "--depth", "self", "--model", "x", "--out", "{out}"], "not both"),
-    "no weights": (["run", "{path}", "--model", "fastdepth", "--out", "{out}"], "needs --weights FILE"),
-    "missing weights": (
-        ["run", "{path}", "--model", "fastdepth", "--weights", "/nowhere/w.onnx", "--out", "{out}"],
-        "no such file: /nowhere/w.onnx",
-    ),
-    "wrong model": (
-        ["run", "{path}", "--model", "fastdeth", "--weights", "{path}/K.txt", "--out", "{out}"],
-        "unknown network 'fastdeth', expected one of",
-    ),
-    "broken weights": (
-        ["run", "{path}", "--model", "onnx", "--weights", "{path}/K.txt", "--out", "{out}"],
-        "needs a spec",
-    ),
-    "spec for fastdepth": (
-        [
-            "run",
-            "{path}",
-            "--model",
-            "fastdepth",
-            "--weights",
-            "{path}/K.txt",
-            "--spec",
-            "{path}/K.txt",
-            "--out",
-            "{out}",
-        ],
-        "does not take ['spec']",
-    ),
-    "no maps": (["run", "{path}", "--depth", "/nowhere", "--out", "{out}"], "no such folder: /nowhere"),
-    "variance without maps": (
-        ["run", "{path}", "--depth", "self", "--variance", "x", "--out", "{out}"],
-        "--variance goes with --depth DIR only",
-    ),
-    "size without maps": (
-        ["run", "{path}", "--model", "x", "--weights", "y", "--size", "2x2", "--out", "{out}"],
-        "--size goes with --depth only",
-    ),
-    "full with one": (
-        ["run", "{path}", "--model", "x", "--weights", "y", "--mode", "full", "--out", "{out}"],
-        "--mode full needs several --weights",
-    ),
-    "unknown option": (["run", "{path}", "--depth", "self", "--eta", "1", "--out", "{out}"], "--eta"),
-    "unknown setting": (["run", "{path}", "--depth", "self", "--ufm.etaa", "1", "--out", "{out}"], "--ufm.etaa"),
-    "setting out of range": (
-        ["run", "{path}", "--depth", "self", "--ufm.eta", "3", "--out", "{out}"],
-        "UfMStarConfig.eta must lie in (0.0, 1.0], got 3.0",
-    ),
-    "nested setting out of range": (
-        ["run", "{path}", "--depth", "self", "--ufm.segment.min_pixels", "0", "--out", "{out}"],
-        "SPGFConfig.min_pixels must lie in [1, inf], got 0",
-    ),
-    "setting of the wrong kind": (["run", "{path}", "--depth", "self", "--ufm.eta", "x", "--out", "{out}"], "ufm.eta"),
-    "no such config": (["run", "{path}", "--config", "/nowhere.yaml", "--out", "{out}"], "/nowhere.yaml"),
-    "frames": (["run", "{path}", "--depth", "self", "--frames", "3", "--out", "{out}"], "START:STOP"),
-    "no frames": (["run", "{path}", "--depth", "self", "--frames", "9:", "--out", "{out}"], "selects none of the 6"),
-    "size": (["run", "{path}", "--depth", "self", "--size", "24", "--out", "{out}"], "--size must be HxW"),
-    "intrinsics": (["run", "{path}", "--depth", "self", "--intrinsics", "1", "2", "--out", "{out}"], "fx fy cx cy"),
-    "layout": (["run", "{path}", "--depth", "self", "--layout", "tum", "--out", "{out}"], "looked for rgb.txt"),
-    "device": (["run", "{path}", "--depth", "self", "--device", "abacus", "--out", "{out}"], "--device abacus"),
-    "no data": (["run", "{path}", "--depth", "self", "--device", "meta", "--out", "{out}"], "--device meta is not"),
-    "size beyond memory": (
-        ["run", "{path}", "--depth", "self", "--size", "99999999x99999999", "--out", "{out}"],
-        "--size must be at most 134 million pixels",
-    ),
-    "threads": (["run", "{path}", "--depth", "self", "--threads", "0", "--out", "{out}"], "--threads"),
-    "someone else's folder": (["run", "{path}", "--depth", "self", "--out", "{path}"], "files of someone else"),
-    "contradiction": (
-        ["run", "{path}", "--depth", "self", "--resume", "--overwrite", "--out", "{out}"],
-        "--resume and --overwrite contradict",
-    ),
+    "unknown command": ("ufmstar walk", "no command 'walk', there are demo, run, eval,"),
+    "no sequence": ("ufmstar run", "sequence"),
+    "no out": ("ufmstar run {path} --depth self", "out"),
+    "no such sequence": ("ufmstar run /nowhere --depth self --out {out}", "no such file or folder: /nowhere"),
+    "someone else's folder": ("ufmstar run {path} --depth self --out {path}", "files of someone else"),
+    "no depth": ("", "--model NAME --weights FILE"),
+    "two depths": ("--depth self --model x", "not both"),
+    "no weights": ("--model fastdepth", "needs --weights FILE"),
+    "missing weights": ("--model fastdepth --weights /nowhere/w.onnx", "no such file: /nowhere/w.onnx"),
+    "wrong model": ("--model fastdeth --weights {path}/K.txt", "unknown network 'fastdeth', expected one of"),
+    "broken weights": ("--model onnx --weights {path}/K.txt", "needs a spec"),
+    "spec": ("--model fastdepth --weights {path}/K.txt --spec {path}/K.txt", "does not take ['spec']"),
+    "no maps": ("--depth /nowhere", "no such folder: /nowhere"),
+    "variance": ("--depth self --variance x", "--variance goes with --depth DIR only"),
+    "size without maps": ("--model x --weights y --size 2x2", "--size goes with --depth only"),
+    "full with one": ("--model x --weights y --mode full", "--mode full needs several --weights"),
+    "unknown option": ("--depth self --eta 1", "--eta"),
+    "unknown setting": ("--depth self --ufm.etaa 1", "--ufm.etaa"),
+    "out of range": ("--depth self --ufm.eta 3", "UfMStarConfig.eta must lie in (0.0, 1.0], got 3.0"),
+    "nested": ("--depth self --ufm.segment.min_pixels 0", "SPGFConfig.min_pixels must lie in [1, inf], got 0"),
+    "wrong kind": ("--depth self --ufm.eta x", "ufm.eta"),
+    "no such config": ("--config /nowhere.yaml", "/nowhere.yaml"),
+    "frames": ("--depth self --frames 3", "START:STOP"),
+    "no frames": ("--depth self --frames 9:", "selects none of the 6"),
+    "size": ("--depth self --size 24", "--size must be HxW"),
+    "size beyond memory": ("--depth self --size 99999999x99999999", "--size must be at most 134 million pixels"),
+    "intrinsics": ("--depth self --intrinsics 1 2", "fx fy cx cy"),
+    "layout": ("--depth self --layout tum", "looked for rgb.txt"),
+    "no poses": ("ufmstar run {path}/images --depth self --layout generic --out {out}", "pass trajectory"),
+    "device": ("--depth self --device abacus", "--device abacus"),
+    "no data": ("--depth self --device meta", "--device meta is not"),
+    "threads": ("--depth self --threads 0", "--threads"),
+    "contradiction": ("--depth self --resume --overwrite", "--resume and --overwrite contradict"),
+    "another command": ("ufmstar bench --frames x", "frames"),
+    "report": ("ufmstar report", "out"),
 }
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_reported_in_one_line(ufmstar, path, tmp_path, mistake):
-    words, expected = MISTAKES[mistake]
-    code, out, err = ufmstar(*[word.format(path=path, out=tmp_path / "out") for word in words])
+    line, expected = MISTAKES[mistake]
+    line = line if line.startswith("ufmstar") else f"ufmstar run {{path}} {line} --out {{out}}"
+    code, out, err = ufmstar(*line.format(path=path, out=tmp_path / "out").split()[1:])
     assert (code, out) == (2, "")
     assert err.startswith("ufmstar")
     assert expected in err
@@ -313,6 +274,13 @@ def test_other_weights_under_the_same_name_do_not_go_on(ufmstar, path, tmp_path,
     assert "source.weights.1.sha256 was" in err
     assert ufmstar(*words)[0] == 2
     assert ufmstar(*words, "--overwrite")[0] == 0
+
+
+def test_members_must_want_the_same_input(ufmstar, path, tmp_path, brightness):
+    brightness.width = iter((32, 33)).__next__
+    code, _, err = ufmstar("run", path, "--model", "any", "--weights", *brightness.files, "--out", tmp_path / "out")
+    assert code == 2
+    assert "same input" in err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -203,9 +203,3 @@ def test_a_network_that_predicts_all_in_one_is_not_separable(sequence):
     assert alone["latency"]["network_uncertainty"] == {"none": "the method needs only depth of the network"}
     assert depth_only["latency"]["multiview"]["median_ms"] > 0
     assert "not torch's" in depth_only["memory"]["not_measurable"]
-
-
-@pytest.mark.parametrize("wrong", [{"frames": 0}, {"warm_up": -1}, {"windows": True}, {"threads": 0}, {"seconds": 0.0}])
-def test_a_plan_is_checked(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        Plan(**wrong)

@@ -14,6 +14,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from modules import same
+from parts import compiled
 from random_gaussians import covariances, mixture, random_pairs
 
 import scenes
@@ -44,7 +45,7 @@ def pairs_of(previous, current, config, stream: int):
     """The compiled list of one stream's pairs: c, k and beta."""
     fields = [value for m in (previous, current) for value in (by_field(m, stream), m.capacity)]
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, gaussian.PIXEL_VARIANCE)
-    return map(torch.from_numpy, correspond_cpu.matches(*fields, K.numpy(), *SIZE, *thresholds))
+    return map(torch.from_numpy, compiled(correspond_cpu.matches)(*fields, K.numpy(), *SIZE, *thresholds))
 
 
 def by_field(m: GaussianMixture, stream: int):
@@ -87,7 +88,7 @@ def fused(previous, current, pairs, config):
         c, k = pairs.match[b].nonzero(as_tuple=True)
         distance = torch.empty(0).double() if pairs.distance is None else pairs.distance[b, c, k]
         new = (v[b].numpy() for v in (current.mean, current.covariance, current.weight, current.features))
-        fuse_cpu.fuse_pairs(
+        compiled(fuse_cpu.fuse_pairs)(
             *(value[b].numpy() for value in out.tensors().values()), *new,
             *(value.numpy() for value in (c, k, pairs.overlap[b, c, k], distance)),
             config.overlap_weighted, epsilon,
@@ -116,7 +117,7 @@ def floored(cov, floor):
     given = (
         value.reshape(-1, *value.shape[cov.dim() - 2 :]).numpy() for value in (mean, cov, torch.ones_like(mean[..., 0]))
     )
-    fuse_cpu.floored(*given, 0.0, 1.0, 1.0, 0.0, out.view(-1, 3, 3).numpy())
+    compiled(fuse_cpu.floored)(*given, 0.0, 1.0, 1.0, 0.0, out.view(-1, 3, 3).numpy())
     return out
 
 

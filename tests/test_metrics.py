@@ -49,10 +49,6 @@ class TestAgainstIndependentImplementations:
         assert float(got["delta1"]) == 3 / 5  # 3, 5 and 3.125: the interval is closed and lies around g
         assert float(got["delta1_ratio"]) == 0.0  # ratios 1.333, 1.25, 1.338, 1.2525, 1.28: open interval
 
-    def test_delta1_ratio_of_negative_depth_is_a_miss(self) -> None:
-        got = figures(Delta1(), torch.tensor([-1.0, 0.0, 1.0]), None, torch.ones(3))
-        assert float(got["delta1_ratio"]) == pytest.approx(1 / 3)
-
     def test_nll_is_scipys(self) -> None:
         d, v, g = maps(30, 40)
         oracle = -stats.norm.logpdf(g.numpy(), d.numpy(), np.sqrt(v.numpy())).mean()
@@ -153,11 +149,6 @@ class TestMeaning:
         assert sign * (float(observed[0]) - stats.norm.cdf(stats.norm.ppf(0.1))) > 0
         oracle = stats.norm.cdf(stats.norm.ppf([0.1, 0.9]) / scale)
         np.testing.assert_allclose(observed.numpy(), oracle, atol=5e-3)
-
-    def test_too_deep_prediction_has_truth_below_its_quantiles(self) -> None:
-        g = torch.full((100,), 2.0)
-        got = figures(ECEQuantile([0.01, 0.3]), g + 10, torch.ones(100), g)
-        assert got["ece_q_observed"].tolist() == [1.0, 1.0]
 
 
 class TestZeroVariance:
@@ -276,13 +267,6 @@ class TestStreaming:
                 sizes.append(sum(x.nelement() * x.element_size() for x in metrics.state_dict().values()))
             assert sizes[0] == sizes[1] == sizes[2] < limit
 
-    def test_sums_keep_counting_beyond_float32(self) -> None:
-        metric, one = RMSE(), torch.ones(1)
-        metric.total, metric.pixels = torch.tensor(2.0**40, dtype=torch.float64), torch.tensor(2**40)
-        metric.update(one + 1, None, one)
-        assert int(metric.pixels) == 2**40 + 1
-        assert float(metric.total) == 2.0**40 + 1
-
     def test_half_precision_is_computed_in_double(self) -> None:
         d, v, g = (x.half() for x in maps(20, 20))
         low, high = SequenceMetrics(), SequenceMetrics()
@@ -303,27 +287,11 @@ class TestStreaming:
         assert second.compute() == whole.compute()
         assert first.compute() == stale
 
-    def test_merging_after_compute_is_not_stale(self) -> None:
-        d, v, g = maps(10, 10)
-        a, b = Delta1(), Delta1()
-        a.update(d, v, g)
-        assert float(a.compute()["pixels"]) == 100
-        b.update(d, v, g)
-        a.merge_state(b)
-        assert float(a.compute()["pixels"]) == 200
-
     def test_other_settings_do_not_merge(self) -> None:
         with pytest.raises(ValueError, match=r"settings.*0\.25.*0\.5"):
             ECEDelta(0.25).merge_state(ECEDelta(0.5))
         with pytest.raises(ValueError, match="other must hold"):
             SequenceMetrics().merge_state(SequenceMetrics(with_variance=False))
-
-    def test_reset(self) -> None:
-        d, v, g = maps(10, 10)
-        metrics = SequenceMetrics()
-        metrics.update(d, v, g)
-        metrics.reset()
-        assert metrics.compute()["pixels"] == 0
 
 
 class TestSequence:

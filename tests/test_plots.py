@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -19,7 +19,6 @@ from ufmstar_torch.eval.run.colours import (
     INVALID_GREY,
     ColourScale,
     colour_table,
-    robust_range,
 )
 from ufmstar_torch.eval.run.panels import FramePanel, contact_sheet, fit_scales, map_columns
 from ufmstar_torch.eval.run.video import preview_frame, write_video
@@ -69,28 +68,6 @@ class TestColours:
             distance = np.abs(colour_table(name).astype(int) - INVALID_GREY).max(1)
             assert distance.min() > 40
 
-    def test_robust_range(self) -> None:
-        values = np.linspace(0.0, 100.0, 10_001)
-        values[-5:] = 1e9
-        assert robust_range([values], from_zero=False) == pytest.approx((1.0, 99.0))
-        assert robust_range([values], from_zero=True)[0] == 0.0
-        half = np.where(values < 50, values, np.nan)
-        assert robust_range([half], from_zero=False)[1] == pytest.approx(49.5, abs=0.01)
-        both = robust_range([np.array([1.0]), np.array([np.nan, 3.0])], from_zero=False)
-        assert both == pytest.approx((1.02, 2.98))
-
-    def test_ranges_without_extent(self) -> None:
-        for maps in ([], [np.full(4, np.nan)], [np.zeros(4)], [np.full(4, 2.0)]):
-            low, high = robust_range(maps, from_zero=False)
-            assert low < high
-        with pytest.raises(ValueError, match="low must be less"):
-            ColourScale(1.0, 1.0, DEPTH_MAP)
-
-    def test_missing_matplotlib_names_the_extra(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setitem(sys.modules, "matplotlib", None)
-        with pytest.raises(ImportError, match=r"ufmstar-torch\[viz\]"):
-            contact_sheet([panel()], "x.png")
-
 
 class TestContactSheet:
     def test_columns_show_the_maps_on_common_scales(self, tmp_path: Path) -> None:
@@ -103,12 +80,6 @@ class TestContactSheet:
         for one in panels:
             expected = {tuple(c) for c in scales.depth.rgb(one.maps["depth"]).reshape(-1, 3).tolist()}
             assert len(expected & shown) > 0.95 * len(expected)
-
-    def test_without_ground_truth_there_is_no_error_column(self, tmp_path: Path) -> None:
-        contact_sheet([panel(error=False)], tmp_path / "without.png")
-        contact_sheet([panel(error=False), panel("b")], tmp_path / "mixed.png")
-        widths = [load(tmp_path / f"{n}.png").shape[1] for n in ("without", "mixed")]
-        assert widths[1] / widths[0] == pytest.approx((1.2 + 4 * 2.4) / (1.2 + 3 * 2.4), abs=0.02)
 
     def test_sigma_and_error_share_a_scale(self, tmp_path: Path) -> None:
         one = panel()  # the error is twice sigma
@@ -142,16 +113,6 @@ class TestContactSheet:
         assert (tmp_path / "s.png").read_bytes() == before
         assert [p.name for p in tmp_path.iterdir()] == ["s.png"]
 
-    def test_errors_name_the_argument(self) -> None:
-        with pytest.raises(ValueError, match="at least one frame"):
-            contact_sheet([], "x.png")
-        depth = np.ones((2, 3))
-        in_floats: Any = np.ones((2, 3, 3))
-        with pytest.raises(ValueError, match="image must be uint8"):
-            FramePanel("a", in_floats, {"depth": depth, "sigma": depth})
-        with pytest.raises(ValueError, match="sigma must have the depth's shape"):
-            FramePanel("a", np.ones((2, 3, 3), np.uint8), {"depth": depth, "sigma": np.ones((3, 3))})
-
 
 class TestPreview:
     @pytest.mark.parametrize("size", [(24, 32), (15, 17), (16, 9), (1, 1)])
@@ -164,12 +125,6 @@ class TestPreview:
         left = step * size[1] + 4  # behind the image and a gap
         cell = frame[22 : 22 + 240 : step, left : left + step * size[1] : step]
         np.testing.assert_array_equal(cell, fit_scales([one]).depth.rgb(one.maps["depth"]))
-
-    def test_size_does_not_depend_on_the_frame(self) -> None:
-        columns, alone = map_columns([panel()]), map_columns([panel(error=False)])
-        without = preview_frame(panel(error=False), columns)
-        assert preview_frame(panel(), columns).shape == without.shape
-        assert preview_frame(panel(error=False), alone).shape[1] < without.shape[1]
 
     def test_video_reads_back(self, tmp_path: Path) -> None:
         import cv2
@@ -201,20 +156,40 @@ class TestPreview:
         assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 3
         video.release()
 
-    def test_no_frame_no_file(self, tmp_path: Path) -> None:
-        write(tmp_path / "v.mp4", [])
-        assert list(tmp_path.iterdir()) == []
 
-    def test_errors(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        with pytest.raises(ValueError, match="path must end in"):
-            write(tmp_path / "v.avi", [])
-        with pytest.raises(ValueError, match="fps"):
-            write(tmp_path / "v.mp4", [], 0)
-        with pytest.raises(ValueError, match="even size"):
-            write(tmp_path / "v.mp4", [np.zeros((3, 4, 3), np.uint8)])
-        frames = [np.zeros((32, 32, 3), np.uint8), np.zeros((32, 34, 3), np.uint8)]
-        with pytest.raises(ValueError, match="size of the first"):
-            write(tmp_path / "v.mp4", frames)
-        monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-        with pytest.raises(ImportError, match=r"ufmstar-torch\[eval\]"):
-            write(tmp_path / "v.mp4", [])
+FLOATS: Any = np.ones((2, 3, 3))
+MAPS = {"depth": np.ones((2, 3)), "sigma": np.ones((2, 3))}
+
+
+@pytest.mark.parametrize(
+    ("call", "match"),
+    [
+        (lambda: ColourScale(1.0, 1.0, DEPTH_MAP), "low must be less"),
+        (lambda: contact_sheet([], "x.png"), "at least one frame"),
+        (lambda: FramePanel("a", FLOATS, MAPS), "image must be uint8"),
+        (lambda: FramePanel("a", FLOATS.astype(np.uint8), MAPS | {"sigma": np.ones((3, 3))}), "sigma must have"),
+        (lambda: write(Path("v.avi"), []), "path must end in"),
+        (lambda: write(Path("v.mp4"), [], 0), "fps"),
+        (lambda: write(Path("v.mp4"), [np.zeros((3, 4, 3), np.uint8)]), "even size"),
+        (lambda: write(Path("v.mp4"), [np.zeros((32, n, 3), np.uint8) for n in (32, 34)]), "size of the first"),
+    ],
+)
+def test_refusals(call: Callable[[], object], match: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=match):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("missing", "extra", "call"),
+    [
+        ("matplotlib", "viz", lambda: contact_sheet([panel()], "x.png")),
+        ("imageio_ffmpeg", "eval", lambda: write(Path("v.mp4"), [])),
+    ],
+)
+def test_missing_packages_name_their_extra(
+    missing: str, extra: str, call: Callable[[], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(ImportError, match=rf"ufmstar-torch\[{extra}\]"):
+        call()

@@ -16,9 +16,9 @@ import scenes
 import ufmstar_torch.regress as regress_module
 from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.kernels import regress_cpu, sample_cpu
+from ufmstar_torch.kernels import regress_cpu
 from ufmstar_torch.kernels.vectors_cpu import vectors
-from ufmstar_torch.regress import distribute, regress, regress_image, sample_mean, sample_pixels, shares, smooth
+from ufmstar_torch.regress import distribute, regress, regress_image, sample_pixels, shares, smooth
 
 pytestmark = pytest.mark.numerics
 
@@ -221,28 +221,6 @@ def test_smooth_averages_where_both_are_known(function, dtype):
     memory, shown = function(before, now, 0.25)
     torch.testing.assert_close(memory, torch.tensor([[[1.5, 4.0, 2.0, nan]]]), equal_nan=True)
     torch.testing.assert_close(shown, torch.tensor([[[1.5, 4.0, nan, nan]]], dtype=dtype), equal_nan=True)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_compiled_image_average_equals_the_reference(dtype):
-    generator = torch.Generator().manual_seed(2)
-    valid = torch.rand(6, 20, 30, generator=generator) > torch.tensor([0.1, 0.5, 0.9, 0.9985, 1.0, 0.0])[:, None, None]
-    for count in (1, 37, 64, 600):
-        index, used = sample_pixels(valid, count, seed=3)
-        fast = sample_cpu.sample_pixels(valid, count, 3)
-        assert torch.equal(fast[0], index)
-        assert torch.equal(fast[1], used)
-        variance = torch.rand(6, count, generator=generator, dtype=dtype)
-        variance[torch.rand(6, count, generator=generator) < 0.3] = torch.nan
-        measured = torch.rand(6, count, generator=generator) > 0.4
-        given = (variance.where(used, torch.nan), measured, used, valid.sum((1, 2)))
-        slow, fast = sample_mean(*given), sample_cpu.sample_mean(*given)
-        for name, value in vars(slow).items():
-            assert getattr(fast, name).dtype == value.dtype, name
-            torch.testing.assert_close(
-                getattr(fast, name), value, rtol=8 * torch.finfo(dtype).eps, atol=0, equal_nan=True
-            )
-        assert sample_cpu.sample_mean(given[0].requires_grad_(), *given[1:]).mean.requires_grad
 
 
 def test_sample_is_seeded_uniform_and_valid():

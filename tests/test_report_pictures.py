@@ -20,7 +20,6 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLL
 from ufmstar_torch.eval.report import pictures as pictures_module
-from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.examples import Example, RowMaps, find_examples
 from ufmstar_torch.eval.report.pictures import (
     BREAKDOWN,
@@ -34,18 +33,15 @@ from ufmstar_torch.eval.report.pictures import (
     draw_comparison,
     draw_strip,
     figures_of,
-    file_name,
     fit_strip_scales,
     largest_difference,
     mean_nll,
-    pictures_of,
     strip_rows,
 )
 from ufmstar_torch.eval.report.rooms import (
     SIGMAS,
     Projection,
     Snapshot,
-    choose_times,
     draw_room,
     find_rooms,
     oblique_view,
@@ -54,7 +50,6 @@ from ufmstar_torch.eval.report.rooms import (
 from ufmstar_torch.eval.report.write import write_report
 from ufmstar_torch.eval.run.colours import INVALID_GREY
 from ufmstar_torch.eval.run.panels import break_name
-from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.work_items import WorkItem
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -167,13 +162,6 @@ class TestStrips:
         # No truth on the right half: of the truth itself, two errors and two NLLs.
         assert pixels(path, np.full(3, INVALID_GREY)) == pytest.approx(2.5 * CELL, rel=0.12)
 
-    def test_one_scale_for_all_rows(self) -> None:
-        rows = {"a": RowMaps(full(2.0), full(0.01)), "b": RowMaps(full(2.9), full(4.0))}
-        scales = fit_strip_scales(example(rows), ["a", "b"])
-        values = np.concatenate([np.full(192, v) for v in (1.0, 0.1, 0.1, 2.0)])
-        assert scales.length.low == 0
-        assert scales.length.high == pytest.approx(np.percentile(values, 99), rel=1e-5)
-
     def test_breakdown_adds_up(self, tmp_path: Path) -> None:
         parts = {"aleatoric": full(0.0625), "disagreement": full(0.1875)}
         one = example({"star": RowMaps(full(2.0), full(0.25), **parts)})
@@ -219,20 +207,6 @@ class TestCompare:
 
 
 class TestProjection:
-    def test_axis_aligned(self) -> None:
-        view = Projection(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), UP)
-        axes, angle = project(view, np.diag([0.04, 9.0, 0.25])[None])
-        np.testing.assert_allclose(view.plane(np.array([[1.0, 2.0, 3.0]])), [[1.0, 3.0]])
-        np.testing.assert_allclose(axes, [[0.5 * SIGMAS, 0.2 * SIGMAS]])
-        assert abs(angle[0]) == pytest.approx(90)
-
-    def test_a_line_at_thirty_degrees(self) -> None:
-        along = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0])
-        view = Projection(np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), UP)
-        axes, angle = project(view, np.outer(along, along)[None])
-        assert angle[0] == pytest.approx(30)
-        np.testing.assert_allclose(axes, [[SIGMAS, 0.0]], atol=1e-7)
-
     @settings(max_examples=25)
     @given(st.integers(0, 2**32 - 1))
     def test_the_ellipse_reaches_as_far_as_the_gaussian(self, seed: int) -> None:
@@ -261,14 +235,6 @@ class TestProjection:
         np.testing.assert_allclose(oblique.vertical, above, atol=1e-12)
         assert oblique.towards @ above == pytest.approx(np.sin(np.radians(35)))
         assert oblique.towards @ forward == pytest.approx(-np.cos(np.radians(35)))
-
-    def test_a_camera_that_looks_straight_down(self) -> None:
-        T = np.eye(4)[None].repeat(2, 0)
-        T[0, :3, :3] = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
-        T[1, :3, 1] = 0  # no up on average either
-        T[0, :3, 1] = 0
-        view = oblique_view(T)
-        np.testing.assert_allclose(np.linalg.norm([view.right, view.up, view.towards], axis=1), 1, atol=1e-12)
 
 
 def snapshot(frame: str, mean: list[list[float]], m: list[float], sigma: float = 0.3) -> Snapshot:
@@ -329,11 +295,6 @@ class TestRooms:
         with pytest.raises(ValueError, match=r"UfMstar-MCD_1\.npz must hold mean_world.*; covariance_world"):
             find_rooms(tmp_path)
 
-    def test_times_are_spread_and_end_with_the_last(self) -> None:
-        times = [snapshot(str(n), [[0, 0, 0]], [0.0]) for n in range(9)]
-        assert [t.frame for t in choose_times(times, 3)] == ["0", "4", "8"]
-        assert choose_times(times[:2], 3) == times[:2]
-
 
 class TestChoice:
     def test_frames_of_many_sequences_first(self) -> None:
@@ -346,10 +307,6 @@ class TestChoice:
         noisy = Row(rows[4].method, Setting(skip=2))
         assert strip_rows([*rows, noisy], "ensemble") == [rows[1], rows[3], rows[4]]
         assert strip_rows(rows[:3], "ensemble") == [rows[1], rows[2]]
-
-    def test_names_of_files_never_collide(self) -> None:
-        assert file_name("a", "b/c") != file_name("a", "b c")
-        assert set(file_name("<x>", "../..", "é")) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJ0123456789-_.")
 
 
 class TestWritePictures:
@@ -374,7 +331,3 @@ class TestWritePictures:
         assert write_report(out).undrawn == {f"{KITCHEN[1]}, frame 7: breakdown": "broken"}
         index = json.loads((out / "figures" / "pictures.json").read_text())
         assert [p["kind"] for p in index["pictures"]] == [STRIP, COMPARE, ROOM]
-
-    def test_nothing_kept_nothing_drawn(self, tmp_path: Path) -> None:
-        results = Results(tmp_path, {"suite": "s"}, (Record("s", "d", "q", "N", "Ensemble"),))
-        assert list(pictures_of(results, tmp_path)) == []

@@ -17,8 +17,6 @@ from ufmstar_torch.eval.methods.setting import Setting, setting_from
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.figures_sweep import default_value, draw_sweep, sweep_lines, sweeps
-from ufmstar_torch.eval.report.means import mean_of
-from ufmstar_torch.eval.report.names import ECE_DELTA
 from ufmstar_torch.eval.report.write import figures_of
 
 STAR = Method.parse("UfM*-DepthOnly")
@@ -70,12 +68,7 @@ def drawn(axes: Any) -> dict[str, Any]:
 
 
 def ends(axes: Any) -> set[str]:
-    return {text.get_text() for text in axes.texts}
-
-
-def test_every_setting_that_the_suite_varies_is_swept(results):
-    assert {name for base, name in sweeps(results) if base == "depth_only"} == VARIED
-    assert set(suite_named("ablation-anchors").sweep) == VARIED
+    return {text.get_text() for text in axes.get_legend().get_texts()}
 
 
 @pytest.mark.parametrize(
@@ -129,17 +122,6 @@ def test_pose_noise_has_lines_of_both_and_their_difference_at_the_same_value(res
     np.testing.assert_allclose(below["anchored"].get_ydata(), np.subtract(*expected[::-1]))
     assert ends(figure.axes[1]) == {"UfM*", "anchored"}
     assert figure.axes[5].get_xlabel() == "rotation drift [°/√frame]"
-
-
-def test_the_band_of_a_line_with_anchors_is_its_interval(results):
-    axes = draw_sweep(results, "depth_only", "rotation_drift").axes[1]
-    line = next(result for result in sweep_lines(results, "depth_only", "rotation_drift") if result.rest)
-    mean = mean_of(line.points[0].records, ECE_DELTA)
-    values = np.array(list(SEQUENCES.values())) / 2
-    assert (mean.value, mean.sequences) == (pytest.approx(values.mean()), 5)
-    assert mean.half == pytest.approx(2.7764451051977934 * values.std(ddof=1) / math.sqrt(5))
-    low = [band.get_paths()[0].vertices for band in axes.collections]
-    assert any(vertices[:, 1].min() == pytest.approx(mean.value - mean.half) for vertices in low)
 
 
 @pytest.mark.parametrize("name", ["track_noise", "anchors.half_life", "anchor_count"])
@@ -198,4 +180,4 @@ def test_nlls_beyond_measure_leave_the_others_to_be_seen():
 
 def test_the_report_has_them(results):
     names = {name for name, _ in figures_of(results) if name.startswith("sweep")}
-    assert names >= {f"sweep depth_only {name}" for name in VARIED} | {"sweep changes depth_only"}
+    assert names >= {f"sweep depth_only {name}" for name in VARIED}

@@ -472,6 +472,10 @@ def test_a_folder_of_someone_else_is_left_alone(path, tmp_path, options):
     assert outputs(out) == before
 
 
+def test_an_empty_folder_will_do(path, tmp_path):
+    assert run(network_job(path, frames=slice(0, 1)), tmp_path, resume=True)["state"] == "finished"
+
+
 def test_two_runs_do_not_share_a_folder(path, tmp_path):
     out = tmp_path / "out"
     refused = []

@@ -13,6 +13,7 @@ from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.check.depth_image_fit import depth_edges, depth_image_fit
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
+from ufmstar_torch.eval.sequences.poses import OURS
 
 SIZE = (120, 160)
 
@@ -62,6 +63,19 @@ def test_a_camera_that_stands_still_leaves_it_undecided(walk):
     assert result.ok
     assert any("tell the depth's scale" in text for text in result.undecided)
     assert any("does not tell the poses from world-to-camera" in text for text in result.undecided)
+
+
+@pytest.mark.parametrize("writer", ["write_tum", "write_seven_scenes", "write_scannet", "write_tartanair"])
+def test_every_generated_layout_is_consistent(tmp_path, writer):
+    path = getattr(layouts, writer)(tmp_path, frames=8)[0]
+    result = check_sequence(open_sequence(path))
+    assert result.ok
+    assert result.error < 0.02
+    assert result.poses == OURS
+    if writer == "write_seven_scenes":
+        own = check_sequence(open_sequence(path, register=False))
+        assert own.ok
+        assert own.registration is None  # the sequence does not claim that depth lies on the images
 
 
 def test_depth_edges_lie_on_the_near_side_and_planes_have_none():

@@ -70,6 +70,13 @@ def test_links_in_a_circle_end_and_links_do_not_double(root):
     assert {name: layout for name, (layout, _) in found(root, max_depth=9).items()} == NAMES
 
 
+def test_a_link_to_somewhere_else_counts(root, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    layouts.write_generic(elsewhere, frames=1)
+    (root / "linked").symlink_to(elsewhere)
+    assert set(found(root)) == {*NAMES, "linked__walk"}
+
+
 def test_hidden_folders_and_those_of_others_are_left_out(root, monkeypatch):
     shutil.copytree(root / "a" / "b" / "walk", root / ".trash" / "walk")
     shut = root / "lost+found"

@@ -115,6 +115,18 @@ def test_tum_intrinsics_follow_the_camera_or_the_user(tmp_path):
     np.testing.assert_array_equal(open_sequence(path).intrinsics, K_TUM_FR3)
 
 
+def test_tum_other_trajectory_and_bad_lines(tmp_path):
+    path, truth = layouts.write_tum(tmp_path)
+    moved = [line.split() for line in (path / "groundtruth.txt").read_text().splitlines()[1:]]
+    slam = "\n".join(" ".join([w[0], str(float(w[1]) + 5), *w[2:]]) for w in moved)
+    (tmp_path / "slam.txt").write_text(slam)
+    sequence = open_sequence(path, trajectory=tmp_path / "slam.txt")
+    np.testing.assert_allclose(sequence[0].T_world_cam[0, 3], truth.T_world_cam[0][0, 3] + 5)
+    (path / "rgb.txt").write_text("# x\n10.0 rgb/a.png\nten rgb/b.png\n")
+    with pytest.raises(ValueError, match=r"rgb\.txt:3: expected 'timestamp filename'"):
+        open_sequence(path)
+
+
 # ---- 7-Scenes
 
 
@@ -143,6 +155,13 @@ def test_seven_scenes_unregistered(tmp_path):
         np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i])
         np.testing.assert_allclose(frame.depth, of_depth.depths[i], atol=5e-4 + 1e-6)
         np.testing.assert_allclose(frame.depth_intrinsics, of_depth.K)
+
+
+def test_seven_scenes_own_calibration(tmp_path):
+    path, _, of_depth = layouts.write_seven_scenes(tmp_path)
+    sequence = open_sequence(path, T_color_depth=np.eye(4), intrinsics=of_depth.K, depth_intrinsics=of_depth.K)
+    np.testing.assert_allclose(sequence[0].depth, of_depth.depths[0], atol=5e-4 + 1e-6)
+    np.testing.assert_allclose(sequence[0].T_world_cam, of_depth.T_world_cam[0])
 
 
 def test_seven_scenes_invalid_and_missing(tmp_path):
@@ -210,6 +229,16 @@ def test_scannet_counts_lost_and_missing_poses(tmp_path):
     assert reasons(sequence) == {"1": "non-finite pose", "2": "missing pose file"}
     assert sequence.without_depth == ("3",)
     assert sequence.names_on_disk == ("0", "1", "2", "3", "4", "5")
+
+
+def test_scannet_resized_export_keeps_the_original_intrinsics_file(tmp_path):
+    path, of_color, of_depth = layouts.write_scannet(tmp_path)
+    for name, K in (("color", (1170, 1171, 648, 484)), ("depth", (578, 578, 320, 240))):
+        fx, fy, cx, cy = K
+        np.savetxt(path / "intrinsic" / f"intrinsic_{name}.txt", [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    sequence = open_sequence(path)
+    np.testing.assert_allclose(sequence.intrinsics, of_color.K)
+    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K)
 
 
 # ---- TartanAir

@@ -324,6 +324,13 @@ def test_mixed_tours_begin_at_home_and_end_in_a_hall(mixed):
     assert of_home <= set(HOME_TEXTURES)
 
 
+def test_shadows_darken_what_a_box_hides_from_the_lamp(home):
+    assert home.volumes.min() < 0.3
+    assert home.volumes.max() == 1
+    # High up in a room, hardly anything stands between a point and the lamps; near the floor, much does.
+    assert home.volumes[:, 0, 2].mean() > home.volumes[:, 0, -1].mean()
+
+
 def test_the_sensor_is_mild_and_repeats(home):
     pose = tour_path(home, 10)[4]
     clean = render(home, pose, K, 24, 32).image.double()
@@ -363,6 +370,17 @@ def test_image_and_depth_of_a_frame_come_from_one_rendering(monkeypatch):
     assert len(calls) == 9
     np.testing.assert_array_equal(sequence[0].image, frames[0].image)
     assert len(calls) == 10, "only a few are kept"
+
+
+def test_path_seed_and_sensor_are_options_of_the_name():
+    plain, other = (
+        open_sequence("tour:2?frames=4&size=24x32"),
+        open_sequence("tour:2?frames=4&size=24x32&path=3&sensor=0"),
+    )
+    assert not np.array_equal(plain[0].T_world_cam, other[0].T_world_cam)
+    same_seed = open_sequence("tour:2?size=24x32&path=3&frames=4")
+    np.testing.assert_array_equal(same_seed[1].depth, other[1].depth)
+    assert not np.array_equal(same_seed[1].image, other[1].image)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from modules import same, snapshot, unchanged
 
 import scenes
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
-from ufmstar_torch.eval.methods.ufm_cloud import Cloud
 
 H, W, FRAMES = 15, 20, 36
 CAP = 420
@@ -145,16 +144,6 @@ def test_a_still_camera_gives_the_mean_variance_plus_the_spread_of_the_depths():
     assert ufm.count.unique().tolist() == [9]
 
 
-def test_depth_only_needs_no_variance_and_starts_from_zero():
-    ufm = UfM(dtype=torch.float64)
-    K4 = torch.tensor(scenes.intrinsics(4, 6))
-    eye = torch.eye(4, dtype=torch.float64)
-    first = ufm(torch.full((1, 4, 6), 2.0), eye, K4)
-    assert first.variance.eq(0).all()
-    second = ufm(torch.full((1, 4, 6), 3.0), eye, K4)
-    assert torch.allclose(second.variance, torch.tensor(0.25))
-
-
 def test_full_mode_adds_both_variances_and_each_can_be_left_out():
     depth, A, E = (torch.full((1, 4, 6), x) for x in (2.0, 0.3, 0.5))
     args = (depth, torch.eye(4), torch.tensor(scenes.intrinsics(4, 6)), A, E)
@@ -215,14 +204,6 @@ def test_no_occlusion_test_and_nothing_behind_the_camera():
     assert out.statistics.new.tolist() == [4]
 
 
-def test_a_point_in_the_cameras_plane_harms_nobody():
-    ufm = UfM(dtype=torch.float64)
-    ufm(plane(1.0), torch.eye(4, dtype=torch.float64), K1)
-    out = ufm(plane(1.0), moved(0, 0, 1.0), K1)
-    assert out.statistics.fused.tolist() == [0]
-    assert out.variance.isfinite().all()
-
-
 def test_negative_covariances_are_kept():
     """Corners of a wide view have off-diagonal entries of both signs; the release would zero half of them."""
     _, out = still([2.0], [0.01], 1)
@@ -241,13 +222,6 @@ def test_points_out_of_view_are_pruned_first_and_the_oldest_of_them():
     assert ufm.clouds()[0].mean[:, 0].tolist() == [3, 100, 101, 102, 103, 200, 201, 202, 203]
     ufm(plane(1.0), moved(0.0), K1)  # the oldest is in view again, the others are not
     assert ufm.clouds()[0].mean[:, 0].tolist() == [3, 103, 200, 201, 202, 203, 0, 1, 2]
-
-
-def test_pruning_takes_points_in_view_when_none_other_is_left():
-    ufm = UfM(UfMConfig(max_points=3), dtype=torch.float64)
-    out = ufm(plane(1.0), torch.eye(4, dtype=torch.float64), K1)
-    assert out.statistics.dropped.tolist() == [1]
-    assert ufm.clouds()[0].mean[:, 0].tolist() == [1, 2, 3]
 
 
 def test_memory_per_point_is_as_documented():
@@ -274,17 +248,6 @@ def test_invalid_pixels_are_left_out_and_points_there_left_alone():
     assert out.statistics.valid_pixels.tolist() == [23]
     assert torch.equal(after.moments[8], before.moments[8])
     assert after.count.tolist() == [2 if n == 8 else 3 for n in range(24)]
-
-
-def test_a_frame_without_a_valid_pixel_changes_no_point():
-    ufm, _ = still([2.0], [0.01], 1)
-    before = snapshot(ufm)
-    eye, K4 = torch.eye(4, dtype=torch.float64), torch.tensor(scenes.intrinsics(4, 6))
-    out = ufm(torch.zeros(1, 4, 6), eye, K4)
-    assert out.variance.isnan().all()
-    assert torch.equal(ufm.moments, before["moments"])
-    empty = UfM()(torch.zeros(1, 4, 6), eye, K4)
-    assert empty.statistics.points.tolist() == [0]
 
 
 def with_pose(T):
@@ -315,24 +278,6 @@ def test_bad_input_is_named_and_leaves_the_state(name):
     assert unchanged(ufm, before)
 
 
-def test_one_bad_stream_among_good_ones_stops_the_whole_frame():
-    ufm = UfM(dtype=torch.float64)
-    depth, pose, intrinsics = (x.repeat(2, 1, 1) for x in frame(0))
-    ufm(depth, pose, intrinsics)
-    before = snapshot(ufm)
-    pose[1, 0, 3] = torch.inf
-    with pytest.raises(ValueError, match="stream 1: pose holds NaN or infinity"):
-        ufm(depth, pose, intrinsics)
-    assert unchanged(ufm, before)
-
-
-def test_nothing_given_is_changed():
-    given_ = frame(0, variances()[0])
-    copies = [x.clone() for x in given_]
-    UfM()(*given_)
-    assert all(same(a, b) for a, b in zip(given_, copies, strict=True))
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -350,17 +295,6 @@ def test_impossible_settings_are_refused(change):
     (name,) = change
     with pytest.raises(ValueError, match=f"UfMConfig.{name}"):
         UfMConfig(**change)
-
-
-def test_settings_go_through_a_dict_and_unknown_ones_are_refused():
-    config = UfMConfig(max_points=300_000, add_epistemic=False)
-    assert UfMConfig.from_dict(config.to_dict()) == config
-    with pytest.raises(ValueError, match="max_point"):
-        UfMConfig.from_dict({"max_point": 3})
-    with pytest.raises(TypeError, match="config must be a UfMConfig"):
-        UfM({"max_points": 3})
-    with pytest.raises(ValueError, match="dtype must be"):
-        UfM(dtype=torch.float16)
 
 
 # ---- the state ----
@@ -465,15 +399,6 @@ def test_deepcopy_casts_and_inference_mode():
     assert "max_points=100000" in repr(ufm)
 
 
-def test_autocast_does_not_touch_it():
-    plain, cast = UfM(), UfM()
-    for i in range(3):
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            a = cast(*frame(i)).variance
-        b = plain(*frame(i)).variance
-    assert same(a, b)
-
-
 def test_layouts_and_half_precision_depth():
     depth, pose, intrinsics = frame(0, dtype=torch.float32)
     out = UfM()(depth[:, None].half(), pose, intrinsics)
@@ -512,13 +437,6 @@ def test_the_cap_holds_and_covariances_stay_positive(cap, seed):
         assert (out.variance[out.valid] >= 0).all()
         assert torch.linalg.eigvalsh(cloud.covariance).min() > -1e-12
         assert int(out.statistics.fused + out.statistics.new) >= int(out.statistics.valid_pixels)
-
-
-def test_a_cloud_is_what_it_says():
-    moments = torch.arange(18.0).reshape(2, 9)
-    cloud = Cloud(moments, torch.ones(2, dtype=torch.int32))
-    assert cloud.mean.tolist() == [[0, 1, 2], [9, 10, 11]]
-    assert cloud.covariance[0].tolist() == [[3, 4, 5], [4, 6, 7], [5, 7, 8]]
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

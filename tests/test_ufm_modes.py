@@ -71,11 +71,3 @@ def test_agrees_with_the_loops(mode, cap):
         pruned += int(out.statistics.dropped)
     assert (pruned > 0) == (cap is not None)
     assert int(ufm.clouds()[0].count.max()) > 2, "points must have been seen again"
-
-
-def test_full_takes_the_spread_of_the_members_as_epistemic():
-    depths = np.stack([drawn(3, member)[0] for member in range(MEMBERS)])
-    text = full(3)
-    seen = np.isfinite(depths[0])
-    np.testing.assert_allclose(text.depth[0].numpy()[seen], depths.mean(0)[seen], rtol=1e-12)
-    np.testing.assert_allclose(text.epistemic_variance[0].numpy()[seen], depths.var(0)[seen], atol=1e-12)

@@ -1,4 +1,4 @@
-"""Compilation before the first frame, and in two processes."""
+"""Compilation: before the first frame, kept on disk, through numba's private parts."""
 
 from __future__ import annotations
 
@@ -8,21 +8,19 @@ import json
 import os
 import subprocess
 import sys
-from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from numba.core import event
+from numba.core import codegen, compiler, event, typed_passes, untyped_passes
 
+from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.engine import warm_up as commands
-from ufmstar_torch.kernels import compile_beside, compile_cpu
-from ufmstar_torch.kernels.compile_beside import compiling_beside
-from ufmstar_torch.kernels.compile_cpu import kernel
-from ufmstar_torch.kernels.regress_tiles_cpu import exact
+from ufmstar_torch.kernels import compile_cpu
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part, zeros
+from ufmstar_torch.warm_up import warm_up
 
-JOB = ("ufmstar_torch.warm_up", "regression", {"kind": "exact"})
 COLD = """
-import json, sys
-import torch
+import json, torch
 from numba.core import event
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.engine.warm_up import metrics, preprocessing
@@ -33,130 +31,113 @@ with event.install_recorder("numba:compile") as compiled:
 names = {one.data["dispatcher"].py_func.__name__ for _, one in compiled.buffer}
 ufm, pose = UfMStar(), torch.eye(4)
 depth = 2 + torch.rand(1, 48, 64, generator=torch.Generator().manual_seed(0)).cumsum(2) / 10
-for _ in range(2):
-    out = ufm(depth, pose, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]))
-print(json.dumps({"names": sorted(names), "steps": steps, "variance": out.variance.sum().item()}))
+with event.install_recorder("numba:compile") as late:
+    for _ in range(2):
+        out = ufm(depth, pose, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]))
+print(json.dumps({"names": sorted(names), "late": len(late.buffer), "steps": steps, "sum": out.variance.sum().item()}))
 """
 
 
+@part
+def shifted(n, more):
+    """Numbers from ``more`` on."""
+    out = empty((2, n), np.float32)
+    for i in range(n):
+        out[0, i] = out[1, i] = i + more
+    return out
+
+
+@leaf
+def summed(values):
+    """The sum of a row."""
+    total = 0.0
+    for i in range(values.size):
+        total += values[i]
+    return total
+
+
 def compiled_function():
-    """A new function of which no cache has a copy."""
-    names: dict = {}
-    exec("def plus_one(x):\n    return x + 1", names)
-    return kernel(names["plus_one"])
+    """A new kernel of which no cache has a copy, with a part and a leaf."""
+    names: dict = {"shifted": shifted, "summed": summed, "zeros": zeros, "np": np}
+    exec("def both(n):\n    rows = shifted(n, 1)\n    return summed(rows[0]), rows, zeros((n, 2), np.int64)", names)
+    return kernel(names["both"])
 
 
-@pytest.fixture
-def started(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """Commands of the processes that were started, which do nothing."""
-    commands: list[list[str]] = []
-
-    def popen(command, **_):
-        commands.append(command)
-        return process(["true"])
-
-    process = subprocess.Popen
-    monkeypatch.setattr(compile_beside.subprocess, "Popen", popen)
-    monkeypatch.setattr(compile_beside.os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
-    return commands
+def test_a_kernel_without_a_folder_to_be_kept_in_is_compiled_in_memory():
+    both = compiled_function()
+    assert both.stats.cache_path is None
+    total, rows, none = both(4)
+    assert total == 10.0
+    assert rows.dtype == np.float32
+    assert rows.tolist() == [[1.0, 2.0, 3.0, 4.0]] * 2
+    assert none.dtype == np.int64
+    assert none.tolist() == [[0, 0]] * 4
 
 
-def begin(dispatcher) -> event.Event:
-    return event.Event("numba:compile", event.EventStatus.START, {"dispatcher": dispatcher})
+def test_a_part_becomes_machine_code_in_its_kernel_alone(monkeypatch):
+    optimised = []
+    once = compile_cpu._Library._optimize_final_module
+    monkeypatch.setattr(
+        compile_cpu._Library, "_optimize_final_module", lambda self: (optimised.append(self.name), once(self))
+    )
+    assert compiled_function()(3)[0] == 6.0
+    assert optimised == ["both"]
 
 
-def test_a_kernel_without_a_folder_to_be_kept_in_is_compiled_in_memory(started):
-    plus_one = compiled_function()
-    assert plus_one.stats.cache_path is None
-    with compiling_beside([JOB]) as compiler:
-        assert plus_one(1) == 2
-        compiler.wait()
-    assert not started
+@pytest.mark.parametrize(
+    ("owner", "names"),
+    [
+        (codegen.JITCodeLibrary, "_optimize_functions _optimize_final_module _finalize_final_module"),
+        (codegen.JITCodeLibrary, "_finalize_dynamic_globals get_pointer_to_function codegen enable_object_caching"),
+        (codegen.JITCPUCodegen, "_module_pass_manager set_env"),
+        (untyped_passes, "TranslateByteCode FixupArgs IRProcessing GenericRewrites ReconstructSSA"),
+        (typed_passes, "NopythonTypeInference PreLowerStripPhis IRLegalization NativeLowering NoPythonBackend"),
+        (compiler.Flags, "values options copy"),
+    ],
+)
+def test_numba_has_the_private_parts_that_are_used(owner, names):
+    missing = [name for name in names.split() if not hasattr(owner, name)]
+    assert not missing, f"numba changed: {owner.__name__} has no {missing}; mend ufmstar_torch/kernels/compile_cpu.py"
 
 
-def test_the_first_compilation_starts_one_process(started):
-    with compiling_beside([JOB]) as compiler:
-        compiler.wait()
-        assert not started
-        for _ in range(2):
-            compiler.on_start(begin(exact))
-        compiler.wait()
-    assert [json.loads(command[-1]) for command in started] == [[list(JOB)]]
+def test_a_kept_kernel_says_in_its_stamp_what_it_depends_on():
+    from ufmstar_torch.kernels.regress_tiles_cpu import exact
+
+    assert exact._cache._cache_file._source_stamp[-1] == compile_cpu._SOURCES, "numba's cache compares another stamp"
 
 
-def test_garbage_is_collected_as_before(started):
+def test_no_garbage_is_collected_while_kernels_are_compiled():
+    during: list[bool] = []
     for enabled in (True, False):
         (gc.enable if enabled else gc.disable)()
-        with compiling_beside([]) as compiler:
-            compiler.on_start(begin(exact))
-            assert not gc.isenabled()
+        warm_up(UfMStar(), (16, 16), 1, lambda *_: during.append(gc.isenabled()))
         assert gc.isenabled() == enabled
         gc.enable()
-    with compiling_beside([JOB]):
-        assert gc.isenabled()
+    assert len(during) > 20
+    assert not any(during)
 
 
-def test_one_core_a_frozen_program_or_a_full_system_compile_in_one_process(started, monkeypatch):
-    def refused(*_, **__):
-        raise BlockingIOError("Resource temporarily unavailable")
-
-    for target, name, value in (
-        (compile_beside.os, "sched_getaffinity", lambda _: {0}),
-        (compile_beside.sys, "frozen", True),
-        (compile_beside.sys, "executable", ""),
-        (compile_beside.sys, "executable", "/opt/robot/bin/robot"),
-        (compile_beside.subprocess, "Popen", refused),
-    ):
-        with monkeypatch.context() as patch, compiling_beside([JOB]) as compiler:
-            patch.setattr(target, name, value, raising=False)
-            compiler.on_start(begin(exact))
-            compiler.wait()
-    assert not started
-
-
-def test_jobs_end_with_the_process_that_started_them(monkeypatch):
-    parents = iter([7, 7, 1])  # the parent is gone before the second job
-    monkeypatch.setattr(compile_beside.os, "getppid", lambda: next(parents))
-    done = []
-    monkeypatch.setattr(
-        compile_beside.importlib, "import_module", lambda name: SimpleNamespace(job=lambda: done.append(name))
-    )
-    compile_beside.main(json.dumps([("first", "job", {}), ("second", "job", {})]))
-    assert done == ["first"]
-
-
-def test_the_jobs_of_a_command_compile_all_in_one_pass():
-    names = ("metrics", "preprocessing", "dense_anchors")
-    jobs = json.dumps([JOB, *((commands.__name__, name, {}) for name in names)])
-    compile_beside.main(jobs)
-    with event.install_recorder("numba:compile") as compiled:
-        compile_beside.main(jobs)
-    assert not compiled.buffer
+def test_what_a_command_compiles_beforehand_is_compiled_once():
+    for job in (commands.metrics, commands.preprocessing, commands.dense_anchors):
+        job()
+        with event.install_recorder("numba:compile") as compiled:
+            job()
+        assert not compiled.buffer
 
 
 @pytest.mark.slow
-def test_a_cold_start_compiles_the_regression_beside_and_gives_the_same(tmp_path):
-    def run(folder) -> dict:
-        environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder), "OMP_NUM_THREADS": "1"}
+def test_a_cold_start_compiles_all_and_a_warm_one_nothing(tmp_path):
+    def run() -> dict:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "OMP_NUM_THREADS": "1"}
         done = subprocess.run([sys.executable, "-c", COLD], env=environment, capture_output=True, text=True, check=True)
         return json.loads(done.stdout)
 
-    cold, warm = run(tmp_path), run(tmp_path)
-    assert "scan_rows" in cold["names"]
-    if len(os.sched_getaffinity(0)) > 1:
-        assert not {
-            "describe",
-            "exact",
-            "exact_at",
-            "in_view",
-            "_choose",
-            "_mean",
-            "uncertainty_sums",
-            "_resized",
-        } & set(cold["names"])
+    cold, warm = run(), run()
+    assert {"scan_rows", "exact", "_resized"} <= set(cold["names"])
     assert not warm["names"]
-    assert cold["variance"] == warm["variance"]
+    assert cold["sum"] == warm["sum"]
     for result in (cold, warm):
+        assert not result["late"]
         assert result["steps"] == [[done, 23] for done in range(24)]
 
 

@@ -175,7 +175,7 @@ class MergeConfig(Checked):
 @dataclass(frozen=True)
 class UfMStarConfig(Checked):
     """All settings of UfM*. The defaults are the paper's, with two exceptions, each explained where it stands: the
-    pruning rule (``segment.prune``, docs/results/segmentation.md) and ``regression``. Extensions that are not in the
+    pruning rule (``segment.prune``, docs/algorithm.md) and ``regression``. Extensions that are not in the
     paper have a section each, None = off.
 
     Attributes:
@@ -271,11 +271,11 @@ class UfMStarConfig(Checked):
         The default differs in three respects. Here a Gaussian below 2,000 pixels or below 32 rows is dropped; by
         default only one that is below 200 pixels and below 16 rows. Measured on four sequences at 224 x 224, that is
         4 to 6 Gaussians over 55 to 85 % of the usable pixels here, and 12 to 24 over 92 to 99 % by default
-        (docs/results/segmentation.md); ECE_delta of FastDepth's depth alone, whole frame, is .562 here and .485 by
-        default, mean over the four (docs/results/real_video.md). The regression sums here over the Gaussians within
+        (docs/results/accuracy.md); ECE_delta of FastDepth's depth alone, whole frame, is .562 here and .485 by
+        default, mean over the four (docs/results/accuracy.md). The regression sums here over the Gaussians within
         .1 m, or .5 m where there are none; by default over all, the sum that this approximates to save time, which was
-        the better calibrated one (docs/results/analysis.md). And SPGF's thresholds have the camera's own focal length
-        here, the reference's by default, which made no difference on tours (docs/results/segmentation.md).
+        the better calibrated one. And SPGF's thresholds have the camera's own focal length
+        here, the reference's by default, which made no difference on tours.
         """
         segment = SPGFConfig(min_pixels=2000, min_rows=32, prune="either", slope_focal="camera")
         return cls(segment=segment, regression="neighbourhood")

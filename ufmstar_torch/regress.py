@@ -313,17 +313,6 @@ def sample_mean(variance: Tensor, measured: Tensor, used: Tensor, valid_pixels: 
     return SampleMean(mean, torch.where(count > 1, error, torch.nan), count, share)
 
 
-@dataclass(frozen=True)
-class SampleKernels:
-    """The replaceable parts of an image average: :func:`sample_pixels` and :func:`sample_mean`."""
-
-    pixels: Callable[[Tensor, int, int], tuple[Tensor, Tensor]]
-    mean: Callable[[Tensor, Tensor, Tensor, Tensor], SampleMean]
-
-
-SAMPLE_REFERENCE = SampleKernels(sample_pixels, sample_mean)
-
-
 @functools.lru_cache(maxsize=4)  # the draw costs more than a sample
 def random_order(pixels: int, seed: int) -> Tensor:
     """A permutation of the numbers below ``pixels``; not to be modified."""

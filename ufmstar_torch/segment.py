@@ -2,7 +2,7 @@
 
 Section "3D Gaussian segmentation" (Li, Karaman, Sze, ICRA 2022): every row is cut into segments that are
 lines in x and z (scanline segmentation), and the segments of successive rows are joined into planes
-(segment fusion). This is the vectorised torch reference; ``docs/results/segmentation.md`` explains the method.
+(segment fusion). This is the vectorised torch reference; ``docs/algorithm.md`` explains the method.
 
 Moments are kept about a point of the surface itself (first pixel of a segment, then the running mean, Chan et al.),
 never about the camera, so that they lose nothing to the distance from it.

@@ -24,7 +24,6 @@ from ufmstar_torch.kernels.select import (
     select_check,
     select_merge,
     select_posterior,
-    select_sample,
     select_step,
 )
 from ufmstar_torch.merge import merged
@@ -34,7 +33,7 @@ from ufmstar_torch.output import StepOutput
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
 from ufmstar_torch.posterior.update import Posterior
 from ufmstar_torch.recalibrate import Recalibration
-from ufmstar_torch.regress import Regression, regress
+from ufmstar_torch.regress import Regression, regress, sample_mean, sample_pixels
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
 from ufmstar_torch.step import Step, StepObserver
@@ -203,10 +202,9 @@ class UfMStar(StatefulModule):
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
-        kernels = select_sample(self.config.backend, frame.depth.device.type)
-        index, used = kernels.pixels(frame.valid, _sample_size(frame, pixels, fraction), seed)
+        index, used = sample_pixels(frame.valid, _sample_size(frame, pixels, fraction), seed)
         out, variance, _, _ = self._observe(frame, anchors, index, average=average)
-        sample = kernels.mean(variance, out.measured >= unmeasured.HALF, used, out.statistics.valid_pixels)
+        sample = sample_mean(variance, out.measured >= unmeasured.HALF, used, out.statistics.valid_pixels)
         return MeanUncertainty(sample.mean, sample.error, sample.count, sample.measured, out.statistics)
 
     def warm_up(

@@ -1,19 +1,17 @@
-"""Two frames of a wall, so that no frame of a user's waits for a compiler."""
+"""Compile all kernels by running two synthetic frames."""
 
 from __future__ import annotations
 
+import gc
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 
 from ufmstar_torch.anchors.hook import Anchors
-from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.kernels.select import compile_triangulation, select_beside
-from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.kernels.select import compile_triangulation
 
 if TYPE_CHECKING:
     from ufmstar_torch.ufmstar import UfMStar
@@ -22,35 +20,27 @@ _DISTANCE = 2.0  # [m]
 _TOTAL = 3 * 7  # stages of a step, for two frames and an image average
 
 
-_REGRESSION = "append"  # the stage before it
-
-
 class _Stages:
     """Counts the stages of the frames (``ufmstar_torch.step.StepObserver``), at whose first a stage compiles.
 
     Args:
         progress: see :func:`warm_up`.
         total: steps to report at most, whatever a step counts as a stage.
-        before_regression: called before every regression.
     """
 
-    def __init__(
-        self, progress: Callable[[int, int], object], total: int, before_regression: Callable[[], object]
-    ) -> None:
-        self._progress, self._total, self._before_regression = progress, total, before_regression
+    def __init__(self, progress: Callable[[int, int], object], total: int) -> None:
+        self._progress, self._total = progress, total
         self._done = -1
         self.step()
 
     def step(self) -> None:
-        """One more is done."""
+        """Report one more step."""
         self._done += 1
         self._progress(min(self._done, self._total), self._total)
 
     def stage(self, name: str) -> None:
         """A stage has ended."""
         self.step()
-        if name == _REGRESSION:
-            self._before_regression()
 
     def kernel(self, name: str) -> AbstractContextManager[object]:
         """Nothing is counted within a stage."""
@@ -65,9 +55,6 @@ def warm_up(
     also: Sequence[Callable[[], object]] = (),
 ) -> None:
     """Take a module through two frames of ``size`` (H, W) and an image average; see ``UfMStar.warm_up``.
-
-    On a machine's very first call the description of the segments, the regression, the image average and ``also`` are
-    compiled in a process beside this one, where there are two cores.
 
     Args:
         module: without frames so far; it is changed.
@@ -90,15 +77,9 @@ def warm_up(
     anchors = None
     if config.anchors is not None:
         anchors = Anchors(torch.zeros(streams, 1, 2, device=device), corner, 1e-4 * corner)
-    jobs: list[tuple[str, str, dict[str, Any]]] = [
-        (__name__, "description", {}),  # first: this process needs it soonest
-        (__name__, "regression", {"kind": config.regression}),
-        (__name__, "sampling", {}),
-    ]
-    jobs += [(function.__module__, function.__qualname__, {}) for function in also]
-    with warnings.catch_warnings(), select_beside(config.backend, device.type, jobs) as wait:
+    with warnings.catch_warnings(), _no_collection():
         warnings.simplefilter("ignore", UserWarning)  # a small image has no segment
-        stages = _Stages(progress or _unseen, _TOTAL + len(also), wait)
+        stages = _Stages(progress or _unseen, _TOTAL + len(also))
         module.observer = stages
         for _ in range(2):  # the fusion meets a mixture from the second on
             module(depth, pose, K, features=features, anchors=anchors)
@@ -110,34 +91,16 @@ def warm_up(
             stages.step()
 
 
-def description() -> None:
-    """Compile what turns segments of single-precision maps into Gaussians, on the CPU."""
-    from ufmstar_torch.kernels.stream_cpu import describe
-
-    none, index = np.empty(0), np.empty(0, np.int64)
-    rounded = np.empty((0, 3), np.float32), np.empty((0, 3, 3), np.float32), np.empty(0, np.float32)
-    segments = index, np.empty((0, 1)), index[:, None]
-    describe(segments, rounded, 1.0, 1.0, 1.0, 1.0, np.empty((0, 3)), np.empty((0, 3, 3)), none, index)
-
-
-def regression(kind: str) -> None:
-    """Compile the regression of single-precision maps, and at some pixels, on the CPU; ``kind`` as
-    ``config.regression``."""
-    from ufmstar_torch.kernels.regress_cpu import regress_image
-
-    mixture = GaussianMixture.empty(1, 1, dtype=torch.float64, device="cpu")
-    depth = torch.full((1, 8, 8), _DISTANCE)
-    for pixels in (None, torch.zeros(1, 1, dtype=torch.int64)):
-        regress_image(mixture, depth, _camera(8, 8)[None], depth > 0, UfMStarConfig(regression=kind), pixels)
-
-
-def sampling() -> None:
-    """Compile the average over a sample of pixels of single-precision maps, on the CPU."""
-    from ufmstar_torch.kernels.sample_cpu import sample_mean, sample_pixels
-
-    valid = torch.ones(1, 8, 8, dtype=torch.bool)
-    _, used = sample_pixels(valid, 1, 0)
-    sample_mean(torch.zeros(1, 1), used, used, valid.sum((1, 2)))
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Collect no garbage: it takes a tenth of a compilation's time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _camera(height: int, width: int) -> torch.Tensor:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.eval.bench.energy import CPU, GPU, Energy, EnergyMeter, difference, measure_energy, summary
 from ufmstar_torch.eval.bench.memory import overhead_percent
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
@@ -27,18 +26,16 @@ from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.run.machine import available_cores, device_of, hardware, load_average, versions
-from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.suite.job import EvalJob
 
 EFFICIENCY = "efficiency.json"
 NETWORK = "network_uncertainty"
-NOT_NEEDED = "the method needs only depth of the network"
-
 Energies = Mapping[Part, Energy]
 
 
 @dataclass(frozen=True)
-class Plan(Checked):
+class Plan:
     """How much is measured.
 
     Attributes:
@@ -47,16 +44,13 @@ class Plan(Checked):
         threads: of torch and numba on the CPU; None = all cores that this process may use.
         seconds: a window of energy lasts at least so long [s].
         windows: of energy per part.
-
-    Raises:
-        ValueError: a number out of range.
     """
 
-    frames: int = number(40, "", "1", 1)
-    warm_up: int = number(5, "", "1", 0)
-    threads: int | None = number(None, "", "1", 1)
-    seconds: float = number(3.0, "", "s", 0.0, open_low=True)
-    windows: int = number(3, "", "1", 1)
+    frames: int = 40
+    warm_up: int = 5
+    threads: int | None = None
+    seconds: float = 3.0
+    windows: int = 3
 
 
 def measure(
@@ -97,8 +91,7 @@ def measure(
     on_gpu = next((d for d in (device, multiview_device) if d.type == "cuda"), None)
     meter = meter or EnergyMeter(None if on_gpu is None else on_gpu.index or 0)
     with pinned_threads(plan.threads or 1):
-        broken: list[FrameError] = []
-        frames = list(islice(sequence.readable(broken.append), wanted := plan.warm_up + plan.frames))
+        frames = list(islice(sequence.readable(lambda error: None), wanted := plan.warm_up + plan.frames))
         if len(frames) < wanted:
             raise ValueError(f"{sequence.name} has {len(frames)} readable frames, the plan needs {wanted}")
         parts = time_parts(
@@ -107,7 +100,7 @@ def measure(
         work = {}
         for (owner, part), calls in parts.calls.items():
             where = multiview_device if part == MULTIVIEW else device
-            work[owner, part] = (_unit(where), [partial(_finished, call, where) for call in calls])
+            work[owner, part] = (_unit(where), [partial(_finish, call, where) for call in calls])
         energy = measure_energy(meter, work, seconds=plan.seconds, windows=plan.windows)
     units = {DEPTH: _unit(device), NETWORK: _unit(device), MULTIVIEW: _unit(multiview_device)}
     gpu = None if on_gpu is None else torch.cuda.get_device_name(on_gpu)
@@ -116,7 +109,7 @@ def measure(
         "machine": {"hardware": hardware(), "versions": versions(), "load": load_average(), "gpu": gpu},
         "devices": {"networks": str(device), "multiview": str(multiview_device), "units": units},
         "plan": asdict(plan),
-        "sequence": {"name": sequence.name, "layout": sequence.layout, "unreadable": len(broken)},
+        "sequence": {"name": sequence.name, "layout": sequence.layout},
         "power": {"missing": meter.missing},
         "map": parts.size,
         "networks": {b: _network_line(networks[b], parts, energy) for b in networks if parts.ms(b, DEPTH)},
@@ -205,7 +198,7 @@ def _unit(device: torch.device) -> str:
     return CPU if device.type == "cpu" else GPU
 
 
-def _finished(call: Callable[[], object], device: torch.device) -> None:
+def _finish(call: Callable[[], object], device: torch.device) -> None:
     call()
     synchronize(device)
 
@@ -232,7 +225,7 @@ def _row_line(row: Row, network: TimedNetwork, parts: TimedParts, energy: Energi
     base, form, name = row.method.base, inference_of(row), row.label
     unknown: dict[str, str] | None = None  # why the network's share for uncertainty is nothing or unknown
     if base == "depth_only":
-        unknown = {"none": NOT_NEEDED}
+        unknown = {"none": "the method needs only depth of the network"}
     elif network.why_whole is not None and not row.method.every_member:
         unknown = {"not_separable": network.why_whole}
     depth = parts.ms(base, DEPTH)

@@ -11,7 +11,6 @@ from torch import Tensor
 from ufmstar_torch.eval.bench.memory import weight_bytes
 from ufmstar_torch.eval.engine.networks import prepared_as
 from ufmstar_torch.eval.engine.predictions import DepthSource
-from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import OF_NETWORK
 from ufmstar_torch.eval.sequences.frame import Frame
@@ -29,7 +28,7 @@ DEPTH, ONCE, EVERY = "depth", "once", "every"
 
 
 class TimedNetwork:
-    """The loaded network(s) of a base (a key of ``BASES``), on one device and in eval mode.
+    """The loaded network(s) of a base (a key of ``methods.method.BASES``), on one device and in eval mode.
 
     Args:
         base: see above.
@@ -43,17 +42,13 @@ class TimedNetwork:
         why_whole: None, or why ``depth`` is the whole network instead.
 
     Raises:
-        ValueError: another base, no member, several members in one, or members that want different inputs.
+        ValueError: several members in one, or members that want different inputs.
     """
 
     def __init__(self, base: str, members: Sequence[DepthNetwork], label: str, samples: int = SAMPLES) -> None:
-        if base not in BASES:
-            raise ValueError(f"base must be one of {', '.join(BASES)}, got {base!r}")
         if any(isinstance(member, Ensemble) for member in members):
             raise ValueError("members must be the ensemble's members one by one, not an Ensemble")
         opened = [member.network() if isinstance(member, LazyMember) else member for member in members]
-        if not opened:
-            raise ValueError(f"{base}: members must hold at least one network")
         if any(member.preprocess != opened[0].preprocess for member in opened):
             raise ValueError(f"{base}: members must want the same input")
         self.base, self.label, self.members = base, label, tuple(opened)

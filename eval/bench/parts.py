@@ -96,18 +96,17 @@ class MultiviewStep:
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points or components, what anchors add included; bytes of the map for smoothing."""
-        if self._model is None:
+        if isinstance(self.ufm, UfM):
             cloud = self.ufm.clouds()[0]
-            count, each, smoothing = len(cloud.count), cloud.bytes_per_point, 0
-        else:
-            count, each = int(self.ufm.mixture.components.sum()), self.ufm.mixture.bytes_per_component()
-            smoothing = self.ufm.smoothed.nbytes
-        kept = count * each
-        if self._model is not None and self._row.setting.anchors:
+            points = len(cloud.count)
+            return {"bytes_end": points * cloud.bytes_per_point, "count_end": points, "smoothing_bytes": 0}
+        count, added = int(self.ufm.mixture.components.sum()), 0
+        if self._row.setting.anchors:
             plain = {f"ufm.{name}" for name in UfMStar().state_dict()}
-            state = self._model.state_dict().items()
-            kept += sum(v.nbytes for name, v in state if name not in plain and isinstance(v, Tensor))
-        return {"bytes_end": kept, "count_end": count, "smoothing_bytes": smoothing}
+            state = self._model.state_dict() if self._model is not None else {}
+            added = sum(v.nbytes for name, v in state.items() if name not in plain and isinstance(v, Tensor))
+        kept = count * self.ufm.mixture.bytes_per_component() + added
+        return {"bytes_end": kept, "count_end": count, "smoothing_bytes": self.ufm.smoothed.nbytes}
 
 
 @dataclass
@@ -155,16 +154,8 @@ def time_parts(
     device: torch.device,
     multiview_device: torch.device,
 ) -> TimedParts:
-    """Run every part of every row on every frame.
-
-    Args:
-        rows, networks, device, multiview_device: as ``eval.bench.measure.measure`` takes them.
-        frames: with images; the first ``warm_up`` are run, but not counted.
-        warm_up: see ``frames``.
-
-    Raises:
-        FrameError: a frame has no image.
-    """
+    """Run every part of every row on every frame; the first ``warm_up`` are not counted. Other arguments: see
+    ``measure.measure``. Raises FrameError: a frame has no image."""
     parts, steps = TimedParts(warm_up), {}
     forms = {row.method.base: {DEPTH} for row in rows}
     for row in rows:

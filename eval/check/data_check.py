@@ -1,4 +1,4 @@
-"""``ufmstar data check``: what a sequence holds, what is wrong with it, and which option puts it right."""
+"""``ufmstar data check``: a sequence's content, its problems, and the options that correct them."""
 
 from __future__ import annotations
 

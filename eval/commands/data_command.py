@@ -25,7 +25,7 @@ class CheckedSequenceOptions(SequenceOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class CheckOptions:
-    """What a sequence holds, and whether its poses, depth and images fit together.
+    """Report a sequence's content, and check whether its poses, depth and images fit together.
 
     Depth is warped between neighbouring frames with the poses as given, inverted, with other axes and at other depth
     scales; if something else fits, the option that corrects it is printed. Exit code: 0 fine, 1 problems, 2 wrong

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 from time import perf_counter
@@ -20,14 +19,13 @@ from ufmstar_torch.eval.commands.options import UsageError, as_dict, parse
 if TYPE_CHECKING:
     from ufmstar_torch.eval.engine.evaluate import RowResult
     from ufmstar_torch.eval.engine.progress import Progress
-    from ufmstar_torch.eval.sequences.frame import FrameSequence
 
 _WEIGHTS = ("weights", "demo.safetensors")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions:
-    """The main job on rendered rooms, with nothing but this package.
+    """The method on rendered rooms, without data or weights.
 
     Walks through rendered rooms with small depth networks that come with the package, compares their own variance with
     UfM's and UfM*'s, and saves pictures. Nothing else is needed; a minute on two cores.
@@ -91,10 +89,12 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     """
     import torch
 
+    from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
     from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
     from ufmstar_torch.eval.engine.load import sha256
     from ufmstar_torch.eval.engine.networks import NetworkSource
     from ufmstar_torch.eval.engine.progress import Progress
+    from ufmstar_torch.eval.engine.warm_up import warm_up_command
     from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
     from ufmstar_torch.eval.methods.suite import suite_named
     from ufmstar_torch.eval.report.demo import DEMO_FILES, ROWS, DemoFrames, surface_kinds, write_pictures
@@ -102,6 +102,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     from ufmstar_torch.eval.run.files import to_json, write_json_atomic
     from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
     from ufmstar_torch.eval.run.summary import versions
+    from ufmstar_torch.eval.sequences.frame import in_memory
     from ufmstar_torch.eval.tour import make_tour, tour_sequence
     from ufmstar_torch.models.trained import load_trained, read_info
     from ufmstar_torch.pipeline import NetworksInTurn
@@ -115,7 +116,10 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     kind = FolderKind(program="ufmstar demo", noun="demo", manifest="summary.json", clear=remover(*DEMO_FILES))
     OutputFolder.open(options.out, kind, {}, overwrite=options.overwrite).close()
     tour = {"seed": options.seed, "style": "mixed", "frames": options.frames, "size": info.spec.size}
-    sequence = _rendered(tour_sequence(**tour), device, progress)
+    config = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
+    warm_up_command(config, device, lambda done, total: progress(Progress("kernels", done, total)), dense=True)
+    progress(Progress("rooms", 0, options.frames))
+    sequence = in_memory(tour_sequence(**tour), lambda done: progress(Progress("rooms", done, options.frames)))
     networks = NetworkSource(NetworksInTurn(members, preprocess=members[0].preprocess), device, {}, seeding=None)
     suite = suite_named("demo")
     names = {row.slug: name for row, name in zip(suite.rows[: 5 if len(members) > 1 else 4], ROWS, strict=False)}
@@ -173,41 +177,6 @@ def _figures(result: RowResult, state_bytes: int) -> dict[str, Any]:
 def _own_curves(result: RowResult) -> dict[str, Any]:
     """The curves of a row but for those that depend on other rows (``RowMetrics.curves``)."""
     return {name: values for name, values in result.curves.items() if ":" not in name}
-
-
-def _rendered(sequence: FrameSequence, device: Any, progress: Callable[[Progress], None]) -> FrameSequence:
-    """All frames in memory. Meanwhile UfM*'s kernels are compiled, which takes some twenty seconds on the first run."""
-    from concurrent.futures import ThreadPoolExecutor
-    from threading import Event
-
-    import numpy as np
-
-    from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
-    from ufmstar_torch.eval.engine.progress import Progress
-    from ufmstar_torch.eval.engine.warm_up import warm_up_command
-
-    frames, rendered = [], Event()
-
-    def compiling(done: int, total: int) -> None:
-        if rendered.is_set():
-            progress(Progress("kernels", done, total))
-
-    progress(Progress("rooms", 0, len(sequence)))
-    with ThreadPoolExecutor(1) as thread:
-        config = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
-        compiled = thread.submit(warm_up_command, config, device, compiling, dense=True)
-        for index in range(len(sequence)):
-            frames.append(sequence[index])
-            progress(Progress("rooms", index + 1, len(sequence)))
-        progress(Progress("kernels", 0, 1))
-        rendered.set()
-        compiled.result()
-    progress(Progress("kernels", 1, 1))
-    entries = [
-        replace(entry, load_image=partial(np.asarray, frame.image), load_depth=partial(np.asarray, frame.depth))
-        for entry, frame in zip(sequence.entries, frames, strict=True)
-    ]
-    return replace(sequence, entries=tuple(entries))
 
 
 @contextmanager

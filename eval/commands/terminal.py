@@ -1,4 +1,4 @@
-"""What a terminal shows of a long run, and how a user ends one: progress bars, Ctrl-C and SIGTERM."""
+"""Long runs in a terminal: progress bars, and Ctrl-C and SIGTERM."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Bars:
-    """A progress bar for each stage of a run, or for each sequence in hand."""
+    """A progress bar for each stage of a run, or for each running sequence."""
 
     def __init__(self) -> None:
         self._bars: dict[str, Any] = {}
@@ -68,7 +68,7 @@ class Bars:
 
 @contextmanager
 def stop_signals(say: Callable[[str], None], what: str = "frame") -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and SIGTERM end the run after the frame (or step) in hand; a second one ends it at once.
+    """Ctrl-C and SIGTERM end the run after the current frame (or step); a second one ends it at once.
 
     Yields:
         Whether one has come.

@@ -1,10 +1,9 @@
-"""Figures of cost: time by method and by stage, calibration against memory and time, growth over long runs."""
+"""Figures of cost: time by method and by stage, calibration against memory and time."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -15,10 +14,9 @@ from ufmstar_torch.eval.report import style
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, mean_of
 from ufmstar_torch.eval.report.names import ECE_DELTA, NETWORK_MS, STATE, TOTAL_MS, UNCERTAINTY_MS
-from ufmstar_torch.eval.run.colours import FAINT, INK, plain
+from ufmstar_torch.eval.run.colours import INK, plain
 
 NETWORK_COLOUR = "#bdbdbd"
-MOST_NAMES = 10  # more points have a legend instead
 # The stages of a step of UfM*, from dark to light, as a print in grey needs it.
 STAGES = {
     "check": "#4d4d4d", "segment": "#0072B2", "correspond": "#009E73", "fuse": "#D55E00", "append": "#CC79A7",
@@ -114,10 +112,7 @@ def draw_tradeoff(results: Results) -> Any | None:
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.set_ylim(bottom=0)
         style.finish(axes, x=word, y="ECE_δ ↓ (bar: 95 % interval)")
-        if len(points) <= MOST_NAMES:
-            _name_points(axes, [(x, points[row].value, row) for row, x in panel.items()])
-    if len(points) > MOST_NAMES:
-        figure.legend(handles=_legend(list(points)), loc="outside right upper", frameon=False, fontsize=style.TICK)
+    figure.legend(handles=_legend(list(points)), loc="outside right upper", frameon=False, fontsize=style.TICK)
     return figure
 
 
@@ -132,46 +127,3 @@ def _legend(rows: Sequence[Row]) -> list[Any]:
         *(Line2D([], [], marker="o", color=look.colour, label=look.name, **how) for look in looks),
         *(Line2D([], [], marker=_BASE_MARKERS[base], color=INK, label=BASES[base][1], **how) for base in bases),
     ]
-
-
-def _name_points(axes: Any, points: Sequence[tuple[float, float, Row]]) -> None:
-    """Each point's name in a column right of the panel, apart from each other, with a thin line to its point."""
-    height = axes.get_position().height * axes.figure.get_figheight()
-    high = axes.get_ylim()[1]
-    places = style.spread_apart([y / high for _, y, _ in points], 1.2 * style.TICK / 72 / height, 0, 1)
-    for (x, y, row), place in zip(points, places, strict=True):
-        look = style.look_of(row.method)
-        name = f"{BASES[row.method.base][1]} {look.name}"
-        axes.annotate(
-            name, (x, y), (1.04, place), textcoords="axes fraction", size=style.TICK, va="center",
-            color=look.colour,
-            arrowprops={"arrowstyle": "-", "color": FAINT, "linewidth": 0.4, "relpos": (0, 0.5), "shrinkB": 3},
-        )  # fmt: skip
-
-
-# ---- growth ----
-
-# Runs of one world differ in their limits of merging and of components in memory; without either comes first.
-_COLOURS = ("#6b6b6b", "#0072B2", "#D55E00", "#009E73")
-_PANELS = {"components": "components in memory", "step_median_ms": "time of a step [ms], median"}
-
-
-def draw_growth(runs: Sequence[Mapping[str, Any]]) -> Any:
-    """Components, and the time of a step, over frames, of runs of ``measure_growth``; a row of panels each world."""
-    worlds = list(dict.fromkeys(run["world"] for run in runs))
-    figure = style.new_figure(8.6, 3.4 * len(worlds), f"Growth: {', '.join(worlds)}; {runs[0]['frames']} frames")
-    for world, panels in zip(worlds, figure.subplots(len(worlds), 2, squeeze=False), strict=True):
-        own = [run for run in runs if run["world"] == world]
-        for panel, (key, words) in zip(panels, _PANELS.items(), strict=True):
-            ends = []
-            for run, colour in zip(own, cycle(_COLOURS), strict=False):
-                values = [row[key] for row in run["rows"]]
-                panel.plot([row["frames"][1] for row in run["rows"]], values, color=colour, linewidth=1.6)
-                merge = f"merge {run['merge']:g}" if run["merge"] else ""
-                most = f"at most {run['max_components']}" if run["max_components"] else ""
-                look = style.Look(", ".join(filter(None, (merge, most))) or "off", colour)
-                ends.append((values[-1], look))
-            panel.set_ylim(bottom=0)
-            style.finish(panel, x=f"frames, {world}", y=words)
-            style.label_ends(panel, ends)
-    return figure

@@ -112,16 +112,14 @@ def _draw_shares(
     """Confidence that the depth is within 25 %, and how often it is (``DELTA``), or predicted quantiles and the share
     of the truth below them (``QUANTILE``), in the unit square with its diagonal."""
     axes.set_visible(True)
-    axes.plot([0, 1], [0, 1], linestyle="--", linewidth=1.0, color=FAINT)
-    last = []
+    axes.plot([0, 1], [0, 1], linestyle="--", linewidth=1.0, color=FAINT, label="exactly right")
     for look, values in lines.items():
         x, y = _confidence(values) if words is DELTA else (values["ece_q_levels"], values["ece_q_observed"])
         axes.plot(x, y, clip_on=False, **look.line)
-        last += [(float(y[-1]), look)] if len(y) else []
     axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", xticks=[0, 0.5, 1], yticks=[0, 0.5, 1])
     style.finish(axes, title=title, x=words[0], y=words[1] if named else "")
     if ends:
-        style.label_ends(axes, [*last, (1.0, Look("exactly right", FAINT))])
+        style.name_lines(axes)
 
 
 def _confidence(values: Curves) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -173,7 +171,7 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
 
 # Entropy [nats] of a Gaussian with a standard deviation of 1 m.
 ONE_METRE = 0.5 * math.log(2 * math.pi * math.e)
-_DECADES = (0.001, 0.01, 0.1, 1.0, 10.0, 100.0)
+_SIGMAS = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)  # [m]
 
 
 def draw_error(results: Results, dataset: str) -> Any | None:
@@ -197,9 +195,7 @@ def draw_error(results: Results, dataset: str) -> Any | None:
             judge = "it" if method.fusion == ALONE else style.look_of(method).name
             title = f"{BASES[base][0]}: where {judge} is confident"
             style.finish(axes, title=title, x="percentile of the row's error", y="mean NLL [nats]")
-            # At the last group that had a pixel.
-            last = {row: next(y for y in reversed(values) if y == y) for row, values in curves.items()}
-            style.label_ends(axes, [(y, style.look_of(row.method)) for row, y in last.items()])
+            style.name_lines(axes)
     return figure
 
 
@@ -241,16 +237,13 @@ def draw_entropy(results: Results, base: str) -> Any | None:
 
 
 def entropy_range(merged: Sequence[Merged]) -> tuple[float, float]:
-    """Where 99.8 % of every histogram lie, and a margin of half a nat [nats]."""
-    lows, highs = [], []
-    for one in merged:
-        counts, edges = np.array(one.curves["entropy_counts"]), np.array(one.curves["entropy_edges"])
-        share = counts.cumsum() / counts.sum()
-        # share[k] is what lies below edges[k]; the last one has no edge above it.
-        lows.append(edges[max(int(np.searchsorted(share[:-1], 0.001, side="right")) - 1, 0)])
-        highs.append(edges[min(int(np.searchsorted(share[:-1], 0.999)), len(edges) - 1)])
-    low, high = float(min(lows)) - 0.5, float(max(highs)) + 0.5
-    return max(low, float(edges[0])), min(high, float(edges[-1]))
+    """Between the first and the last bin with more than a thousandth of some row's pixels, and half a nat around."""
+    edges = np.array(merged[0].curves["entropy_edges"])
+    counts = np.array([one.curves["entropy_counts"] for one in merged])
+    filled = np.flatnonzero((counts / counts.sum(1, keepdims=True))[:, 1:-1].max(0) > 0.001)
+    if not len(filled):
+        return float(edges[0]), float(edges[-1])
+    return max(edges[filled[0]] - 0.5, float(edges[0])), min(edges[filled[-1] + 1] + 0.5, float(edges[-1]))
 
 
 def density(merged: Merged) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -282,10 +275,7 @@ def _draw_histograms(axes: Any, rows: Mapping[Row, Merged]) -> None:
 def _sigma_axis(axes: Any, low: float, high: float) -> None:
     """The same axis in metres of a standard deviation, above."""
     twin = axes.secondary_xaxis("top", functions=(lambda h: h - ONE_METRE, lambda s: s + ONE_METRE))
-    decades = [sigma for sigma in _DECADES if low <= math.log(sigma) + ONE_METRE <= high]
-    finer = [factor * sigma for sigma in _DECADES for factor in (1, 2, 5)]
-    within = [sigma for sigma in finer if low <= math.log(sigma) + ONE_METRE <= high]
-    shown = decades if len(decades) > 2 else within
-    twin.set_xticks([math.log(sigma) for sigma in shown], [f"σ = {sigma:g} m" for sigma in shown])
+    shown = [sigma for sigma in _SIGMAS if low <= math.log(sigma) + ONE_METRE <= high]
+    twin.set_xticks([math.log(sigma) for sigma in shown], [f"{sigma:g} m" for sigma in shown])
     twin.tick_params(labelsize=style.TICK - 1, color=FAINT, labelcolor=INK)
     twin.spines["top"].set_visible(False)

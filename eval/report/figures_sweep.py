@@ -1,14 +1,11 @@
-"""Ablations: the rows of an evaluation as lines over the values of one setting, figures over these, and what each
-setting changes, sequence by sequence.
-"""
+"""Ablations: the rows of an evaluation as lines over the values of one setting, and figures over these."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
-from operator import add
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -160,17 +157,17 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
     for column, quantity in enumerate(shown):
         panel = axes[0][column]
         means = {line: {p.value: mean_of(p.records, quantity) for p in line.points} for line in looks}
-        reached, ends = _draw(panel, means, looks)
+        reached = _draw(panel, means, looks)
         style.finish(panel, title=f"{quantity.heading}, mean over sequences")
         _scale(panel, [point.value for line in drawn if len(line.points) > 1 for point in line.points])
-        _tame(panel, name, reached, ends)
+        _tame(panel, name, reached)
         if below:
             panel = axes[1][column]
             panel.axhline(0, color=FAINT, linewidth=0.8)
             means = {line: {a.value: difference(a.records, b.records, quantity) for a, b in ab} for line, ab in below}
-            reached, ends = _draw(panel, means, looks)
+            reached = _draw(panel, means, looks)
             style.finish(panel, title=f"difference to {to} in {quantity.name}, in pairs")
-            _tame(panel, name, reached, ends)
+            _tame(panel, name, reached)
         panel.set_xlabel(plain(f"{word} [{unit}]" if unit else word), size=style.LABEL, color=INK)
     return figure
 
@@ -196,13 +193,10 @@ def _compared(drawn: Sequence[SweepLine], alone: SweepLine | None, name: str) ->
     return to, [(line, points) for line, points in pairs if points]
 
 
-def _draw(
-    axes: Any, curves: Mapping[SweepLine, Mapping[float, Mean]], looks: Mapping[SweepLine, Look]
-) -> tuple[list[float], list[tuple[float, Look]]]:
-    """Means over the values of a setting with their bands, by line; dashed without a band for reference. The values
-    reached, and what stands at the ends."""
+def _draw(axes: Any, curves: Mapping[SweepLine, Mapping[float, Mean]], looks: Mapping[SweepLine, Look]) -> list[float]:
+    """Means over the values of a setting with their bands, by line; dashed without a band for reference. Returns the
+    values reached."""
     reached: list[float] = []
-    ends = []
     for line, means in curves.items():
         kept = [(x, mean.value, mean.half) for x, mean in means.items() if not math.isnan(mean.value)]
         if not kept:
@@ -218,11 +212,10 @@ def _draw(
         else:
             axes.plot(x, y, **dashed)
         reached += [value for value in y.tolist() if math.isfinite(value)]
-        ends.append((float(y[-1]), look))
-    return reached, ends
+    return reached
 
 
-def _tame(axes: Any, name: str, reached: Sequence[float], ends: Sequence[tuple[float, Look]]) -> None:
+def _tame(axes: Any, name: str, reached: Sequence[float]) -> None:
     """Mark the default, and name the lines.
 
     Logarithmic beyond 1 where values are so high that the others would lie on one line, and cut to the values:
@@ -234,7 +227,7 @@ def _tame(axes: Any, name: str, reached: Sequence[float], ends: Sequence[tuple[f
     value = default_value(name)
     if not math.isnan(value):
         axes.axvline(value, color=FAINT, linewidth=0.8, linestyle=":", zorder=0)
-    style.label_ends(axes, ends)
+    style.name_lines(axes)
 
 
 def _scale(axes: Any, values: Sequence[float]) -> None:
@@ -244,42 +237,3 @@ def _scale(axes: Any, values: Sequence[float]) -> None:
     if len(ticks) <= 9:
         axes.set_xticks(ticks, [f"{value:g}" for value in ticks])
         axes.minorticks_off()
-
-
-def draw_changes(results: Results, base: str) -> Any | None:
-    """What each setting changes, as intervals about the paired difference; None where there is no ablation."""
-    lines = list(_variants(results, base))
-    if not lines:
-        return None
-    shown = [q for q in names.DIFFERENCES if q.key != "ause_rmse"]
-    title = (
-        f"What each setting changes: {BASES[base][0]}, in pairs on {names.count(len(results.sequences()), 'sequence')}"
-    )
-    figure = style.new_figure(2.8 + 2.3 * len(shown), 1.3 + 0.24 * len(lines), title)
-    axes = figure.subplots(1, len(shown), squeeze=False, sharey=True)[0]
-    for place, quantity in zip(axes, shown, strict=True):
-        place.axvline(0, color=FAINT, linewidth=0.8)
-        for y, (row, reference) in enumerate(lines):
-            mean = difference(results.of(row), results.of(reference), quantity)
-            if not math.isnan(mean.value):
-                look = style.look_of(row.method)
-                place.errorbar(
-                    mean.value, y, xerr=np.nan_to_num(mean.half), color=look.colour, marker=look.marker,
-                    markersize=4.5, linewidth=1.4, markerfacecolor=look.colour if mean.beyond else "white", capsize=0,
-                )  # fmt: skip
-        style.finish(place, title=f"Δ {quantity.heading}", x="less the default")
-    axes[0].set_ylim(len(lines) - 0.5, -0.5)
-    one = len({row.method for row, _ in lines}) == 1  # the method is named where there are several
-    methods = ["" if one else f"{style.look_of(row.method).name}, " for row, _ in lines]
-    settings = [names.setting_label(row.setting.to_dict()) for row, _ in lines]
-    axes[0].set_yticks(range(len(lines)), map(plain, map(add, methods, settings)), size=style.TICK)
-    figure.supxlabel("filled: the 95 % interval leaves out 0", size=style.TICK, color=FAINT, x=0.99, ha="right")
-    return figure
-
-
-def _variants(results: Results, base: str) -> Iterator[tuple[Row, Row]]:
-    """Rows of an ablation with the default of the same method."""
-    for row in results.rows:
-        varied = row.method.base == base and row.method.fusion != ALONE and not row.setting.plain
-        if varied and row.base_line in results.rows:
-            yield row, row.base_line

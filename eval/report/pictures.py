@@ -134,31 +134,25 @@ def _folder_of(results: Results, dataset: str, sequence: str) -> Path:
 # ---- drawing: each writes its PNG into the folder and returns its words ----
 
 
-def _picture(example: Example, rows: Sequence[str], kind: str, base: str, words: tuple[str, str, str]) -> Picture:
-    """The name and the words of a picture: the end of its title, its caption, and what the alternative text begins
-    with; rows are listed there with their mean NLL, for those who cannot see the picture."""
-    title, caption, shows = words
+def _picture(example: Example, rows: Sequence[str], kind: str, base: str, title: str, caption: str) -> Picture:
+    """The name and the words of a picture; rows are listed with their mean NLL for those who cannot see it."""
     means = ((example.label(row), mean_nll(example, row)) for row in rows)
     listed = ", ".join(f"{label} ({'no NLL' if nll is None else f'mean NLL {nll:.2f}'})" for label, nll in means)
     name = file_name(kind, example.dataset, example.sequence, example.frame, *filter(None, (base,)))
     title = f"{example.sequence}, frame {example.frame}: {title}"
-    return Picture(name, kind, title, caption, f"{shows} of {listed}.")
+    return Picture(name, kind, title, caption, f"{title}; {listed}")
 
 
 def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequence[Snapshot]) -> Picture:
     scale = draw_room(folder / name, snapshots, f"{label}, {sequence}")
-    counts = [len(snapshot.mean) for snapshot in snapshots]
-    times = f"{len(snapshots)} times" if len(snapshots) > 1 else "one time"
-    return Picture(
-        name,
-        ROOM,
-        f"{sequence}: the Gaussians of {label} at {times}",
-        "Each Gaussian is an ellipse as large as the patch it stands for, painted from far to near; what lies "
-        "above the camera (the ceiling) is left out. Black: seen from one view only, or with no disagreement. "
-        "Blue: the camera's path.",
-        f"The room of {sequence}, {' then '.join(map(str, counts))} Gaussians, coloured by disagreement from 0 to "
-        f"{scale.high:.2g} m.",
+    counts = " then ".join(str(len(snapshot.mean)) for snapshot in snapshots)
+    caption = (
+        "Each Gaussian is an ellipse as large as the patch it stands for. What lies above the camera (the ceiling) is "
+        "left out. Black: seen from one view only, or no disagreement. Blue: the camera's path."
     )
+    title = f"{sequence}: the Gaussians of {label}"
+    alt = f"{title}: {counts} Gaussians, coloured by disagreement from 0 to {scale.high:.2g} m"
+    return Picture(name, ROOM, title, caption, alt)
 
 
 def fit_strip_scales(example: Example, rows: Sequence[str]) -> PanelScales:
@@ -184,13 +178,11 @@ def draw_strip(folder: Path, example: Example, rows: Sequence[str], base: str) -
         Bar("|error| and σ [m]", scales.length, 1, span=2),
         Bar("NLL [nats]", NLL_SCALE, 3),
     ]
-    words = (
-        Method(base).name,
-        "A good standard deviation σ looks like the error beside it. NLL is bright where a row was too sure of itself; "
-        "its colours are the same in all strips. Lengths share one scale.",
-        "Depth, error, standard deviation and NLL",
+    caption = (
+        "A good standard deviation σ looks like the error beside it. NLL is bright where a row is overconfident; its "
+        "colours are the same in all strips. Lengths share one scale."
     )
-    picture = _picture(example, rows, STRIP, base, words)
+    picture = _picture(example, rows, STRIP, base, Method(base).name, caption)
     draw_grid(folder / picture.file, [head, *body], bars, aspect=example.aspect)
     return picture
 
@@ -210,13 +202,11 @@ def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Pictu
     captions = ("√A, aleatoric", "√E, epistemic", "√M, between views", "σ = √V, V = A + E + M", "|error|", "NLL")
     body[0] = body[0].captioned(captions)
     bars = [Bar("√A, √E, √M, σ and |error| [m]", scales.length, 0, span=5), Bar("NLL [nats]", NLL_SCALE, 5)]
-    words = (
-        "what the variance is made of",
+    caption = (
         "The parts add up as variances, V = A + E + M; shown are their square roots, in metres, on one scale with the "
-        "error. A and E are the network's own, M is what the views disagree by.",
-        "Aleatoric, epistemic and multiview parts",
+        "error. A and E are the network's own, M is the disagreement between the views."
     )
-    picture = _picture(example, rows, BREAKDOWN, "", words)
+    picture = _picture(example, rows, BREAKDOWN, "", "parts of the variance", caption)
     draw_grid(folder / picture.file, body, bars, aspect=example.aspect)
     return picture
 
@@ -245,13 +235,12 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
         GridRow("where they differ most", lines, enlarged),
     ]
     bars = [Bar("|error| and σ [m]", scales.length, 1, span=3), Bar("UfM* minus UfM [m]", signed, 4)]
-    words = (
-        f"{example.label(ufm_star)} against {example.label(ufm)}",
-        "Red: UfM* is the less sure of the two; blue: the surer. The blue box marks where they differ most on average, "
-        "enlarged below.",
-        "Standard deviations and their difference,",
+    title = f"{example.label(ufm_star)} against {example.label(ufm)}"
+    caption = (
+        "Red: UfM* has the larger standard deviation; blue: the smaller. The box marks where they differ most on "
+        "average, enlarged below."
     )
-    picture = _picture(example, pair, COMPARE, base, words)
+    picture = _picture(example, pair, COMPARE, base, title, caption)
     draw_grid(folder / picture.file, grid, bars, aspect=example.aspect)
     return picture
 

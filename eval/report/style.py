@@ -1,12 +1,10 @@
-"""How figures look: one colour and mark per kind of method, names at the ends of lines, no global state."""
+"""How figures look: one colour and mark per kind of method, names right of the panels, no global state."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, Method
 from ufmstar_torch.eval.run.colours import FAINT, INK, plain, require_matplotlib
@@ -80,34 +78,10 @@ def finish(axes: Any, *, title: str = "", x: str = "", y: str = "") -> None:
         axes.spines[side].set_color(FAINT)
 
 
-def spread_apart(places: Sequence[float], gap: float, low: float, high: float) -> list[float]:
-    """Places at least ``gap`` apart within [low, high] in the same order, each as near to its own as can be.
-
-    Less k gaps, the places in their order must only not fall, which is isotonic regression. Where they do not fit, the
-    gap is smaller.
-    """
-    from scipy.optimize import isotonic_regression
-
-    if not places:
-        return []
-    wanted, order = np.array(places), np.argsort(places, kind="stable")
-    offset = min(gap, (high - low) / max(len(places) - 1, 1)) * np.arange(len(places))
-    spread = np.empty(len(places))
-    nearest = isotonic_regression(wanted[order] - offset).x + offset
-    spread[order] = np.maximum(np.minimum(nearest, high - offset[::-1]), low + offset)
-    return [float(place) for place in spread]
-
-
-def label_ends(axes: Any, ends: Sequence[tuple[float, Look]]) -> None:
-    """Names right of a panel, level with the y where their lines end, and apart from each other, for final limits of
-    y."""
-    transform = axes.transData + axes.transAxes.inverted()
-    x = axes.get_xlim()[1]
-    wanted = [min(max(float(transform.transform((x, y))[1]), 0.0), 1.0) for y, _ in ends]
-    height = axes.get_position().height * axes.figure.get_figheight()
-    for place, (_, look) in zip(spread_apart(wanted, 1.25 * TICK / 72 / height, 0, 1), ends, strict=True):
-        where = {"transform": axes.transAxes, "va": "center", "ha": "left"}
-        axes.text(1.02, place, plain(look.name), color=look.colour, size=TICK, **where)
+def name_lines(axes: Any) -> None:
+    """The names of the lines, right of a panel."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=TICK)
 
 
 def stretch(axes: Any, values: Sequence[float], factor: float, **about_zero: float) -> None:

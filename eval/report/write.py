@@ -66,8 +66,6 @@ def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
         yield f"entropy {base}", partial(figures_curves.draw_entropy, results, base)
     for base, name in figures_sweep.sweeps(results):
         yield f"sweep {base} {name}", partial(figures_sweep.draw_sweep, results, base, name)
-    for base in results.bases:
-        yield f"sweep changes {base}", partial(figures_sweep.draw_changes, results, base)
     yield "latency", partial(figures_cost.draw_latency, results)
     yield "latency stages", partial(figures_cost.draw_stages, results)
     yield "tradeoff", partial(figures_cost.draw_tradeoff, results)

@@ -1,4 +1,4 @@
-"""Output folders: to whom a folder belongs, what it was started with, and which process holds it.
+"""Output folders: the program that owns a folder, its settings, and the lock of the process that writes there.
 
 A folder belongs to a program once it contains the manifest of that program's :class:`FolderKind`. Files of other
 programs are never touched.

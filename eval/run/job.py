@@ -1,4 +1,4 @@
-"""What ``ufmstar run`` runs, and what its results depend on."""
+"""A job of ``ufmstar run``, and its identity: the values on which the results depend."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class RunJob:
         return {**self.source.identity, **(self.landmarks().identity if self.config.anchors is not None else {})}
 
     def identity(self) -> dict[str, Any]:
-        """Plain values on which the results depend: a run can only go on with the same ones."""
+        """Plain values on which the results depend. A run is only continued with the same ones."""
         sequence, digest = self.sequence, hashlib.sha256()
         for index in self.indices:
             entry = sequence.entries[index]

@@ -1,4 +1,4 @@
-"""What a result was computed with: versions, hardware, the load of the machine, and the device."""
+"""Versions, hardware, load and devices, as results record them."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def available_cores() -> int:
 
 
 def share_threads() -> None:
-    """Leave a core to the threads that read ahead and write behind: the threads of torch, and with it of ONNX Runtime
-    and the kernels, become one fewer than the cores, and no more than before."""
+    """Limit the threads of torch, ONNX Runtime and the kernels to one fewer than the cores: one is left for the threads
+    that read and write frames."""
     import torch
 
     torch.set_num_threads(max(1, min(torch.get_num_threads(), available_cores() - 1)))
@@ -82,8 +82,8 @@ def require_device(name: str) -> str:
 
 
 def device_of(name: str, local: int) -> str:
-    """The device of the process with that number on its computer: "cuda" is the GPU in turn, else as it stands. Raises
-    ValueError: the device does not exist."""
+    """The device of process number ``local``: for "cuda" the GPU of that number (modulo the GPUs), else ``name``.
+    Raises ValueError: the device does not exist."""
     import torch
 
     if name == "cuda" and torch.cuda.is_available():

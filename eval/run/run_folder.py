@@ -4,7 +4,7 @@
 OUT/frames.jsonl       one line per frame, in order: counts, means, times; or why it was skipped
 OUT/resume/run.json    what the run was started with
 OUT/resume/state.pt    the checkpoint, replaced every few seconds and at the end
-OUT/resume/lock        held while a run is going on
+OUT/resume/lock        locked during a run
 ```
 A killed run computes the frames after its checkpoint again and writes the same files.
 """

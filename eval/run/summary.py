@@ -23,16 +23,23 @@ STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "s
 _PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")
 
 
-# How a run ended, or not: the state, and why.
+# State and reason of an unfinished run.
 GOING_ON = INTERRUPTED, "no orderly end: the program was killed, or is still running"
 
 
 def write_summary(
     job: RunJob, folder: RunFolder, state: str, reason: str, outputs: Mapping[str, str | None] | None = None
 ) -> dict[str, Any]:
-    """Write summary.json from what is on disk, so that a continued run has the same, and return its content as plain
-    values. ``state`` and ``reason``: how the run ended; ``outputs`` holds for each file None if it exists, or why it
-    does not."""
+    """Write summary.json from the run's records and sums, and return its content as plain values.
+
+    Args:
+        job, folder: of the run.
+        state, reason: how the run ended.
+        outputs: for each file None if it exists, or why it does not.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     checkpoint, records = folder.checkpoint, folder.records
     done = [record for record in records if record["state"] == "done"]
     figures = RunMetrics(UFM, checkpoint.metrics).figures()
@@ -65,7 +72,7 @@ def write_summary(
 
 
 def _posterior(done: Sequence[Mapping[str, Any]], figures: Mapping[str, float] | None) -> dict[str, Any]:
-    """Of a run with a posterior: its metrics, and what held-out anchors said in the end; {} of another run."""
+    """With a posterior: its metrics, and the last frame's figures of held-out anchors; else {}."""
     records = [record["posterior"] for record in done if "posterior" in record]
     if not records:
         return {}
@@ -125,7 +132,7 @@ def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _anchors(done: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """What anchors did over all frames, the first ones included; None of a run without."""
+    """Means over all frames of the anchors' figures; None without anchors."""
     records = [record["anchors"] for record in done if "anchors" in record]
     if not records:
         return None

@@ -1,4 +1,4 @@
-"""What ``ufmstar run`` leaves of every frame: an npz and two 16-bit PNGs.
+"""The files of every frame of ``ufmstar run``: an npz and two 16-bit PNGs.
 
 ```
 OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2] float32 and valid bool, each [H, W]; with

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -195,6 +197,22 @@ def make_sequence(
     return FrameSequence(
         name, layout, entries, intrinsics, image_size, depth_intrinsics, depth_size, skipped, names, posed
     )
+
+
+def in_memory(sequence: FrameSequence, progress: Callable[[int], object] = lambda _: None) -> FrameSequence:
+    """The sequence with all frames decoded now and kept; ``progress`` gets the number of decoded frames. Raises
+    FrameError: a frame cannot be decoded."""
+    entries = []
+    for frame, entry in zip(sequence, sequence.entries, strict=True):
+        load_image = entry.load_image and partial(_same, frame.image)
+        load_depth = entry.load_depth and partial(_same, frame.depth)
+        entries.append(replace(entry, load_image=load_image, load_depth=load_depth))
+        progress(len(entries))
+    return replace(sequence, entries=tuple(entries))
+
+
+def _same(array: Any) -> Any:
+    return array
 
 
 def parse_slice(text: str | None) -> slice:

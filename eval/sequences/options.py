@@ -13,7 +13,7 @@ from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """What a user may override. Raises ValueError: a number is out of its range."""
+    """The options that a user may override. Raises ValueError: a number is out of its range."""
 
     # Instead of the layout's own [px]: a file, a 3x3 matrix, or fx, fy, cx, cy; and those of the depth maps (7-Scenes,
     # ScanNet, generic).

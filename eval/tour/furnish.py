@@ -18,7 +18,7 @@ CLEARANCE = 0.38  # between furniture and any way: 0.3 m for the camera, and the
 OVERHEAD = 2.0  # things whose lower edge is higher than this hang over a way [m]
 LIGHTS = 3  # of a room at most
 _FROM_WALL = 0.02  # the skirting board stands between [m]
-_HALL_FROM = 7.0  # rooms with a side from here on are stock as halls [m]
+_HALL_FROM = 7.0  # rooms with a side from here on are furnished as halls [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ def furnish(room: Room, doors: list[Door], way: Array, palette: Palette, rng: np
 
 @dataclass(eq=False)
 class Furnished:
-    """What a room holds; it grows while the room is stock."""
+    """The content of a room; it grows while the room is furnished."""
 
     room: Room
     way: Array  # [M, 2] x and z of the points near the room where a camera may be [m]

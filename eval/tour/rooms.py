@@ -102,7 +102,7 @@ def _try_layout(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room],
 
 
 def _room(style: TourStyle, rng: np.random.Generator) -> Room:
-    size = rng.uniform(*style.room_size, 2)
+    size = rng.uniform(style.room_size[0], style.room_size[1], size=2)
     return Room(np.zeros(2), size, float(rng.uniform(*style.ceiling)), style)
 
 

@@ -59,7 +59,7 @@ def tour_sequence(
     path_seed: int | None = None,
     sensor: bool = True,
 ) -> FrameSequence:
-    """A tour as a sequence; frames are rendered when they are asked for.
+    """A tour as a sequence; frames are rendered when they are indexed.
 
     Args:
         seed: of the rooms, see :func:`make_tour`.

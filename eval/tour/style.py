@@ -1,4 +1,4 @@
-"""What rooms look like: sizes, surfaces and light of a tour's styles.
+"""The styles of a tour's rooms: sizes, surfaces and light.
 
 ``home`` is the distribution that a network can be trained on; ``hall`` lies outside of it: larger rooms and
 things, darker and colder light, and textures that no home has. ``mixed`` begins at home and ends in a hall.

@@ -32,7 +32,6 @@ _SHADOWLESS = ("window", "picture", "clock", "skirting")  # flat on the wall
 class Tour:
     """Furnished rooms, and the ways through them. World axes: x right, y down, z forward [m], the floor at y = 0."""
 
-    # What it was made from.
     seed: int
     style: TourStyle
     rooms: Tensor  # [R, 2, 3] float64 lower and upper corners (y from the ceiling to 0) [m]

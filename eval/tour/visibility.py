@@ -1,4 +1,4 @@
-"""What of a tour a camera can see: the part of the image that each primitive and each room can touch."""
+"""Visibility: the part of the image that each primitive and each room can touch."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import part
+from ufmstar_torch.kernels.compile_cpu import empty, part
 
 _SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
@@ -83,7 +83,7 @@ def geodesic(mean_a, cov_a, mean_b, cov_b, lam, work):
     for i in range(3):
         for j in range(3):
             M[i, j] = L_b[0, i] * L_a[0, j] + L_b[1, i] * L_a[1, j] + L_b[2, i] * L_a[2, j]
-    s = np.empty(3)
+    s = empty(3, np.float64)
     right_singular(M, V, s)
     distance, shift = -2 * (s[0] + s[1] + s[2]), 0.0
     for i in range(3):
@@ -133,7 +133,7 @@ def _exceeds(S, floor):
 @part
 def floor_covariance(covariance, floor):
     """Lift the eigenvalues of every positive semidefinite covariance [N, 3, 3] to floor [N], in place."""
-    M, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    M, V, s = empty((3, 3), np.float64), empty((3, 3), np.float64), empty(3, np.float64)
     for n in range(covariance.shape[0]):
         S = covariance[n]
         if _exceeds(S, floor[n]):
@@ -157,7 +157,7 @@ def floor_covariance(covariance, floor):
 def floored(mean, covariance, weight, near, focal, widening, epsilon, covariance_out):
     """Write the covariances of occupied slots with the floor that a segment needs (``step``): the variance across one
     pixel, and ``epsilon`` times the trace for storage."""
-    least = np.empty(1)
+    least = empty(1, np.float64)
     for n in range(weight.size):
         if not weight[n] > 0:
             continue
@@ -180,8 +180,8 @@ def fuse_pairs(
     After each pair the values take the precision they are stored in. ``distance`` [P] takes the place of W2^2 where it
     is not empty; with ``weighted``, pi_c is multiplied by the overlap [P].
     """
-    work = np.empty((6, 3, 3))
-    mean_k, cov_k, least = np.empty(3), np.empty((3, 3)), np.empty(1)
+    work = empty((6, 3, 3), np.float64)
+    mean_k, cov_k, least = empty(3, np.float64), empty((3, 3), np.float64), empty(1, np.float64)
     for p in range(pair_c.size):
         c, k = pair_c[p], pair_k[p]
         pi_k = np.float64(weight[k])

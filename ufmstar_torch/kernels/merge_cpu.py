@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, part, zeros
 from ufmstar_torch.mixture import GaussianMixture
 
 _HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
@@ -91,10 +91,10 @@ def _partition(mean, covariance, weight, compared, limit):
     n = weight.size
     mean, covariance, weight, compared = mean.copy(), covariance.copy(), weight.copy(), compared.copy()
     into, alive, changed = np.arange(n), np.ones(n, np.bool_), np.ones(n, np.bool_)
-    log_det, S = np.empty(n), np.empty((3, 3))
+    log_det, S = empty(n, np.float64), empty((3, 3), np.float64)
     reach = 4 * math.expm1(limit) * (1 + 1e-9)
-    left, right, loss, pairs = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n), 0
-    best, partner = np.empty(n), np.empty(n, np.int64)
+    left, right, loss, pairs = empty(n, np.int64), empty(n, np.int64), empty(n, np.float64), 0
+    best, partner = empty(n, np.float64), empty(n, np.int64)
     for i in range(n):
         log_det[i] = _log_det(covariance[i])
     while True:
@@ -146,7 +146,12 @@ def _partition(mean, covariance, weight, compared, limit):
 def _own_shares(mean, covariance, weight, prior_weight):
     """s_k of occupied components."""
     n = weight.size
-    L, W, log_peak, half = np.zeros((n, 3, 3)), np.empty((n, 6)), np.empty(n), np.empty((n, 3))
+    L, W, log_peak, half = (
+        zeros((n, 3, 3), np.float64),
+        empty((n, 6), np.float64),
+        empty(n, np.float64),
+        empty((n, 3), np.float64),
+    )
     for k in range(n):
         S = covariance[k]
         negligible = _NEGLIGIBLE * max(S[0, 0], S[1, 1], S[2, 2])
@@ -169,7 +174,7 @@ def _own_shares(mean, covariance, weight, prior_weight):
         log_peak[k] = math.log(weight[k]) - _HALF_LOG_TWO_PI_CUBED + math.log(i00) + math.log(i11) + math.log(i22)
         for r in range(3):
             half[k, r] = math.sqrt(3 * S[r, r])
-    shares, x, evidence = np.empty(n), np.empty((6, 3)), np.empty(6)
+    shares, x, evidence = empty(n, np.float64), empty((6, 3), np.float64), empty(6, np.float64)
     for f in range(n):
         for i in range(3):
             for r in range(3):

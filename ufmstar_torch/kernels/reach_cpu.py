@@ -18,7 +18,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import leaf, part
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
 from ufmstar_torch.kernels.regress_cull_cpu import negligible
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, gather, padded
 from ufmstar_torch.kernels.vectors_cpu import vectors
@@ -41,20 +41,20 @@ def reached(motion, mean, covariance, weight, K, size, prior_weight, epsilon, mo
         prior_weight, epsilon: of the regression; epsilon = 0 takes every occupied slot.
         more: how many components the frame may add.
     """
-    index, occupied = np.empty(weight.size, np.int64), 0
+    index, occupied = empty(weight.size, np.int64), 0
     for k in range(weight.size):
         index[occupied] = k
         occupied += weight[k] > 0
     if epsilon == 0:
         return index[:occupied], occupied
-    planes = np.empty((6, 4))  # outside: n . x > 0; and log2 of the least density that counts
+    planes = empty((6, 4), np.float64)  # outside: n . x > 0; and log2 of the least density that counts
     _plane(planes, 0, motion, -K[0, 0], 0.0, -(K[0, 2] + _WIDER))
     _plane(planes, 1, motion, K[0, 0], 0.0, K[0, 2] + 1 - size[1] - _WIDER)
     _plane(planes, 2, motion, 0.0, -K[1, 1], -(K[1, 2] + _WIDER))
     _plane(planes, 3, motion, 0.0, K[1, 1], K[1, 2] + 1 - size[0] - _WIDER)
     _plane(planes, 4, motion, 0.0, 0.0, -1.0)
     planes[5, 0] = negligible(prior_weight, epsilon, occupied + more)
-    n, group, kept = 0, np.empty((FIELDS, _GROUP)), np.empty(_GROUP)
+    n, group, kept = 0, empty((FIELDS, _GROUP), np.float64), empty(_GROUP, np.float64)
     for first in range(0, occupied, _GROUP):
         slots = index[first : min(first + _GROUP, occupied)]
         gather(slots, slots.size, mean, covariance, weight, group)

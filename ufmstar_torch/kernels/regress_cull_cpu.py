@@ -26,7 +26,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, leaf
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
 from ufmstar_torch.kernels.regress_points_cpu import HALF_LOG_TWO_PI_CUBED
 from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, bounds, largest
 from ufmstar_torch.kernels.rigid_cpu import padded
@@ -55,23 +55,23 @@ def in_view(components, m, features, occupied, K, depth, prior_weight, prior_mea
     """
     height, width = depth.shape
     least, limit = math.log2(_PRIOR * prior_weight), negligible(prior_weight, epsilon, occupied)
-    whitened = np.empty((WHITENED, components.shape[1]))
-    index, kept = np.empty(m.size, np.int64), np.empty(m.size, np.int64)
-    n = _visible(components, m.size, whitened, K, height, width, limit, np.empty((2, 3)), index)
-    packed = np.empty((FIELDS, padded(n)), depth.dtype)
+    whitened = empty((WHITENED, components.shape[1]), np.float64)
+    index, kept = empty(m.size, np.int64), empty(m.size, np.int64)
+    n = _visible(components, m.size, whitened, K, height, width, limit, empty((2, 3), np.float64), index)
+    packed = empty((FIELDS, padded(n)), depth.dtype)
     _pack(components, whitened, index, n, packed)
-    z = _farthest(depth, np.empty(1, depth.dtype))
+    z = _farthest(depth, empty(1, depth.dtype))
     left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
     right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
     box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
-    settings, work = (prior_weight, prior_mean, epsilon, least, n), np.empty(8 + packed.shape[1], depth.dtype)
+    settings, work = (prior_weight, prior_mean, epsilon, least, n), empty(8 + packed.shape[1], depth.dtype)
     # Blocks take n components; a few more lower the threshold by more than what rounding can make of two boxes.
     chosen = cull(packed, n, n + n // 64 + 1, box, settings, work, kept)
     for i in range(chosen):
         index[i] = index[kept[i]]
-    fields, constants = np.empty((chosen, FIELDS)), np.empty((chosen, TERMS), depth.dtype)
+    fields, constants = empty((chosen, FIELDS), np.float64), empty((chosen, TERMS), depth.dtype)
     _terms(components, whitened, index, m, features, fields, constants)
-    packed = np.empty((FIELDS, padded(chosen)), depth.dtype)
+    packed = empty((FIELDS, padded(chosen)), depth.dtype)
     _pack(components, whitened, index, chosen, packed)
     return index[:chosen], fields, packed, constants, settings
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, part
 from ufmstar_torch.kernels.regress_points_cpu import prepare, slots_in_use
 
 
@@ -17,7 +17,7 @@ def near_image(
 ):  # fmt: skip
     """One stream, depth [H, W] into out [H, W] and out_f [F, H, W]; of the rows every ``shares``-th, from ``first``."""
     index, log_peak, local, extent = _components(mean, covariance, weight, sigmas)
-    gaps, kept, sums = np.empty(index.size), np.empty(index.size, np.int64), np.empty(features.shape[1])
+    gaps, kept, sums = empty(index.size, np.float64), empty(index.size, np.int64), empty(features.shape[1], np.float64)
     for v in range(first, depth.shape[0], shares):
         for u in range(depth.shape[1]):
             if depth[v, u] > 0:
@@ -37,7 +37,7 @@ def near_image(
 def near_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f):
     """At points [P, 3] into out [P] and out_f [F, P]; NaN where a point is not finite."""
     index, log_peak, local, extent = _components(mean, covariance, weight, sigmas)
-    gaps, kept, sums = np.empty(index.size), np.empty(index.size, np.int64), np.empty(features.shape[1])
+    gaps, kept, sums = empty(index.size, np.float64), empty(index.size, np.int64), empty(features.shape[1], np.float64)
     for p in range(points.shape[0]):
         x, y, z = np.float64(points[p, 0]), np.float64(points[p, 1]), np.float64(points[p, 2])
         known = x + y + z
@@ -54,7 +54,7 @@ def near_points(points, mean, covariance, weight, m, features, prior_weight, pri
 def _components(mean, covariance, weight, sigmas):
     """Occupied components: index, log peak density, mean and whitening [K, 9], and half the sides of their boxes."""
     index, whitening, log_peak = prepare(slots_in_use(weight), mean, covariance, weight)
-    local, extent = np.empty((index.size, 9)), np.empty((index.size, 3))
+    local, extent = empty((index.size, 9), np.float64), empty((index.size, 3), np.float64)
     for k in range(index.size):
         for i in range(3):
             local[k, i] = mean[index[k], i]

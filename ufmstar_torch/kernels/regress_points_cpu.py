@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, part, zeros
 
 _LEAF = 16  # points; below that choosing components costs more than it saves
 HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
@@ -20,8 +20,8 @@ HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 @part
 def prepare(index, mean, covariance, weight):
     """Of some occupied components [n]: index, inverse Cholesky factor (row by row, 6 numbers) and log peak density."""
-    whitening = np.empty((index.size, 6))
-    log_peak = np.empty(index.size)
+    whitening = empty((index.size, 6), np.float64)
+    log_peak = empty(index.size, np.float64)
     for i in range(index.size):
         S = covariance[index[i]]
         least = 1e-14 * max(S[0, 0], S[1, 1], S[2, 2])  # fusion keeps pivots far above it
@@ -41,7 +41,7 @@ def prepare(index, mean, covariance, weight):
 @part
 def slots_in_use(weight):
     """Indices of positive weights; ``np.flatnonzero`` takes longer to compile."""
-    index, n = np.empty(weight.size, np.int64), 0
+    index, n = empty(weight.size, np.int64), 0
     for k in range(weight.size):
         index[n] = k
         n += weight[k] > 0
@@ -58,7 +58,7 @@ def at_points(points, mean, covariance, weight, m, features, prior_weight, prior
     everyone = np.arange(points.shape[0])
     near = _touched(points, everyone, np.arange(index.size), boxes)
     order, leaf = _by_place(points, everyone, near.size)
-    sums = np.zeros(features.shape[1])
+    sums = zeros(features.shape[1], np.float64)
     for first in range(0, order.size, leaf):
         kept = _touched(points, order[first : first + leaf], near, boxes)
         for p in order[first : first + leaf]:
@@ -91,7 +91,7 @@ def _boxes(mean, covariance, index, log_peak, limit):
     millionth larger, far more than the rounding of q: culling by them changes no bit of the result. A component whose
     peak is too low has an empty box.
     """
-    boxes = np.empty((index.size, 2, 3))
+    boxes = empty((index.size, 2, 3), np.float64)
     for j in range(index.size):
         S, square = covariance[index[j]], 2 * (log_peak[j] - limit)
         least = 1e-14 * max(S[0, 0], S[1, 1], S[2, 2])  # as in prepare
@@ -110,7 +110,7 @@ def _touched(points, chosen, candidates, boxes):
             value = np.float64(points[p, i])
             if value - value == 0:
                 low[i], high[i] = min(low[i], value), max(high[i], value)
-    kept = np.empty(candidates.size, np.int64)
+    kept = empty(candidates.size, np.int64)
     n = 0
     for j in candidates:
         x = boxes[j, 0, 0] <= high[0] and low[0] <= boxes[j, 1, 0]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import contracted, kernel, leaf, part
+from ufmstar_torch.kernels.compile_cpu import contracted, empty, kernel, leaf, part, zeros
 from ufmstar_torch.kernels.regress_cull_cpu import FIELDS, cull, pad
 from ufmstar_torch.kernels.regress_vectors_cpu import (
     PIXELS,
@@ -55,7 +55,7 @@ def exact_at(depth, K, pixels, view, features, shift, out, out_f):
     """One stream at some pixels [n], indices into the flattened image, into out [n] and out_f [F, n]."""
     height, width = depth.shape
     columns, rows = (width + _BLOCK - 1) // _BLOCK, (height + _BLOCK - 1) // _BLOCK
-    begin, sorted_pixels = np.zeros(rows * columns + 1, np.int64), np.empty((4, pixels.size), np.int64)
+    begin, sorted_pixels = zeros(rows * columns + 1, np.int64), empty((4, pixels.size), np.int64)
     _by_block(pixels, width, columns, begin, sorted_pixels)
     tiles, lists, sums = _scratch(view, out_f, shift)
     _at_pixels(depth, K, begin, sorted_pixels, view, features, tiles, lists, sums, out, out_f)
@@ -74,19 +74,19 @@ def _scratch(view, out_f, shift):
     """
     n, dtype, more = view[2].shape[1], view[2].dtype, out_f.shape[0] - _mixed(out_f.shape[0])  # n is padded
     tiles = (
-        np.empty((2, PIXELS), dtype), np.empty(PIXELS, dtype), np.empty((_TILES, 3 * PIXELS), dtype),
-        np.empty((_TILES, 9)), np.empty(_TILES, np.bool_), np.empty((_TILES, PIXELS), dtype), np.empty(10, dtype),
+        empty((2, PIXELS), dtype), empty(PIXELS, dtype), empty((_TILES, 3 * PIXELS), dtype),
+        empty((_TILES, 9), np.float64), empty(_TILES, np.bool_), empty((_TILES, PIXELS), dtype), empty(10, dtype),
     )  # fmt: skip
-    lists = np.empty((FIELDS, n), dtype), np.empty(n + 8, dtype), np.empty(n, np.int64), np.empty(n, np.int64)
-    start = np.zeros(6, dtype)
+    lists = empty((FIELDS, n), dtype), empty(n + 8, dtype), empty(n, np.int64), empty(n, np.int64)
+    start = zeros(6, dtype)
     start[_EVIDENCE], start[_TOTAL], start[3] = view[4][0], view[4][0] * view[4][1], TINY
     start[4], start[5] = shift[1], shift[0]
-    densities = np.empty((n if more > 0 else 0, PIXELS), dtype)
+    densities = empty((n if more > 0 else 0, PIXELS), dtype)
     return (
         tiles, lists,
         (
-            start, np.empty((n, 3), dtype), densities, np.empty((5, PIXELS), dtype),
-            np.empty((more, PIXELS), dtype), np.empty(n, dtype),
+            start, empty((n, 3), dtype), densities, empty((5, PIXELS), dtype),
+            empty((more, PIXELS), dtype), empty(n, dtype),
         ),
     )  # fmt: skip
 

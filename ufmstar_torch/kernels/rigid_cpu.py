@@ -11,7 +11,7 @@ import functools
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import leaf, part
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
 from ufmstar_torch.kernels.vectors_cpu import LANES, vectors
 
 FIELDS = 13  # of a component: mean (3), covariance (9), weight
@@ -27,7 +27,7 @@ def padded(n):
 @part
 def relative(T_a, T_b):
     """[3, 4] the motion (R, t) that takes points of camera a into camera b (``camera.relative_pose``)."""
-    motion = np.empty((3, 4))
+    motion = empty((3, 4), np.float64)
     x, y, z = T_a[0, 3] - T_b[0, 3], T_a[1, 3] - T_b[1, 3], T_a[2, 3] - T_b[2, 3]
     for i in range(3):
         for j in range(3):
@@ -68,7 +68,7 @@ def turn(code, motion, n, stride, fields):
 @part
 def move(motion, mean, covariance, weight, mean_out, covariance_out):
     """Write the moved mean [K, 3] and covariance [K, 3, 3] of occupied slots. What is not written stays as it is."""
-    half = np.empty((3, 3))
+    half = empty((3, 3), np.float64)
     for k in range(weight.size):
         if not weight[k] > 0:
             continue

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.compile_cpu import kernel
+from ufmstar_torch.kernels.compile_cpu import kernel, zeros
 from ufmstar_torch.kernels.segment_image_cpu import join_rows, write_gaussians, write_labels
 from ufmstar_torch.kernels.segment_rows_cpu import SEGMENT, SEGMENT_INT, scan_rows
 from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
@@ -150,14 +150,14 @@ def _depth_bins(s: float, limits: _Limits) -> tuple[np.ndarray, np.ndarray]:
 def _feature_means(features, labels, weight):
     """Mean of the features [B, F, H, W] over the pixels of each Gaussian, in raster order."""
     streams, channels, height, width = features.shape
-    sums = np.zeros((streams, weight.shape[1], channels))
+    sums = zeros((streams, weight.shape[1], channels), np.float64)
     for b in range(streams):
         for f in range(channels):
             for v in range(height):
                 for u in range(width):
                     if labels[b, v, u] >= 0:
                         sums[b, labels[b, v, u], f] += features[b, f, v, u]
-    out = np.zeros(sums.shape, weight.dtype)
+    out = zeros(sums.shape, weight.dtype)
     for b in range(streams):
         for k in range(weight.shape[1]):
             for f in range(channels):

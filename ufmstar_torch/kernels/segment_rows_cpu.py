@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, leaf
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, zeros
 
 # Where counters start. numba gives a plain 0 a type of its own, and compiles all that is called with it twice.
 ZERO: Any = np.int64(0)
@@ -54,11 +54,14 @@ def scan_rows(
     its runs.
     """
     width = z.shape[1]
-    row, rx = (np.empty(width), np.empty(width), np.empty(width), np.zeros(width)), np.empty(width)
+    row, rx = (
+        (empty(width, np.float64), empty(width, np.float64), empty(width, np.float64), zeros(width, np.float64)),
+        empty(width, np.float64),
+    )
     for u in range(width):
         rx[u] = (u - cx) / fx
-    place = np.empty(width + 1, np.int32)  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
-    older, older_int = np.empty((limits.max_open, 10)), np.empty((limits.max_open, 5), np.int64)
+    place = empty(width + 1, np.int32)  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
+    older, older_int = empty((limits.max_open, 10), np.float64), empty((limits.max_open, 5), np.int64)
     end, pixels = first * segments_of_row(width, limits), first * width
     for v in range(first, last):
         spans[v, 0], spans[v, 2] = end, pixels

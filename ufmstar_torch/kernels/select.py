@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import fields, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -22,13 +20,11 @@ from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.posterior.update import PosteriorUpdate
 from ufmstar_torch.posterior.update import update as update_posterior
-from ufmstar_torch.regress import SAMPLE_REFERENCE, SampleKernels
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
 
 _TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
-Wait = Callable[[], None]
 _LEAST_CAPABILITY = (8, 0)  # of an NVIDIA GPU that triton supports
 
 
@@ -105,15 +101,6 @@ def select_merge(name: str, device_type: str) -> MergeKernels:
 
         return MergeKernels(merge_cpu.partition, merge_cpu.own_shares)
     return MERGE_REFERENCE
-
-
-def select_sample(name: str, device_type: str) -> SampleKernels:
-    """The parts of an image average; arguments and errors as :func:`select_step`."""
-    if _compiled(name, device_type):
-        from ufmstar_torch.kernels import sample_cpu
-
-        return SampleKernels(sample_cpu.sample_pixels, sample_cpu.sample_mean)
-    return SAMPLE_REFERENCE
 
 
 def select_kernels(name: str, device_type: str) -> Kernels:
@@ -211,23 +198,6 @@ def compile_triangulation() -> None:
     poses = np.stack([np.eye(4)] * 2)
     poses[1, 0, 3] = 1.0
     triangulate(np.array([[[0.5, 0.0], [-0.5, 0.0]]]), np.ones((1, 2), np.bool_), poses, np.eye(3))
-
-
-@contextmanager
-def select_beside(name: str, device_type: str, jobs: Sequence[tuple[str, str, dict[str, Any]]]) -> Iterator[Wait]:
-    """Where kernels are compiled for the CPU, a process beside this one that compiles others, if any have to be
-    (``compile_beside``); arguments and errors as :func:`select_step`. The context's value waits for it."""
-    if not _compiled(name, device_type):
-        yield _no_wait
-        return
-    from ufmstar_torch.kernels.compile_beside import compiling_beside
-
-    with compiling_beside(jobs) as compiler:
-        yield compiler.wait
-
-
-def _no_wait() -> None:
-    """Nothing is compiled beside."""
 
 
 def _on_host(kernel: SegmentKernel) -> SegmentKernel:

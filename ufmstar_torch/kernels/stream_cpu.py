@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, part, zeros
 from ufmstar_torch.kernels.correspond_cpu import matches
 from ufmstar_torch.kernels.fuse_cpu import append, floored, fuse_pairs
 from ufmstar_torch.kernels.reach_cpu import reached
@@ -58,13 +58,18 @@ def match(b, camera, before, after, mixture, segments, size, thresholds, reach):
     mean_c, cov_c, weight_c = segments[0][b], segments[1][b], segments[2][b]
     motion = relative(first, present)
     near, occupied = reached(motion, mean, covariance, weight, K, size, reach[0], reach[1], weight_c.size)
-    here = np.empty((FIELDS, padded(near.size + weight_c.size)))
-    segments_here = np.empty((FIELDS, padded(weight_c.size)))
+    here = empty((FIELDS, padded(near.size + weight_c.size)), np.float64)
+    segments_here = empty((FIELDS, padded(weight_c.size)), np.float64)
     gather(near, near.size, mean, covariance, weight, here)
     turn(motion, padded(near.size), here.shape[1], here)
-    gather(np.arange(weight_c.size), weight_c.size, mean_c, cov_c, weight_c, segments_here)
+    everyone = empty(weight_c.size, np.int64)
+    for i in range(everyone.size):
+        everyone[i] = i
+    gather(everyone, weight_c.size, mean_c, cov_c, weight_c, segments_here)
     c, k, overlap = matches(here, near.size, segments_here, weight_c.size, K, *size, *thresholds)
-    new, found, matched, created = np.ones(weight_c.size, np.bool_), 0, 0, 0
+    new, found, matched, created = empty(weight_c.size, np.bool_), 0, 0, 0
+    for i in range(new.size):
+        new[i] = True
     for i in range(c.size):
         new[c[i]] = False
     for i in range(new.size):
@@ -110,17 +115,17 @@ def join(b, present, first, before, after, segments, pairs, distance, new, occup
     _extend(before[3][b], disagreement)
     _extend(before[4][b], count)
     _extend(before[5][b].reshape(-1), features.reshape(-1))
-    moved, turned = np.zeros(mean_c.shape), np.zeros(cov_c.shape)
+    moved, turned = zeros(mean_c.shape, np.float64), zeros(cov_c.shape, np.float64)
     move(relative(present[b], first[b]), mean_c, cov_c, weight_c, moved, turned)
     slots, given = (mean, covariance, weight, disagreement, count, features), (moved, turned, weight_c, features_c)
     c, k, overlap = pairs
     fuse_pairs(*slots, *given, c, _at(near, k), overlap, distance, weighted, epsilon)
     components = append(*slots, *given, new, occupied)
-    slots_near = np.empty(near.size + components - occupied, np.int64)
+    slots_near = empty(near.size + components - occupied, np.int64)
     for i in range(slots_near.size):
         slots_near[i] = near[i] if i < near.size else occupied + i - near.size
     _renew(relative(first[b], present[b]), slots_near, k, near.size, mean, covariance, weight, here)
-    m, more = np.empty(slots_near.size), np.empty((slots_near.size, features.shape[1] + extra))
+    m, more = empty(slots_near.size, np.float64), empty((slots_near.size, features.shape[1] + extra), np.float64)
     for i in range(slots_near.size):
         k = slots_near[i]
         m[i] = disagreement[k]
@@ -133,7 +138,7 @@ def join(b, present, first, before, after, segments, pairs, distance, new, occup
 @part
 def _at(values, index):
     """``values[index]``, which takes longer to compile."""
-    out = np.empty(index.size, np.int64)
+    out = empty(index.size, np.int64)
     for i in range(index.size):
         out[i] = values[index[i]]
     return out
@@ -151,10 +156,10 @@ def _extend(before, after):
 @part
 def _renew(motion, slots, fused, old, mean, covariance, weight, here):
     """Write the ``fused`` columns [P] by field in the camera frame again, and those from ``old`` on."""
-    columns = np.empty(fused.size + slots.size - old, np.int64)
+    columns = empty(fused.size + slots.size - old, np.int64)
     for i in range(columns.size):
         columns[i] = fused[i] if i < fused.size else old + i - fused.size
-    changed = np.empty((FIELDS, padded(columns.size)))
+    changed = empty((FIELDS, padded(columns.size)), np.float64)
     gather(_at(slots, columns), columns.size, mean, covariance, weight, changed)
     turn(motion, changed.shape[1], changed.shape[1], changed)
     for field in range(FIELDS):

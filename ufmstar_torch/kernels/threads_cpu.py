@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-_SHARE = 160 * 160  # pixels; below that a thread costs more than it saves (docs/results/benchmark.md)
+_SHARE = 160 * 160  # pixels; below that a thread costs more than it saves
 
 
 def each(function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
