@@ -14,8 +14,8 @@ from oracle_anchors import weight
 import scenes
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.evidence import Evidence, inliers, means, observe
+from ufmstar_torch.anchors.extension import anchored_term
 from ufmstar_torch.anchors.given import AnchorInput, Anchors
-from ufmstar_torch.anchors.hook import anchored_term
 
 HEIGHT, WIDTH = 48, 64
 ON = UfMStarConfig(anchors=AnchorConfig())
@@ -56,7 +56,7 @@ def test_anchored_without_anchors_is_plain():
         assert a.anchored is None
         assert bool((b.anchored[b.valid] == 0).all())
         assert b.statistics.anchors.tolist() == [0]
-    with pytest.raises(ValueError, match="AnchorConfig"):
+    with pytest.raises(ValueError, match=r"UfMStarConfig\.anchors is None"):
         plain(*arguments, anchors=anchors_of(depth, 5, np.random.default_rng(0)))
     with pytest.raises(ValueError, match="needs anchors"):
         a.corrected()

@@ -155,7 +155,7 @@ def test_the_pipeline_takes_anchors_in_the_images_pixels(preprocess):
         assert 38 <= given <= 40, "but for those that a pixel without depth takes at half the size"
         assert 23 <= fewer <= 25
     assert float(out.ufm.anchored[out.ufm.valid].mean()) > 0.05
-    with pytest.raises(ValueError, match="AnchorConfig"):
+    with pytest.raises(ValueError, match="anchors"):
         UncertainDepth(Biased())(image, pose, intrinsics, anchors=anchors)
 
 

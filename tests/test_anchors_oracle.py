@@ -11,8 +11,8 @@ from walks import HEIGHT, SPGF, WIDTH, oracle_settings
 import scenes
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.evidence import Evidence, inliers
+from ufmstar_torch.anchors.extension import anchored_term, learn
 from ufmstar_torch.anchors.given import AnchorInput, Anchors, check_anchors, check_values
-from ufmstar_torch.anchors.hook import anchored_term, learn
 from ufmstar_torch.frame import check_frame
 from ufmstar_torch.kernels import anchors_cpu
 from ufmstar_torch.kernels.regress_cpu import all_seen, regress_maps

@@ -40,10 +40,10 @@ def test_public_names():
 
 
 def test_signatures():
-    observation = ["depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid", "features", "anchors"]
-    assert names(UfMStar.__init__) == ["config", "recalibration", "dtype", "device"]
-    assert names(UfMStar.forward) == observation
-    assert names(UfMStar.mean_uncertainty) == [*observation, "pixels", "fraction", "seed", "average"]
+    observation = ["depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid", "features"]
+    assert names(UfMStar.__init__) == ["config", "extensions", "dtype", "device"]
+    assert names(UfMStar.forward) == [*observation, "given"]
+    assert names(UfMStar.mean_uncertainty) == [*observation, "pixels", "fraction", "seed", "average", "given"]
     assert names(UfMStar.query) == ["points", "frame"]
     assert names(UfMStar.reset) == ["streams", "keep_evidence"]
     made_of = [

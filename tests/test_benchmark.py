@@ -16,7 +16,7 @@ from onnx_files import small_network, write_fastdepth
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, TimedCalls, pinned_threads
-from ufmstar_torch.eval.commands import bench_command
+from ufmstar_torch.eval.commands.bench import main, read
 from ufmstar_torch.eval.engine.clock import CallTimes, paired_ratio, spread
 
 # ---- statistics and clocks ----
@@ -122,7 +122,7 @@ def bench(path, *words):
     """A tiny run: its report."""
     words = [*words, "--frames", "2", "--history", "3", "--threads", "1", "--json", str(path)]
     before = threads()
-    assert bench_command.main(bench_command.read(words)) == 0
+    assert main(read(words)) == 0
     assert threads() == before
     return json.loads(path.read_text())
 

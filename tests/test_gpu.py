@@ -14,6 +14,7 @@ from walks import SPGF, walks
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch.capture import Captured
 
 pytestmark = [
     pytest.mark.gpu,
@@ -68,7 +69,7 @@ def test_256_streams_equal_themselves_alone_and_leave_each_other_alone():
 def test_the_graph_equals_the_step():
     ufm, given = UfMStar(UfMStarConfig(segment=SPGF, **FIXED)), frames(2, 12)
     plain = copy.deepcopy(ufm)
-    captured = ufm.capture(*given[0])
+    captured = Captured(ufm, *given[0])
     for i, frame in enumerate(given):
         if i == 8:
             ufm.reset([1])

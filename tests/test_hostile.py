@@ -16,7 +16,6 @@ from modules import same
 import scenes
 from ufmstar_torch import AnchorConfig, MergeConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.state import UfMStarState
 
 H, W, LENGTH = 24, 32, 20
 FRAMES = int(os.environ.get("UFMSTAR_HOSTILE_FRAMES", "1000"))
@@ -148,7 +147,7 @@ def spoil(rng, given):
 def assert_in_order(ufm, session):
     """The state is one that a run may have."""
     try:
-        UfMStarState(**{name: getattr(ufm, name) for name in ufm.STATE}).require(ufm.config)
+        ufm.state.require(ufm.config, ufm.state)
     except ValueError as error:
         raise AssertionError(f"session {session}: {error}") from error
 

@@ -33,7 +33,8 @@ from ufmstar_torch.kernels import (
 )
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.posterior.update import update as update_posterior
-from ufmstar_torch.step import REFERENCE, step
+from ufmstar_torch.step import step
+from ufmstar_torch.step_parts import REFERENCE
 
 pytestmark = pytest.mark.numerics
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ HEAVY = ("torch", "lightning", "torchvision", "kornia", "matplotlib", "torchmetr
 HEAVY += ("numba",)
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
 REFERENCE = ("gaussian", "camera", "segment", "correspond", "disagree", "fuse", "regress", "mixture", "step", "frame")
-REFERENCE += ("anchors", "evidence", "hook", "output", "state", "fixed_order", "merge")
+REFERENCE += ("anchors", "evidence", "output", "state", "fixed_order", "merge")
 
 
 def layer_of(path: Path) -> str:
@@ -98,6 +99,23 @@ def test_imports_inside_eval_go_one_way():
                 if rank[target] > rank[own[0]] or (rank[target] == rank[own[0]] and target != own[0]):
                     result.add(f"{'.'.join(own)} -> {'.'.join(parts[2:]) or target}")
     assert not result, result
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    """Neither at import nor inside functions."""
+    names = {module_of(path): path for path in sources() if path.name != "__init__.py"}
+
+    def targets(path: Path) -> set[str]:
+        each = [(module, name) for module, own in imported(path) for name in own or [""]]
+        return {full if (full := f"{module}.{name}") in names else module for module, name in each} & names.keys()
+
+    graph = {name: targets(path) - {name} for name, path in names.items()}
+    TopologicalSorter(graph).prepare()  # a CycleError names the circle
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts if parts[0] == "ufmstar_torch" else ("ufmstar_torch", *parts))
 
 
 def test_no_slow_tier_imports_a_fast_one():

@@ -20,6 +20,8 @@ from walks import SPGF, run
 
 from ufmstar_torch import AnchorConfig, MergeConfig, PosteriorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.frame import FRAME_FAULTS
+from ufmstar_torch.fuse import make_room
+from ufmstar_torch.mixture import GaussianMixture
 
 pytestmark = pytest.mark.numerics
 
@@ -283,15 +285,49 @@ def test_growth_by_doubling_keeps_everything():
     assert small.mean.shape[1] == 2 ** int(np.ceil(np.log2(k)))
 
 
-def test_max_components_drops_and_counts():
-    ufm = UfMStar(CONFIG.replace(initial_capacity=2, max_components=5))
-    outputs = [ufm(*frame(i)) for i in range(8)]
-    assert ufm.mean.shape[1] == 5
-    assert outputs[-1].statistics.components.item() == 5
-    assert sum(o.statistics.dropped.item() for o in outputs) > 0
-    for o in outputs:
-        s = o.statistics
-        assert (s.matched + s.new + s.dropped).item() == s.segments.item()
+@pytest.mark.parametrize("limit", [5, 14])
+def test_max_components_drops_the_farthest_in_both_tiers(limit):
+    """As the mixture without a limit, less what is farthest from the camera; every component is counted."""
+    limited = CONFIG.replace(initial_capacity=2, max_components=limit)
+    tiers = [UfMStar(limited.replace(backend=backend), dtype=torch.float64) for backend in ("torch", "numba")]
+    free, dropped, before, earlier = UfMStar(CONFIG, dtype=torch.float64), 0, 0, []
+    for i in range(8):
+        one, other = (ufm(*frame(i, torch.float64)) for ufm in tiers)
+        assert int(one.statistics.dropped) == int(other.statistics.dropped)
+        torch.testing.assert_close(one.variance, other.variance, rtol=1e-8, atol=1e-10, equal_nan=True)
+        for a, b in zip(*(ufm.mixture.tensors().values() for ufm in tiers), strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12)
+        s = one.statistics
+        dropped += int(s.dropped)
+        assert int(s.components) == before + int(s.segments - s.matched) - int(s.dropped) <= limit
+        before = int(s.components)
+        if not dropped:
+            free(*frame(i, torch.float64))
+            earlier = free.mixture.mean[0, :before]
+        elif free is not None:
+            free(*frame(i, torch.float64))
+            k = int(free.mixture.components)
+            where = torch.linalg.inv(free.T_world_first[0]) @ torch.tensor(POSES[i])
+            far = (free.mixture.mean[0, : len(earlier)] - where[:3, 3]).square().sum(-1)
+            gone = far.sort(descending=True).indices[: k - limit]
+            kept = [n for n in range(k) if n not in gone.tolist()][:limit]
+            torch.testing.assert_close(tiers[0].mixture.mean[0], free.mixture.mean[0, kept], rtol=1e-9, atol=1e-12)
+            free = None
+    assert dropped > 0
+    assert free is None
+    assert tiers[0].mean.shape[1] == tiers[1].mean.shape[1] == limit
+
+
+def test_of_equally_far_components_the_oldest_is_dropped_and_sums_follow():
+    mean = torch.tensor([[[0.0, 0, 1], [0, 0, 2], [0, 2, 0], [0, 0, 0.5], [0, 0, 9]]])
+    empty = GaussianMixture.empty(1, 5, dtype=torch.float32, device="cpu")
+    mixture = empty.replace(mean=mean, weight=torch.tensor([[1.0, 2, 3, 4, 0]]))
+    sums = {"evidence": torch.arange(4.0)[None, :, None]}
+    for old, coming, kept, dropped in ((4, 1, [0, 2, 3], 1), (4, 3, [3], 3), (2, 1, [0, 2, 3], 1), (2, 3, [2], 2)):
+        room = make_room(mixture, sums, torch.tensor([old]), torch.tensor([coming]), torch.zeros(1, 3), 4)
+        assert (room.mixture.weight[0] - 1)[: len(kept)].tolist() == kept
+        assert room.sums["evidence"][0, :, 0].tolist() == kept + [0] * (5 - len(kept))
+        assert int(room.dropped) == dropped
 
 
 def test_mean_uncertainty():

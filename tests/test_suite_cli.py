@@ -12,7 +12,7 @@ from tiny_suite import rows_of
 from ufmstar_torch import cli
 from ufmstar_torch.eval.bench import measure as measurement
 from ufmstar_torch.eval.commands import dry_run as dry
-from ufmstar_torch.eval.commands.eval_command import job_from, read
+from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.suite import names
 from ufmstar_torch.eval.suite import shards

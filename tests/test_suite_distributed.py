@@ -18,7 +18,7 @@ from pool_tasks import pool
 from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept
 from trainings import SPEC
 
-from ufmstar_torch.eval.commands.eval_command import job_from, read
+from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.run import machine
 from ufmstar_torch.eval.run.folder import FolderError

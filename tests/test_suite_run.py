@@ -16,7 +16,7 @@ from layouts_more import write_nyu
 from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, write_rooms
 from tiny_suite import evaluate, rows_of
 
-from ufmstar_torch.eval.commands.eval_command import job_from, read
+from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.run.folder import FolderError

@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from ufmstar_torch.config import SPGFConfig as SPGFConfig
     from ufmstar_torch.config import UfMStarConfig as UfMStarConfig
     from ufmstar_torch.mixture import GaussianMixture as GaussianMixture
+    from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
     from ufmstar_torch.pipeline import UncertainDepth as UncertainDepth
     from ufmstar_torch.prediction import DepthPrediction as DepthPrediction
     from ufmstar_torch.recalibrate import Recalibration as Recalibration
     from ufmstar_torch.ufmstar import UfMStar as UfMStar
-    from ufmstar_torch.ufmstar import UfMStarOutput as UfMStarOutput
 else:
     __getattr__, __dir__ = lazy_names(__name__)
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
+from ufmstar_torch.output import UfMStarOutput
+from ufmstar_torch.ufmstar import UfMStar
 
 _WARM_UP = 3  # frames before the capture: kernels are compiled by then
 
@@ -28,7 +27,8 @@ class Captured:
         record: turns a function into its recording. None = a CUDA graph.
 
     Raises:
-        ValueError: a config with which a step reads from the device, or does not have one shape.
+        ValueError: tensors that are not on CUDA (without ``record``), or a config with which a step reads from the
+            device, or does not have one shape.
     """
 
     def __init__(
@@ -43,6 +43,8 @@ class Captured:
         *,
         record: Callable[[Callable[[], None]], Callable[[], None]] | None = None,
     ) -> None:
+        if record is None and depth.device.type != "cuda":
+            raise ValueError(f"depth must lie on a CUDA device to be captured, got {depth.device}")
         _require_fixed(ufm)
         given = (depth, pose, intrinsics, aleatoric, epistemic, valid)
         self._inputs = tuple(None if v is None else v.detach().to(depth.device, copy=True) for v in given)

@@ -17,12 +17,12 @@ OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("eval.commands.demo", "the method on rendered rooms, without data or weights"),
     "run": ("eval.commands.run", "depth and variance of a sequence of posed images, onto disk"),
-    "eval": ("eval.commands.eval_command", "the rows of a table or figure of the paper, on your own sequences"),
-    "report": ("eval.commands.report_command", "tables, figures and a page from the results of eval"),
-    "bench": ("eval.commands.bench_command", "time per stage and memory, beside the depth network's own"),
+    "eval": ("eval.commands.evaluate", "the rows of a table or figure of the paper, on your own sequences"),
+    "report": ("eval.commands.report", "tables, figures and a page from the results of eval"),
+    "bench": ("eval.commands.bench", "time per stage and memory, beside the depth network's own"),
     "train": ("train.command", "a network with an uncertainty head, or an ensemble of them"),
-    "recalibrate": ("eval.commands.recalibrate_command", "fit a map of the variance to sequences with ground truth"),
-    "data": ("eval.commands.data_command", "check: do a sequence's poses, depth and images fit together?"),
+    "recalibrate": ("eval.commands.recalibrate", "fit a map of the variance to sequences with ground truth"),
+    "data": ("eval.commands.data", "check: do a sequence's poses, depth and images fit together?"),
 }
 _HELP = """usage: ufmstar COMMAND ...
 

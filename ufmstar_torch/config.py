@@ -202,7 +202,8 @@ class UfMStarConfig(Checked):
         add_epistemic: add the network's epistemic variance to the result
         features: additional regressed quantities per Gaussian
         initial_capacity: slots for Gaussians at the start; the number grows as needed
-        max_components: largest number of Gaussians; null = no limit
+        max_components: largest number of Gaussians, beyond which the farthest are dropped, then the oldest; null = no
+            limit
         rotation_tolerance: largest deviation of a pose's rotation from an orthogonal matrix
         on_bad_frame: refuse a frame with a fault, or skip and count it
         backend: implementation of the kernels

@@ -7,7 +7,6 @@ raises or skips. What is wrong with single pixels becomes ``valid = False`` and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,6 +16,8 @@ from torch import Tensor
 from ufmstar_torch.arguments import require_float, require_mask
 from ufmstar_torch.camera import POLAR_STEPS as POLAR_STEPS
 from ufmstar_torch.camera import focal_and_centre, nearest_rotation, rotation_deviation
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.output import FrameStatistics
 
 # Index = code. Each text finishes the sentence "stream b: ...".
 FRAME_FAULTS = (
@@ -191,18 +192,36 @@ def check_frame(
     return kernel(maps, T, K, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
 
 
-def raise_faults(faults: Sequence[int]) -> None:
-    """Raise a ValueError that names every stream at fault.
-
-    Args:
-        faults: of every stream, index into ``FRAME_FAULTS``.
+def raise_faults(frame: FrameInput) -> None:
+    """Raise a ValueError that names every stream at fault; waits for an accelerator unless the camera was on the CPU.
 
     Raises:
-        ValueError: an entry of ``faults`` is not 0.
+        ValueError: a stream is at fault, or the frame has no values.
     """
+    fault = frame.fault if frame.known_fault is None else frame.known_fault
+    if fault.device.type == "meta":
+        raise ValueError("depth lies on device meta, without values: set on_bad_frame='skip'")
+    faults = fault.tolist()
     bad = [f"stream {b}: {FRAME_FAULTS[code]}" for b, code in enumerate(faults) if code]
     if bad:
         raise ValueError("; ".join(bad))
+
+
+def without_segments(frame: FrameInput, statistics: FrameStatistics, config: UfMStarConfig) -> str:
+    """A warning where a stream had depth but no segment, else ""; on the CPU only, elsewhere it would have to wait."""
+    if frame.depth.device.type != "cpu" or all(statistics.segments.tolist()):
+        return ""
+    pixels = statistics.valid_pixels + frame.beyond + frame.out_of_range
+    empty = (pixels > 0) & (statistics.segments == 0)
+    if not bool(empty.any()):
+        return ""
+    b = int(empty.nonzero()[0])
+    return (
+        f"stream {b}: a frame has no segment, so nothing is compared between views: of {int(pixels[b])} pixels "
+        f"{int(frame.beyond[b])} lie beyond segment.max_depth = {config.segment.depth_limit} m and "
+        f"{int(frame.out_of_range[b])} outside the accepted ranges. Is the depth in metres, smooth, and the "
+        "intrinsics the depth map's? (said once)"
+    )
 
 
 def _features(features: Tensor | None, count: int, plain: Tensor) -> Tensor | None:

@@ -7,6 +7,9 @@ storage would round away are lifted, so that a thin covariance stays positive de
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -123,3 +126,54 @@ def append(mixture: GaussianMixture, current: GaussianMixture, new: Tensor) -> t
     placed["disagreement"] = place(mixture.disagreement, torch.zeros_like(current.disagreement))
     placed["count"] = place(mixture.count, torch.ones_like(current.count))
     return GaussianMixture(**placed), (new & ~fits).sum(dim=1)
+
+
+class Room(NamedTuple):
+    """A mixture from which components were dropped.
+
+    Attributes:
+        mixture: [B, K], the others in their order.
+        sums: [B, K, ...] by name, as the mixture's rows.
+        slot: [B, K] in which each of them was; of empty slots nothing.
+        dropped: [B] how many of the components that were remembered before are gone.
+    """
+
+    mixture: GaussianMixture
+    sums: dict[str, Tensor]
+    slot: Tensor
+    dropped: Tensor
+
+
+def make_room(
+    mixture: GaussianMixture, sums: Mapping[str, Tensor], old: Tensor, coming: Tensor, position: Tensor, limit: int
+) -> Room:
+    """Drop what exceeds ``config.max_components``: the component farthest from the camera first, of equally far ones
+    the oldest. The others move up and keep their order, which is that of their creation. No device is waited for.
+
+    Args:
+        mixture: after the fusion, [B, K].
+        sums: tensors [B, K or less, ...] by name, whose rows belong to the components.
+        old: [B] how many components were remembered before the frame; those behind them are dropped last.
+        coming: [B] how many are still to be appended.
+        position: [B, 3] of the camera in the mixture's frame [m].
+        limit: the largest number of components.
+    """
+    slot = torch.arange(mixture.capacity, device=position.device).expand(mixture.weight.shape)
+    excess = (mixture.components + coming - limit)[:, None]
+    key = (mixture.mean.double() - position[:, None]).square().sum(-1)
+    key = torch.where(slot < old[:, None], key, slot / mixture.capacity - 2)
+    order = torch.where(mixture.valid, key, -3.0).sort(dim=1, descending=True, stable=True).indices
+    stays = mixture.valid & (torch.empty_like(order).scatter_(1, order, slot) >= excess)
+    source = (~stays).to(torch.uint8).argsort(dim=1, stable=True)
+    occupied = torch.gather(stays, 1, source)
+
+    def moved(value: Tensor) -> Tensor:
+        missing = mixture.capacity - value.shape[1]
+        value = torch.cat([value, value.new_zeros(len(value), missing, *value.shape[2:])], 1) if missing else value
+        shape = source.shape + (1,) * (value.dim() - 2)
+        rows = torch.gather(value, 1, source.view(shape).expand(value.shape))
+        return torch.where(occupied.view(shape), rows, torch.zeros_like(rows))
+
+    dropped = (mixture.valid & ~stays & (slot < old[:, None])).sum(1)
+    after = GaussianMixture(**{name: moved(value) for name, value in mixture.tensors().items()})
+    return Room(after, {name: moved(value) for name, value in sums.items()}, source, dropped)

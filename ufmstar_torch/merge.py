@@ -28,16 +28,19 @@ their shares at these points. Their means and covariances stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.extension import Extension, FrameExtension, Total
 from ufmstar_torch.fixed_order import total
+from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import cholesky3, floor_covariance, storage_floor
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.output import StepOutput
 from ufmstar_torch.regress import shares
 from ufmstar_torch.state import UfMStarState
 
@@ -61,56 +64,88 @@ class MergeKernels:
     own_shares: Callable[[GaussianMixture, UfMStarConfig], Tensor]
 
 
+class MergeExtension(Extension):
+    """Merging every some frames.
+
+    Args:
+        config: with ``merge``.
+        kernels: makes the kernels for a backend and a device's type.
+    """
+
+    def __init__(self, config: UfMStarConfig, kernels: Callable[[str, str], MergeKernels]) -> None:
+        self._config, self._kernels = config, kernels
+
+    def of_frame(
+        self, frame: FrameInput, own: Sequence[Tensor], given: object, before: Sequence[FrameExtension], *, dense: bool
+    ) -> FrameExtension:
+        """Merging after this frame."""
+        return _MergeFrame(frame, self._config, self._kernels(self._config.backend, frame.depth.device.type))
+
+
+class _MergeFrame(FrameExtension):
+    """Merging after one frame."""
+
+    changes_mixture = True
+
+    def __init__(self, frame: FrameInput, config: UfMStarConfig, kernels: MergeKernels) -> None:
+        self._frame, self._config, self._kernels = frame, config, kernels
+
+    def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
+        """Merge the streams that are due, and count the components."""
+        state = merged(state, self._frame.fault == 0, self._config, self._kernels)
+        return state, replace(out, statistics=replace(out.statistics, components=state.mixture.components))
+
+
 def merged(state: UfMStarState, fine: Tensor, config: UfMStarConfig, kernels: MergeKernels) -> UfMStarState:
     """The state after a frame, merged every ``merge.every`` frames of a stream.
 
     Args:
         state: of B streams, after the step.
         fine: [B] True where the frame was used.
-        config: ``merge`` None: the state as it is. Otherwise checking which streams are due waits for an accelerator.
+        config: with ``merge``. Checking which streams are due waits for an accelerator.
         kernels: which implementation of each part.
     """
-    if config.merge is None or state.mean.device.type == "meta":
+    assert config.merge is not None
+    if state.mean.device.type == "meta":
         return state
     due = fine & (state.frames % config.merge.every == 0)
     if not bool(due.any()):
         return state
-    mixture, evidence = merge(state.mixture, state.evidence, due, config, kernels)
-    return replace(state, **mixture.tensors(), evidence=evidence)
+    sums = torch.cat([state.mean.new_zeros(*state.weight.shape, 0), *state.by_component.values()], -1)
+    mixture, sums = merge(state.mixture, sums, due, config, kernels)
+    parts = sums.split([value.shape[-1] for value in state.by_component.values()], -1) if state.by_component else ()
+    return state.with_tensors(mixture.tensors() | dict(zip(state.by_component, parts, strict=True)))
 
 
 def merge(
-    mixture: GaussianMixture, evidence: Tensor, due: Tensor, config: UfMStarConfig, kernels: MergeKernels
+    mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarConfig, kernels: MergeKernels
 ) -> tuple[GaussianMixture, Tensor]:
     """Join, then dissolve; the components that are left move up and keep their order.
 
     Args:
         mixture: [B, K] in any frame: both rules are rigid invariants up to the choice of the cubature points.
-        evidence: [B, K, 3] sums of anchors beside it, or [B, 0, 3].
+        sums: [B, K, C] of observations beside it.
         due: [B] the streams to merge; the others stay as they are.
         config: ``merge``, which is not None, and ``prior_weight``.
         kernels: which implementation of each part.
 
     Returns:
-        The mixture [B, K] and the evidence. What neither joined nor received anything is unchanged to the last bit.
+        The mixture [B, K] and the sums. What neither joined nor received anything is unchanged to the last bit.
     """
     assert config.merge is not None
     before = mixture.to(torch.float64)
-    rows = evidence.shape[1]
-    sums = evidence.double() if rows else evidence.new_zeros(*before.weight.shape, evidence.shape[2]).double()
-    joined, sums, changed = _joined(before, sums, kernels.partition(before, config.merge.loss))
+    joined, moved, changed = _joined(before, sums.double(), kernels.partition(before, config.merge.loss))
     floored = floor_covariance(joined.covariance, storage_floor(joined.covariance, mixture.covariance.dtype))
     joined = joined.replace(covariance=torch.where(changed[..., None, None], floored, joined.covariance))
-    fewer, sums, received = _dissolved(joined, sums, kernels.own_shares(joined, config), config)
+    fewer, moved, received = _dissolved(joined, moved, kernels.own_shares(joined, config), config)
     changed = (changed | received | ~fewer.valid) & due[:, None]
 
-    after = fewer.tensors() | {"evidence": sums}
-    old = mixture.tensors() | {"evidence": evidence if rows else sums}
+    after, old = fewer.tensors() | {"sums": moved}, mixture.tensors() | {"sums": sums}
     kept = {name: _where(changed, value.to(old[name].dtype), old[name]) for name, value in after.items()}
     order = (kept["weight"] <= 0).to(torch.uint8).argsort(dim=1, stable=True)
     packed = {name: torch.gather(v, 1, _as_index(order, v)) for name, v in kept.items()}
-    evidence = packed.pop("evidence")[:, :rows].to(evidence.dtype)
-    return GaussianMixture(**packed), evidence
+    sums = packed.pop("sums")
+    return GaussianMixture(**packed), sums
 
 
 def partition(mixture: GaussianMixture, limit: float) -> Tensor:

@@ -21,7 +21,8 @@ class FrameStatistics:
         matched: segments fused with at least one earlier component.
         pairs: fused (c, k) pairs.
         new: segments appended to the mixture.
-        dropped: segments not remembered: ``max_components`` was reached, or nearer than the near plane.
+        dropped: components that were dropped because ``max_components`` was reached, the farthest first; and segments
+            nearer than the near plane, which are not remembered.
         valid_pixels: pixels used.
         beyond: pixels not used because their depth is beyond ``config.segment.max_depth``.
         out_of_range: further pixels with a finite positive depth that are not used: depth, A, E or features outside the
@@ -30,7 +31,7 @@ class FrameStatistics:
             seen from two views or more; what they get is ``config.unmeasured``.
         fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
         rotation_deviation: max |R^T R - I| of the pose, removed by projection onto SO(3).
-        anchors: given and usable; 0 for a standing camera, say.
+        anchors: with ``config.anchors``, given and usable; 0 for a standing camera, say. None without.
         anchors_used: of those, no gross outliers. 0 = nothing new was learnt: M + A + E is plain UfM*'s and B what had
             been learnt before, which at the start is nothing.
         calibration: with ``config.posterior``, mean z^2 of held-out anchors lately: 1 = the posterior is off by as much
@@ -51,8 +52,8 @@ class FrameStatistics:
     unmeasured: Tensor
     fault: Tensor
     rotation_deviation: Tensor
-    anchors: Tensor
-    anchors_used: Tensor
+    anchors: Tensor | None = None
+    anchors_used: Tensor | None = None
     calibration: Tensor | None = None
     unseen: Tensor | None = None
 
@@ -71,8 +72,6 @@ class StepOutput:
     Attributes:
         disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid; [B, n] on a subset.
         features: regressed features [B, H, W, F] or [B, n, F].
-        residual: [B, H, W, 2] or [B, n, 2] from anchors, the mean relative error r and mean square excess e expected at
-            each pixel (``anchors.evidence``); None unless ``config.anchors``.
         measured: [B, H, W] or [B, n] share in [0, 1] of M that rests on surfaces seen from two views or more.
         read_labels: returns ``labels``; a GPU writes them when they are asked for.
         current_cam: C_i in the camera frame.
@@ -81,7 +80,6 @@ class StepOutput:
 
     disagreement: Tensor
     features: Tensor
-    residual: Tensor | None
     measured: Tensor
     read_labels: Callable[[], Tensor]
     current_cam: GaussianMixture
@@ -125,16 +123,16 @@ class UfMStarOutput:
     disagreement: Tensor
     aleatoric: Tensor | None
     epistemic: Tensor | None
-    anchored: Tensor | None
-    bias: Tensor | None
-    posterior_depth: Tensor | None
-    posterior_variance: Tensor | None
     features: Tensor
     measured: Tensor
     valid: Tensor
     read_labels: Callable[[], Tensor]
     current_cam: GaussianMixture
     statistics: FrameStatistics
+    anchored: Tensor | None = None
+    bias: Tensor | None = None
+    posterior_depth: Tensor | None = None
+    posterior_variance: Tensor | None = None
 
     def __repr__(self) -> str:
         """Shape, median standard deviation and counts in a line."""

@@ -17,11 +17,11 @@ from torch import Tensor, nn
 from ufmstar_torch.anchors.given import Anchors, require_anchors
 from ufmstar_torch.anchors.streams import Given, StreamLandmarks
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
-from ufmstar_torch.output import FrameStatistics, MeanUncertainty
+from ufmstar_torch.output import FrameStatistics, MeanUncertainty, UfMStarOutput
 from ufmstar_torch.prediction import DepthPrediction, infer, stated_range
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.stateful import outliving
-from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
+from ufmstar_torch.ufmstar import UfMStar
 
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
 Preprocess = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -185,7 +185,7 @@ class UncertainDepth(NetworksInTurn):
             "dense" (searched in earlier images), a file of landmarks, or a
             :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a list with one for
             each. Saved and reset with the state. None: those given with an image, if any.
-        recalibration: of the variance, as :class:`UfMStar` takes it (``Recalibration.from_json(FILE)``).
+        recalibration: a map of V, after everything else (``Recalibration.from_json(FILE)``); None = V as it is.
         multiview_device: of UfM* and of the results, whatever the networks' is: "cpu" for the paper's split. None = the
             networks'. :meth:`stream` runs both at the same time.
 
@@ -232,7 +232,8 @@ class UncertainDepth(NetworksInTurn):
             config = config.replace(
                 anchors=config.anchors or AnchorConfig(), posterior=config.posterior or PosteriorConfig()
             )
-        self.ufm = UfMStar((config or UfMStarConfig()).within(self.max_depth), recalibration=recalibration)
+        mapped = () if recalibration is None else (recalibration,)
+        self.ufm = UfMStar((config or UfMStarConfig()).within(self.max_depth), extensions=mapped)
         if anchors is not None and self.ufm.config.anchors is None:
             raise ValueError("anchors go with UfMStarConfig(anchors=AnchorConfig())")
         self.landmarks = None if anchors is None else StreamLandmarks(anchors)

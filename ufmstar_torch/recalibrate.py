@@ -15,7 +15,8 @@ from torch import Tensor
 
 from ufmstar_torch.checked import Checked, choice
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.stateful import flat
+from ufmstar_torch.extension import Extension
+from ufmstar_torch.stateful import flat, plain
 
 SCALAR, ISOTONIC = "scalar", "isotonic"
 # Settings of UfM* that do not change what V means.
@@ -23,7 +24,7 @@ _HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
 
 
 @dataclass(frozen=True)
-class Recalibration(Checked):
+class Recalibration(Checked, Extension):
     """V -> V', the same at every pixel.
 
     Between two knots log V' is linear in log V. Above the last knot V' / V is that of the last knot. Below the first
@@ -82,6 +83,10 @@ class Recalibration(Checked):
         beyond = (position - v[-1]).clamp_min(0)
         return torch.where(variance.isnan(), variance, (inside + beyond).exp().to(variance.dtype))
 
+    def map_variance(self, variance: Tensor) -> Tensor:
+        """V' of V."""
+        return self(variance)
+
     def require(self, config: UfMStarConfig, network: str = "") -> None:
         """Check that V means what it meant when the map was fitted.
 
@@ -92,14 +97,12 @@ class Recalibration(Checked):
         Raises:
             ValueError: the map was fitted under other settings of UfM*, or to another network.
         """
-        now = flat(config.to_dict())
-        changed = [
-            f"{name} = {value!r} (now {now[name]!r})"
-            for name, value in flat(self.ufm).items()
-            if name in now and name not in _HARMLESS and now[name] != value
-        ]
+        fitted, now = flat(self.ufm), flat(plain(config))
+        names = sorted((fitted.keys() | now.keys()) - set(_HARMLESS)) if fitted else []
+        changed = [name for name in names if fitted.get(name) != now.get(name)]
         if changed:
-            raise ValueError(f"the recalibration was fitted to UfM* with {', '.join(changed)}")
+            each = ", ".join(f"{name} = {fitted.get(name)!r} (now {now.get(name)!r})" for name in changed)
+            raise ValueError(f"the recalibration was fitted to UfM* with {each}")
         if network and self.network and network != self.network:
             raise ValueError(f"the recalibration was fitted to the network {self.network}, not {network}")
 

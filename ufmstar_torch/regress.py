@@ -246,6 +246,26 @@ def moving_average(
     return flat.scatter(1, pixels, mixed).view(memory.shape), shown
 
 
+def sample_size(size: tuple[int, int], pixels: int | None, fraction: float | None) -> int:
+    """Pixels to sample of an image of ``size`` (H, W): ``pixels``, or a share of all; neither: 1000.
+
+    Raises:
+        ValueError: both, or one out of range.
+    """
+    total = size[0] * size[1]
+    if pixels is not None and fraction is not None:
+        raise ValueError("give pixels or fraction, not both")
+    if fraction is not None:
+        if not 0 < fraction <= 1:
+            raise ValueError(f"fraction must lie in (0, 1], got {fraction}")
+        return max(1, round(fraction * total))
+    if pixels is None:
+        return min(1000, total)
+    if isinstance(pixels, bool) or not isinstance(pixels, int) or not 1 <= pixels <= total:
+        raise ValueError(f"pixels must be a whole number from 1 to H*W = {total}, got {pixels!r}")
+    return pixels
+
+
 def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
     """A uniform sample of the valid pixels of each image, without replacement.
 

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.hook import EVIDENCE_SUMS
 from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.posterior.running import SIZE as POSTERIOR_SIZE
 
 
 @dataclass(frozen=True)
 class UfMStarState:
-    """The state of B streams. The fields' names are the keys of a saved state (``UfMStar.state_dict``).
+    """The state of B streams. The tensors' names are the keys of a saved state (``UfMStar.state_dict``).
 
     Attributes:
         mean, covariance, weight, disagreement, count, features: M_i (:class:`GaussianMixture`) in the frame of each
@@ -27,10 +26,8 @@ class UfMStarState:
         skipped: [B] int64 number of frames skipped for a fault.
         smoothed: [B, H, W] moving average of the dense disagreement [m^2] in the mixture's dtype, NaN without a
             value; of size 0 x 0 before the first average.
-        evidence: [B, K, 3] sums over anchors, row k of slot k; K = 0 without ``config.anchors``.
-        overall_evidence: [B, 3] sums over anchors of the stream.
-        posterior: [B, S] float64 what the posterior has learnt (``posterior.running``); S = 0 without
-            ``config.posterior``.
+        by_component: tensors of extensions [B, K, C] by name, sums over what was observed of each component.
+        by_stream: tensors of extensions [B, C] by name, which describe a stream as a whole.
     """
 
     mean: Tensor
@@ -44,25 +41,22 @@ class UfMStarState:
     frames: Tensor
     skipped: Tensor
     smoothed: Tensor
-    evidence: Tensor
-    overall_evidence: Tensor
-    posterior: Tensor
+    by_component: Mapping[str, Tensor] = field(default_factory=dict)
+    by_stream: Mapping[str, Tensor] = field(default_factory=dict)
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
-        """The tensors' names."""
-        return tuple(f.name for f in fields(cls))
+        """Names of the tensors that the paper's state has."""
+        return tuple(f.name for f in fields(cls) if f.name not in ("by_component", "by_stream"))
 
     @classmethod
     def initial(
         cls, streams: int, config: UfMStarConfig, dtype: torch.dtype, device: torch.device | str
     ) -> UfMStarState:
-        """The empty state of ``streams`` independent streams."""
+        """The empty state of ``streams`` independent streams, without extensions."""
         capacity = min(config.initial_capacity, config.max_components or config.initial_capacity)
         mixture = GaussianMixture.empty(streams, capacity, features=config.features, dtype=dtype, device=device)
         counter = torch.zeros(streams, dtype=torch.int64, device=device)
-        rows = capacity if config.anchors is not None else 0
-        learnt = POSTERIOR_SIZE if config.posterior is not None else 0
         return cls(
             **mixture.tensors(),
             T_world_first=torch.eye(4, dtype=torch.float64, device=device).repeat(streams, 1, 1),
@@ -70,9 +64,6 @@ class UfMStarState:
             frames=counter,
             skipped=counter.clone(),
             smoothed=torch.zeros(streams, 0, 0, dtype=dtype, device=device),
-            evidence=torch.zeros(streams, rows, EVIDENCE_SUMS, dtype=dtype, device=device),
-            overall_evidence=torch.zeros(streams, EVIDENCE_SUMS, dtype=dtype, device=device),
-            posterior=torch.zeros(streams, learnt, dtype=torch.float64, device=device),
         )
 
     @property
@@ -80,8 +71,12 @@ class UfMStarState:
         """M_i, [B, K]."""
         return GaussianMixture(self.mean, self.covariance, self.weight, self.disagreement, self.count, self.features)
 
-    def require(self, config: UfMStarConfig) -> None:
+    def require(self, config: UfMStarConfig, like: UfMStarState) -> None:
         """Check tensors that come from elsewhere, a checkpoint say, before they become a state.
+
+        Args:
+            config: of UfM*.
+            like: a state with the tensors of the extensions, of any number of streams and components.
 
         Raises:
             ValueError: shapes that do not fit each other or the config; values that are not finite or out of their
@@ -90,17 +85,17 @@ class UfMStarState:
         if self.weight.dim() != 2:
             raise ValueError(f"weight must be [B, K], got {tuple(self.weight.shape)}")
         b, k = self.weight.shape
-        rows = self.evidence.shape[1] if self.evidence.dim() == 3 and self.evidence.shape[1] in (0, k) else k
         image = tuple(self.smoothed.shape[1:]) if self.smoothed.dim() == 3 else ("H", "W")
-        learnt = POSTERIOR_SIZE if config.posterior is not None else 0
         shapes = {
             "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": (b, k), "count": (b, k),
             "features": (b, k, config.features), "T_world_first": (b, 4, 4), "started": (b,), "frames": (b,),
-            "skipped": (b,), "smoothed": (b, *image), "evidence": (b, rows, EVIDENCE_SUMS),
-            "overall_evidence": (b, EVIDENCE_SUMS), "posterior": (b, learnt),
+            "skipped": (b,), "smoothed": (b, *image),
+            **{name: (b, k, *value.shape[2:]) for name, value in like.by_component.items()},
+            **{name: (b, *value.shape[1:]) for name, value in like.by_stream.items()},
         }  # fmt: skip
+        tensors = self.tensors()
         for name, shape in shapes.items():
-            if (given := tuple(getattr(self, name).shape)) != shape:
+            if (given := tuple(tensors[name].shape)) != shape:
                 raise ValueError(f"{name} must have shape {shape} beside weight {(b, k)}, got {given}")
         if config.max_components is not None and k > max(config.max_components, 1):
             raise ValueError(f"{k} slots exceed max_components = {config.max_components}")
@@ -124,9 +119,25 @@ class UfMStarState:
         if b and float(rotation_deviation(R).max()) > 1e-6:
             raise ValueError("T_world_first holds matrices that are not rigid")
 
+    @property
+    def extensions(self) -> dict[str, Tensor]:
+        """The tensors of extensions by name."""
+        return {**self.by_component, **self.by_stream}
+
     def tensors(self) -> dict[str, Tensor]:
         """The tensors by name, without copying."""
-        return dict(vars(self))
+        return {name: getattr(self, name) for name in self.names()} | self.extensions
+
+    def with_tensors(self, changed: Mapping[str, Tensor]) -> UfMStarState:
+        """A copy with some of its tensors exchanged, by name."""
+        if not changed:
+            return self
+        kept = {
+            name: {n: changed.get(n, v) for n, v in getattr(self, name).items()}
+            for name in ("by_component", "by_stream")
+        }
+        own = {name: changed[name] for name in self.names() if name in changed}
+        return replace(self, **own, by_component=kept["by_component"], by_stream=kept["by_stream"])
 
     def restarted(self, again: Tensor) -> UfMStarState:
         """The state with the streams of the mask ``again`` [B] as they were before their first frame."""
@@ -136,4 +147,4 @@ class UfMStarState:
             mask = again.view(-1, *[1] * (old.dim() - 1))
             return torch.where(mask, torch.as_tensor(start.get(name, 0), dtype=old.dtype, device=old.device), old)
 
-        return UfMStarState(**{name: value(name, old) for name, old in self.tensors().items()})
+        return self.with_tensors({name: value(name, old) for name, old in self.tensors().items()})

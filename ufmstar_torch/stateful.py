@@ -41,9 +41,9 @@ class StatefulModule(nn.Module):
         config: of the module.
     """
 
-    STATE: ClassVar[tuple[str, ...]]
+    STATE: tuple[str, ...]
     CONFIG: ClassVar[type[Config]]
-    ALWAYS_FLOAT64: ClassVar[tuple[str, ...]] = ("T_world_first",)
+    ALWAYS_FLOAT64: tuple[str, ...] = ("T_world_first",)
     config: Config
 
     if TYPE_CHECKING:
@@ -70,8 +70,16 @@ class StatefulModule(nn.Module):
         chosen[given if given.numel() else given.long()] = True
         return chosen
 
+    def _settle(self) -> None:
+        """Write what is pending into the buffers, before they are saved, loaded, copied or moved."""
+
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        self._settle()
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """``.to()`` and friends, with the exceptions that the class states."""
+        self._settle()
         before = {name: getattr(self, name) for name in self.STATE}
         super()._apply(fn, recurse)
         for name, old in before.items():
@@ -87,9 +95,7 @@ class StatefulModule(nn.Module):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Warn where the config of a loaded state differs from this module's."""
-        # A setting younger than the state had its default.
-        saved = flat(type(self.config)().to_dict()) | flat(_config_of(state))
-        ours = flat(self.config.to_dict())
+        saved, ours = flat(_config_of(state)), flat(plain(self.config))
         changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
         if changed:
             each = ", ".join(f"{key} was {saved.get(key)!r}, is {ours.get(key)!r}" for key in changed)
@@ -131,6 +137,7 @@ class StatefulModule(nn.Module):
         missing: list[str], unexpected: list[str], errors: list[str],
     ) -> None:  # fmt: skip
         """Check the whole of a saved state, then take its shapes and copy its values: all of it or nothing."""
+        self._settle()
         expected = [prefix + name for name in (*self.STATE, "_extra_state")]
         absent = [key for key in expected if key not in state_dict]
         foreign = [key for key in state_dict if key.startswith(prefix) and key not in expected]
@@ -192,11 +199,16 @@ def _config_of(state: object) -> dict[str, Any]:
     return config
 
 
+def plain(config: Config) -> dict[str, Any]:
+    """Its values as JSON returns them."""
+    return _config_of(_bytes_of(config))
+
+
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested values by dotted name, as segment.min_pixels."""
     found: dict[str, Any] = {}
     for name, value in values.items():
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) and value else {prefix + name: value}
     return found
 
 

@@ -4,27 +4,24 @@ The mixture is kept in the frame of each stream's first camera: poses are taken 
 float64, so large world coordinates never reach the float32 state, and what a frame does not update never changes.
 
 :class:`Step` is what ``UfMStar`` calls; :func:`step` is the reference. Its kernels can be replaced one by one
-(:class:`Kernels`); another implementation of the whole step has the same signature.
+(``step_parts``); another implementation of the whole step has the same signature.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch import correspond, fuse, gaussian, regress, segment, unmeasured
-from ufmstar_torch.anchors.hook import AnchorInput, Evidence, after_regression, before_regression, learn
+from ufmstar_torch import fuse, unmeasured
 from ufmstar_torch.camera import focal_and_centre, relative_pose
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.disagree import with_overlap_disagreement
+from ufmstar_torch.extension import NONE, FrameExtensions
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import pixel_footprint, storage_floor
 from ufmstar_torch.mixture import GaussianMixture
@@ -32,28 +29,7 @@ from ufmstar_torch.output import FrameStatistics, StepOutput, given
 from ufmstar_torch.regress import Regression, moving_average
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
-
-
-class StepObserver(Protocol):
-    """Follows a step from stage to stage, to time it; it changes no result."""
-
-    def stage(self, name: str) -> None:
-        """A stage has ended: check, segment, correspond, fuse, append, regress or average, in this order.
-
-        What lies between two kernels belongs to the stage that needs it. segment: SPGF and the floor of its
-        covariances. correspond: the mixture into the camera frame, and the matching. fuse: the disagreement of
-        overlaps, the segments into the first camera's frame, growth, and the fusion. append: the new components, the
-        mixture into the camera frame, and the evidence of anchors. regress: the regression. average: the moving
-        average, statistics and the new state. The caller of a step ends "check" itself.
-        """
-        ...
-
-    def kernel(self, name: str) -> AbstractContextManager[object]:
-        """Around the kernel of this name, a field of :class:`Kernels`.
-
-        A compiled step names spgf, correspond, fuse (which appends as well) and regress_image.
-        """
-        ...
+from ufmstar_torch.step_parts import REFERENCE, Kernels, StepObserver
 
 
 class Step(Protocol):
@@ -67,117 +43,9 @@ class Step(Protocol):
         *,
         pixels: Tensor | None = None,
         smooth: bool = True,
-        anchors: AnchorInput | None = None,
+        extensions: FrameExtensions = NONE,
         observer: StepObserver | None = None,
     ) -> tuple[UfMStarState, StepOutput]: ...
-
-
-class SegmentKernel(Protocol):
-    """Step 2: C_i in the camera frame without a floor, and labels [B, H, W] (:func:`ufmstar_torch.segment.segment`)."""
-
-    def __call__(self, given: SegmentInput, /) -> tuple[GaussianMixture, Tensor]: ...
-
-
-class FloorKernel(Protocol):
-    """Covariances [..., 3, 3] whose eigenvalues are at least a floor [...] [m^2]
-    (:func:`ufmstar_torch.gaussian.floor_covariance`)."""
-
-    def __call__(self, covariance: Tensor, floor: Tensor, /) -> Tensor: ...
-
-
-class CorrespondKernel(Protocol):
-    """Step 3: M_(i-1) and C_i in the camera frame, K, (H, W) -> pairs (:func:`ufmstar_torch.correspond.correspond`)."""
-
-    def __call__(
-        self,
-        previous_cam: GaussianMixture,
-        current_cam: GaussianMixture,
-        intrinsics: Tensor,
-        size: tuple[int, int],
-        config: UfMStarConfig,
-        /,
-    ) -> Correspondence: ...
-
-
-class FuseKernel(Protocol):
-    """Step 4 for the matched pairs (:func:`ufmstar_torch.fuse.fuse`)."""
-
-    def __call__(
-        self,
-        mixture: GaussianMixture,
-        current: GaussianMixture,
-        pairs: Correspondence,
-        config: UfMStarConfig,
-        /,
-        *,
-        rounds: int | None = None,
-    ) -> GaussianMixture: ...
-
-
-class RegressKernel(Protocol):
-    """Step 5 at every pixel, or at some (:func:`ufmstar_torch.regress.regress_image`)."""
-
-    def __call__(
-        self,
-        mixture_cam: GaussianMixture,
-        depth: Tensor,
-        intrinsics: Tensor,
-        valid: Tensor,
-        config: UfMStarConfig,
-        /,
-        pixels: Tensor | None = None,
-    ) -> Regression: ...
-
-
-class SmoothKernel(Protocol):
-    """Memory, map, alpha -> new memory, map to show (:func:`ufmstar_torch.regress.smooth`)."""
-
-    def __call__(self, previous: Tensor, current: Tensor, alpha: float, /) -> tuple[Tensor, Tensor]: ...
-
-
-class DistributeKernel(Protocol):
-    """Values at points, summed by component (:func:`ufmstar_torch.regress.distribute`)."""
-
-    def __call__(
-        self, mixture_cam: GaussianMixture, points: Tensor, values: Tensor, config: UfMStarConfig, /
-    ) -> Tensor: ...
-
-
-@dataclass(frozen=True)
-class Kernels:
-    """The replaceable parts of :func:`step`; all take checked input."""
-
-    spgf: SegmentKernel
-    floor_covariance: FloorKernel
-    correspond: CorrespondKernel
-    fuse: FuseKernel
-    regress_image: RegressKernel
-    smooth: SmoothKernel
-    distribute: DistributeKernel
-
-    def observed(self, observer: StepObserver) -> Kernels:
-        """The same kernels, with the observer around every call."""
-
-        def around(name: str, kernel: Callable[..., Any]) -> Callable[..., Any]:
-            def call(*args: Any, **kwargs: Any) -> Any:
-                with observer.kernel(name):
-                    return kernel(*args, **kwargs)
-
-            return call
-
-        kernels: dict[str, Any] = {f.name: around(f.name, getattr(self, f.name)) for f in fields(self)}
-        return Kernels(**kernels)
-
-
-REFERENCE = Kernels(
-    spgf=segment.segment,
-    floor_covariance=gaussian.floor_covariance,
-    correspond=correspond.correspond,
-    fuse=fuse.fuse,
-    regress_image=regress.regress_image,
-    smooth=regress.smooth,
-    distribute=regress.distribute,
-)
 
 
 def step(
@@ -187,9 +55,10 @@ def step(
     *,
     pixels: Tensor | None = None,
     smooth: bool = True,
-    anchors: AnchorInput | None = None,
+    extensions: FrameExtensions = NONE,
     observer: StepObserver | None = None,
     kernels: Kernels = REFERENCE,
+    grow: bool = True,
 ) -> tuple[UfMStarState, StepOutput]:
     """Segment, correspond, fuse, regress (section "Uncertainty from Motion*", steps 2 to 5).
 
@@ -199,9 +68,10 @@ def step(
         config: of UfM*.
         pixels: [B, n] indices into the flattened image to regress only there; None = every pixel.
         smooth: apply the exponential moving average.
-        anchors: of this frame; only with ``config.anchors``.
+        extensions: what they do during this frame.
         observer: is called after every stage and around every kernel.
         kernels: which implementation of each part.
+        grow: whether the mixture may get more slots; False: the caller has seen to it.
 
     Returns:
         The new state and the output. A stream whose frame is at fault keeps its state and gets NaN.
@@ -228,21 +98,24 @@ def step(
     far_enough = current_cam.mean[..., 2] > config.near_plane
     new = current_cam.valid & far_enough & ~matched
     current_first = current_cam.rigid(*relative_pose(frame.T_world_cam, first))
-    needed, rounds = _room(mixture, pairs, new, config)
+    needed, rounds = _room(mixture, pairs, new, config, grow)
     mixture = mixture.grown(needed, config.max_components)
     mixture = kernels.fuse(mixture, current_first, pairs.padded(mixture.capacity), config, rounds=rounds)
     stage("fuse")
 
+    sums, limit, gone = dict(state.by_component), config.max_components, torch.zeros_like(state.frames)
+    if limit is not None and needed >= limit:
+        position = relative_pose(frame.T_world_cam, first)[1]
+        mixture, sums, _, gone = fuse.make_room(mixture, sums, mixture.components, new.sum(1), position, limit)
     mixture, dropped = fuse.append(mixture, current_first, new)
-    evidence, used, mixture_cam, stream = before_regression(
-        Evidence(state.evidence, state.overall_evidence), mixture.to(torch.float64).rigid(R_cam, t_cam),
-        frame, anchors, config, functools.partial(learn, distribute=kernels.distribute),
-    )  # fmt: skip
+    mixture_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
+    changed, mixture_cam = extensions.before_regression({**state.by_stream, **sums}, mixture_cam, kernels.distribute)
     mixture_cam = unmeasured.before_regression(mixture_cam)
     stage("append")
 
     result = kernels.regress_image(mixture_cam, frame.depth, frame.intrinsics, frame.valid, config, pixels)
-    result, residual, measured = after_regress(result, stream, frame, config, pixels)
+    result, measured = filled_in(result, frame, config, pixels)
+    result = extensions.after_regression(result)
     stage("regress")
 
     counts = {
@@ -251,46 +124,33 @@ def step(
         "matched": matched.sum(1),
         "pairs": pairs.match.sum((1, 2)),
         "new": new.sum(1) - dropped,
-        "dropped": dropped + (current_cam.valid & ~far_enough).sum(1),
+        "dropped": gone + dropped + (current_cam.valid & ~far_enough).sum(1),
         "valid_pixels": frame.valid.sum((1, 2)),
         "unmeasured": (measured < unmeasured.HALF).flatten(1).sum(1),
-        "anchors": torch.zeros_like(used) if anchors is None else anchors.valid.sum(1),
-        "anchors_used": used,
     }
     disagreement, smoothed = result.disagreement, state.smoothed
     if smooth and config.ema_alpha < 1.0:
         smoothed, disagreement = moving_average(
             smoothed, disagreement, frame.size, config.ema_alpha, pixels, kernels.smooth
         )
-    updated = after_frame(state, frame, mixture.tensors(), first, smoothed, evidence)
-    out = StepOutput(
-        disagreement, result.features, residual, measured, partial(given, labels), current_cam,
-        frame_statistics(frame, counts),
-    )  # fmt: skip
+    updated = state.with_tensors({
+        **mixture.tensors(), **sums, **changed, "T_world_first": first, "started": state.started | fine,
+        "frames": state.frames + fine, "skipped": state.skipped + ~fine, "smoothed": smoothed,
+    })  # fmt: skip
+    statistics = frame_statistics(frame, counts)
+    out = StepOutput(disagreement, result.features, measured, partial(given, labels), current_cam, statistics)
     stage("average")
     return updated, out
 
 
-def after_regress(
-    result: Regression, stream: Tensor | None, frame: FrameInput, config: UfMStarConfig, pixels: Tensor | None
-) -> tuple[Regression, Tensor | None, Tensor]:
-    """Separate what was regressed beside the disagreement, and fill in what was not measured.
-
-    Args:
-        result: of the mixture as ``anchors.hook`` and ``unmeasured`` made it ready.
-        stream: from ``anchors.hook.before_regression``.
-        frame, config, pixels: as :func:`step`.
-
-    Returns:
-        The regression of M and the caller's features; the residual and the share that was measured, as in
-        :class:`~ufmstar_torch.output.StepOutput`.
-    """
+def filled_in(
+    result: Regression, frame: FrameInput, config: UfMStarConfig, pixels: Tensor | None
+) -> tuple[Regression, Tensor]:
+    """:func:`ufmstar_torch.unmeasured.after_regression` of a frame, at every pixel or at some."""
     depth = frame.depth
     if pixels is not None and config.unmeasured == "relative":  # nothing else reads it
         depth = torch.gather(depth.flatten(1), 1, pixels)
-    result, measured = unmeasured.after_regression(result, depth, config)
-    result, residual = after_regression(result, stream)
-    return result, residual, measured
+    return unmeasured.after_regression(result, depth, config)
 
 
 def frame_statistics(frame: FrameInput, counts: Mapping[str, Tensor]) -> FrameStatistics:
@@ -301,26 +161,6 @@ def frame_statistics(frame: FrameInput, counts: Mapping[str, Tensor]) -> FrameSt
         out_of_range=frame.out_of_range,
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
-    )
-
-
-def after_frame(
-    state: UfMStarState, frame: FrameInput, mixture: dict[str, Tensor], first: Tensor, smoothed: Tensor,
-    evidence: Evidence,
-) -> UfMStarState:  # fmt: skip
-    """The state after a frame: the mixture's tensors, the first camera's pose, the moving average and the evidence are
-    given; a frame at fault counts as skipped."""
-    fine = frame.fault == 0
-    return UfMStarState(
-        **mixture,
-        T_world_first=first,
-        started=state.started | fine,
-        frames=state.frames + fine,
-        skipped=state.skipped + ~fine,
-        smoothed=smoothed,
-        evidence=evidence.component,
-        overall_evidence=evidence.overall,
-        posterior=state.posterior,
     )
 
 
@@ -350,7 +190,7 @@ def _segment(
 
 
 def _room(
-    mixture: GaussianMixture, pairs: Correspondence, new: Tensor, config: UfMStarConfig
+    mixture: GaussianMixture, pairs: Correspondence, new: Tensor, config: UfMStarConfig, grow: bool
 ) -> tuple[int, int | None]:
     """Slots that the frame needs, and a bound on the matches of any one component (None: the kernel reads it).
 
@@ -361,7 +201,7 @@ def _room(
         ValueError: growth on the meta device, which has no values.
     """
     device, limit = mixture.mean.device.type, config.max_components
-    if device != "cpu" and limit is not None and mixture.capacity >= limit:
+    if not grow or (device != "cpu" and limit is not None and mixture.capacity >= limit):
         return mixture.capacity, pairs.match.shape[1]
     if device == "meta":
         raise ValueError("device 'meta' needs max_components <= initial_capacity")

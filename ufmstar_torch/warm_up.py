@@ -6,22 +6,40 @@ import gc
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import torch
 
-from ufmstar_torch.anchors.hook import Anchors
+from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.select import compile_triangulation
-
-if TYPE_CHECKING:
-    from ufmstar_torch.ufmstar import UfMStar
 
 _DISTANCE = 2.0  # [m]
 _TOTAL = 3 * 7  # stages of a step, for two frames and an image average
 
 
+class Module(Protocol):
+    """A ``UfMStar``."""
+
+    config: UfMStarConfig
+    observer: Any
+
+    @property
+    def mean(self) -> torch.Tensor:
+        """Of the mixture [B, K, 3]."""
+        ...
+
+    def __call__(self, *frame: Any, **options: Any) -> Any:
+        """Process a frame."""
+        ...
+
+    def mean_uncertainty(self, *frame: Any, **options: Any) -> Any:
+        """Process a frame and average its variance."""
+        ...
+
+
 class _Stages:
-    """Counts the stages of the frames (``ufmstar_torch.step.StepObserver``), at whose first a stage compiles.
+    """Counts the stages of the frames (``ufmstar_torch.step_parts.StepObserver``), at whose first a stage compiles.
 
     Args:
         progress: see :func:`warm_up`.
@@ -48,7 +66,7 @@ class _Stages:
 
 
 def warm_up(
-    module: UfMStar,
+    module: Module,
     size: tuple[int, int],
     streams: int,
     progress: Callable[[int, int], object] | None = None,
@@ -82,7 +100,7 @@ def warm_up(
         stages = _Stages(progress or _unseen, _TOTAL + len(also))
         module.observer = stages
         for _ in range(2):  # the fusion meets a mixture from the second on
-            module(depth, pose, K, features=features, anchors=anchors)
+            module(depth, pose, K, features=features, **({} if anchors is None else {"anchors": anchors}))
         module.mean_uncertainty(depth, pose, K, features=features, pixels=1)
         if config.anchors is not None:
             compile_triangulation()

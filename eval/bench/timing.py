@@ -22,7 +22,7 @@ from ufmstar_torch.eval.engine.clock import CallTimes, StageTimer, spread, synch
 F = TypeVar("F")
 Name = TypeVar("Name", bound=Hashable)
 
-# Every moment of a step belongs to one of these; see ``ufmstar_torch.step.StepObserver``.
+# Every moment of a step belongs to one of these; see ``ufmstar_torch.step_parts.StepObserver``.
 STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
 _CPU = torch.device("cpu")
 
@@ -90,7 +90,7 @@ class TimedCalls:
 
 
 class StagedStep:
-    """UfM* with the times of its steps' stages: the observer (``ufmstar_torch.step.StepObserver``) of a module.
+    """UfM* with the times of its steps' stages: the observer (``ufmstar_torch.step_parts.StepObserver``) of a module.
 
     The stages are those that the step names; what follows the last one, the output's assembly, belongs to none. The
     module's device is waited for at both ends of every stage.

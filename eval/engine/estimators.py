@@ -182,7 +182,7 @@ class Gaussians(Estimator):
         recalibration: Recalibration | None = None,
         aleatoric_in_h: bool = False,
     ) -> None:
-        self.ufm = UfMStar(config, recalibration=recalibration, device=device)
+        self.ufm = UfMStar(config, extensions=() if recalibration is None else (recalibration,), device=device)
         self._uses_variances, self._corrected, self._in_h = uses_variances, corrected, aleatoric_in_h
         self._posterior = posterior
         self._anchors = 0
@@ -204,7 +204,8 @@ class Gaussians(Estimator):
             features=features,
             anchors=anchors,
         )
-        self._anchors = int(out.statistics.anchors_used[0])
+        used = out.statistics.anchors_used
+        self._anchors = 0 if used is None else int(used[0])
         depth, variance = out.corrected() if self._corrected else (out.depth, out.variance)
         if self._posterior:
             depth, variance = out.posterior()
@@ -240,7 +241,9 @@ class Gaussians(Estimator):
             "smoothing_bytes": self.ufm.smoothed.nbytes,
         }
         if self.ufm.config.anchors is not None:
-            kept["bytes"] += (count + 1) * self.ufm.overall_evidence.nbytes + self.ufm.posterior.nbytes
+            state = self.ufm.state
+            sums = sum(value[:, :1].nbytes for value in state.by_component.values())
+            kept["bytes"] += count * sums + sum(value.nbytes for value in state.by_stream.values())
             kept["anchors"] = self._anchors
         return kept
 

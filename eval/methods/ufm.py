@@ -59,7 +59,7 @@ class UfMConfig(Checked):
 
 @dataclass(frozen=True)
 class UfMStatistics:
-    """What happened to one frame, per stream [B].
+    """Counts of one frame, per stream [B].
 
     Attributes:
         points: kept after the frame.
@@ -182,7 +182,7 @@ class UfM(StatefulModule):
         )  # fmt: skip
         with outliving(), torch.no_grad(), full_precision(frame.depth.device):
             if self.config.on_bad_frame == "raise":
-                raise_faults(frame.fault.tolist())
+                raise_faults(frame)
             variance, statistics = self._advance(frame)
         return UfMOutput(
             depth=depth,

@@ -21,10 +21,11 @@ from ufmstar_torch.anchors.evidence import (
     LEAST_SIGMA,
     Evidence,
 )
+from ufmstar_torch.anchors.extension import Learnt
+from ufmstar_torch.anchors.extension import learn as learn_reference
 from ufmstar_torch.anchors.given import FARTHEST_OFF, AnchorInput, Anchors, claimed
-from ufmstar_torch.anchors.hook import Learnt
-from ufmstar_torch.anchors.hook import learn as learn_reference
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.extension import Distribute
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
@@ -94,8 +95,9 @@ def learn(
     frame: FrameInput,
     anchors: AnchorInput | None,
     config: UfMStarConfig,
+    distribute: Distribute = distribute,
 ) -> Learnt:
-    """As :func:`ufmstar_torch.anchors.hook.learn`, for CPU tensors, of evidence that may have less room than the
+    """As :func:`ufmstar_torch.anchors.extension.learn`, for CPU tensors, of evidence that may have less room than the
     mixture."""
     if config.regression != "exact":
         padded_evidence = evidence.padded(mixture_cam.capacity)
@@ -143,7 +145,7 @@ def learn_in_view(
 
 
 def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> tuple[Tensor, Tensor]:
-    """As :func:`ufmstar_torch.anchors.hook.anchored_term`, for CPU tensors, in one pass."""
+    """As :func:`ufmstar_torch.anchors.extension.anchored_term`, for CPU tensors, in one pass."""
     d, e, M = (array(value) for value in (depth, excess, disagreement))
     term, both = np.empty_like(M), np.empty_like(M)
     _add_term(*(value.reshape(-1) for value in (d, e, M, term, both)))

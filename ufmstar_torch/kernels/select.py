@@ -10,9 +10,8 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.given import CheckKernel as AnchorCheckKernel
-from ufmstar_torch.anchors.given import check_values as check_anchor_values
-from ufmstar_torch.anchors.hook import TermKernel, anchored_term
+from ufmstar_torch.anchors.extension import REFERENCE as ANCHOR_REFERENCE
+from ufmstar_torch.anchors.extension import AnchorKernels
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import CheckKernel, check_values
 from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
@@ -22,7 +21,8 @@ from ufmstar_torch.posterior.update import PosteriorUpdate
 from ufmstar_torch.posterior.update import update as update_posterior
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
+from ufmstar_torch.step import Step, step
+from ufmstar_torch.step_parts import REFERENCE, Kernels, SegmentKernel
 
 _TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
 _LEAST_CAPABILITY = (8, 0)  # of an NVIDIA GPU that triton supports
@@ -76,22 +76,13 @@ def select_check(name: str, device_type: str) -> CheckKernel:
     return check_values
 
 
-def select_anchor_check(name: str, device_type: str) -> AnchorCheckKernel:
-    """The check of a frame's anchors; arguments and errors as :func:`select_step`."""
+def select_anchors(name: str, device_type: str) -> AnchorKernels:
+    """The parts of the evidence of anchors; arguments and errors as :func:`select_step`."""
     if _compiled(name, device_type):
-        from ufmstar_torch.kernels import anchors_cpu
+        from ufmstar_torch.kernels import anchors_cpu as fast
 
-        return anchors_cpu.check_values
-    return check_anchor_values
-
-
-def select_anchored_term(name: str, device_type: str) -> TermKernel:
-    """What anchors add to the variance; arguments and errors as :func:`select_step`."""
-    if _compiled(name, device_type):
-        from ufmstar_torch.kernels import anchors_cpu
-
-        return anchors_cpu.anchored_term
-    return anchored_term
+        return AnchorKernels(fast.check_values, fast.learn, fast.learn_in_view, fast.anchored_term)
+    return ANCHOR_REFERENCE
 
 
 def select_merge(name: str, device_type: str) -> MergeKernels:

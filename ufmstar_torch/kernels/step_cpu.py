@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,30 +18,32 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch import unmeasured
-from ufmstar_torch.anchors.hook import AnchorInput, Evidence, Learnt
+from ufmstar_torch.camera import relative_pose
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.disagree import overlap_disagreement
+from ufmstar_torch.extension import NONE, FrameExtensions
 from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.fuse import make_room
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
-from ufmstar_torch.kernels.anchors_cpu import learn, learn_in_view
 from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.regress_cpu import EPSILON, Seen, View, in_slots, look, regress_maps
 from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
-from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, WEIGHT
+from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, padded
 from ufmstar_torch.kernels.segment_cpu import feature_means, fit, most_gaussians
 from ufmstar_torch.kernels.stream_cpu import describe, join, match, tally
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import StepOutput
-from ufmstar_torch.regress import moving_average
+from ufmstar_torch.regress import distribute, moving_average
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.step import StepObserver, after_regress, frame_statistics
+from ufmstar_torch.step import filled_in, frame_statistics
+from ufmstar_torch.step_parts import StepObserver
 
 Floats = NDArray[np.floating[Any]]
 _NAMES = tuple(field.name for field in fields(GaussianMixture))
 _COUNTS: tuple[str, ...] = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
-_COUNTS += ("unmeasured", "anchors", "anchors_used")
+_COUNTS += ("unmeasured",)
 
 
 class _Pairs(NamedTuple):
@@ -60,11 +62,15 @@ class _Pairs(NamedTuple):
 
 
 class _Joined(NamedTuple):
-    """The mixture after the fusion by field; of each stream the slots within reach [n], and what is in them."""
+    """The mixture after the fusion by field; of each stream the slots within reach [n], and what is in them; tensors of
+    extensions by name, and how many components are new and how many were dropped."""
 
     mixture: dict[str, Tensor]
     slots: list[NDArray[np.int64]]
     seen: list[Seen]
+    sums: dict[str, Tensor]
+    new: list[int]
+    dropped: list[int]
 
 
 def step(
@@ -74,7 +80,7 @@ def step(
     *,
     pixels: Tensor | None = None,
     smooth: bool = True,
-    anchors: AnchorInput | None = None,
+    extensions: FrameExtensions = NONE,
     observer: StepObserver | None = None,
 ) -> tuple[UfMStarState, StepOutput]:
     """As :func:`ufmstar_torch.step.step`, for CPU tensors."""
@@ -84,29 +90,23 @@ def step(
     stage("segment")
 
     with kernel("correspond"):
-        cameras, pairs = _match(state, frame, segments, config)
+        cameras, pairs = _match(state, frame, segments, config, extensions.columns)
     stage("correspond")
 
     with kernel("fuse"):
-        joined = _join(state, frame, segments, cameras[0], pairs, config)
+        joined = _join(state, frame, segments, cameras[0], pairs, config, extensions.columns)
     stage("fuse")
 
-    learnt: Learnt | None = None
-    views: list[View] | None = None
-    if config.anchors is not None:
-        learnt, views = _learn(state, joined, frame, anchors, config)
+    changed: dict[str, Tensor] = {}
+    views, shift = None, None
+    if extensions.columns:
+        changed, views, shift = _columns(state, joined, frame, extensions, config)
     stage("append")
 
     with kernel("regress_image"):
-        shift = None if learnt is None or views is None else array(learnt.stream)
         result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels, views, shift)
-    if learnt is not None and views is None:
-        shape = -1, *[1] * (result.features.dim() - 2), 2
-        result.features[..., -3:-1] += learnt.stream.to(frame.depth.dtype).view(shape)
-    result, _, measured = after_regress(result, None, frame, config, pixels)
-    residual = None
-    if learnt is not None:
-        residual, result = result.features[..., -2:], replace(result, features=result.features[..., :-2])
+    result, measured = filled_in(result, frame, config, pixels)
+    result = extensions.after_regression(result)
     stage("regress")
 
     disagreement, smoothed = result.disagreement, state.smoothed
@@ -114,25 +114,13 @@ def step(
         smoothed, disagreement = moving_average(
             smoothed, disagreement, frame.size, config.ema_alpha, pixels, smooth_maps
         )
-    counts = _counts(frame, pairs, joined.seen, measured, anchors, None if learnt is None else learnt.used)
-    evidence = Evidence(state.evidence, state.overall_evidence) if learnt is None else learnt.evidence
-    first, started, frames, skipped = map(torch.from_numpy, cameras)
-    state_after = UfMStarState(
-        **joined.mixture,
-        T_world_first=first,
-        started=started,
-        frames=frames,
-        skipped=skipped,
-        smoothed=smoothed,
-        evidence=evidence.component,
-        overall_evidence=evidence.overall,
-        posterior=state.posterior,
-    )
-    out = StepOutput(
-        disagreement, result.features, residual, measured, labels, current_cam, frame_statistics(frame, counts)
-    )
+    names = ("T_world_first", "started", "frames", "skipped")
+    followed = dict(zip(names, map(torch.from_numpy, cameras), strict=True))
+    updated = state.with_tensors({**joined.mixture, **joined.sums, **changed, **followed, "smoothed": smoothed})
+    statistics = frame_statistics(frame, _counts(frame, pairs, joined, measured))
+    out = StepOutput(disagreement, result.features, measured, labels, current_cam, statistics)
     stage("average")
-    return state_after, out
+    return updated, out
 
 
 def _unobserved(name: str) -> None:
@@ -167,7 +155,7 @@ def _segment(
 
 
 def _match(
-    state: UfMStarState, frame: FrameInput, segments: Sequence[NDArray[Any]], config: UfMStarConfig
+    state: UfMStarState, frame: FrameInput, segments: Sequence[NDArray[Any]], config: UfMStarConfig, columns: int
 ) -> tuple[tuple[NDArray[Any], ...], list[_Pairs]]:
     """Step 3: of the state after the frame, camera-to-world of the first camera, started, frames and skipped; and what
     each stream matches."""
@@ -176,7 +164,7 @@ def _match(
     after = tuple(map(np.empty_like, before))
     mixture = tuple(array(value) for value in (state.mean, state.covariance, state.weight))
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
-    least = min(EPSILON[frame.depth.dtype], EPSILON[state.covariance.dtype] if config.anchors is not None else 1.0)
+    least = min(EPSILON[frame.depth.dtype], EPSILON[state.covariance.dtype] if columns else 1.0)
     reach = config.prior_weight, least if config.regression == "exact" else 0.0
     given = (camera, before, after, mixture, segments[:3], frame.size, thresholds, reach)
     return after, [_Pairs(*found) for found in each(match, [(b, *given) for b in range(len(frame.depth))])]
@@ -189,41 +177,80 @@ def _join(
     first: Floats,
     pairs: Sequence[_Pairs],
     config: UfMStarConfig,
+    columns: int,
 ) -> _Joined:
-    """Step 4, and the mixture as the regression takes it; ``first`` is camera-to-world of the first cameras."""
+    """Step 4, and the mixture as the regression takes it, with room for ``columns`` of extensions; ``first`` is
+    camera-to-world of the first cameras."""
     slots = tuple(array(getattr(state, name)) for name in _NAMES)
     needed = max(pair.occupied + pair.created for pair in pairs)
-    capacity = _capacity(slots[0].shape[1], needed, config.max_components)
+    capacity = slots[0].shape[1]
+    while capacity < needed:
+        capacity *= 2
     updated = tuple(np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype) for value in slots)
     settings = config.overlap_weighted, float(np.finfo(slots[1].dtype).eps)
     fused = array(frame.T_world_cam), first, slots, updated, (*segments[:3], segments[5])
     calls = [
         (
             b, *fused, pair[:3], _distance(b, pair, segments, config), pair.new, pair.occupied, pair.near, pair.here,
-            settings, 3 if config.anchors is not None else 1,
+            settings, columns + 1,
         )
         for b, pair in enumerate(pairs)
     ]  # fmt: skip
     joined = each(join, calls)
     mixture = dict(zip(_NAMES, map(torch.from_numpy, updated), strict=True))
     seen = [Seen(pair.here, *one[1:]) for pair, one in zip(pairs, joined, strict=True)]
-    return _Joined(mixture, [one[0] for one in joined], seen)
+    sums = dict(state.by_component)
+    all_of_them = _Joined(mixture, [one[0] for one in joined], seen, sums, [p.created for p in pairs], [0] * len(seen))
+    limit = config.max_components
+    if limit is None or capacity <= limit:
+        return all_of_them
+    position = relative_pose(frame.T_world_cam, torch.from_numpy(first))[1]
+    return _within_limit(all_of_them, [pair.occupied for pair in pairs], position, limit)
 
 
-def _learn(
-    state: UfMStarState, joined: _Joined, frame: FrameInput, anchors: AnchorInput | None, config: UfMStarConfig
-) -> tuple[Learnt, list[View] | None]:
-    """What anchors teach, and what is in view (None unless the regression is the exact sum). By how much each
-    component's error exceeds the stream's is written to the features before the last, in the order of
-    ``hook.before_regression``."""
-    evidence, capacity = Evidence(state.evidence, state.overall_evidence), joined.mixture["weight"].shape[1]
+def _within_limit(joined: _Joined, old: Sequence[int], position: Tensor, limit: int) -> _Joined:
+    """At most ``limit`` components and slots (:func:`ufmstar_torch.fuse.make_room`), of which the first ``old`` of each
+    stream were remembered before."""
+    before = torch.tensor(old)
+    coming = torch.zeros_like(before)
+    room = make_room(GaussianMixture(**joined.mixture), joined.sums, before, coming, position, limit)
+    slots, seen = [], []
+    for at, one, source, components in zip(
+        joined.slots, joined.seen, array(room.slot), room.mixture.components.tolist(), strict=True
+    ):
+        place = np.full(source.size, -1)
+        place[source[:components]] = np.arange(components)
+        kept = np.flatnonzero(place[at] >= 0)
+        here = np.zeros((FIELDS, padded(kept.size)))
+        here[:, : kept.size] = one.components[:, kept]
+        slots.append(place[at[kept]])
+        seen.append(Seen(here, one.disagreement[kept], one.features[kept], components))
+    return _Joined(
+        {name: value[:, :limit].contiguous() for name, value in room.mixture.tensors().items()},
+        slots,
+        seen,
+        {name: value[:, :limit].contiguous() for name, value in room.sums.items()},
+        (room.mixture.components - before + room.dropped).tolist(),
+        room.dropped.tolist(),
+    )
+
+
+def _columns(
+    state: UfMStarState, joined: _Joined, frame: FrameInput, extensions: FrameExtensions, config: UfMStarConfig
+) -> tuple[dict[str, Tensor], list[View] | None, Floats | None]:
+    """Write the columns of extensions to the features before the last. Returns the tensors of the state that change;
+    what is in view, and what the regression is to add to the columns, where an extension works on what is in view."""
+    capacity, tensors = joined.mixture["weight"].shape[1], {**state.by_stream, **joined.sums}
     if config.regression == "exact":
-        views = look(joined.seen, frame.depth, frame.intrinsics, config, evidence.overall.dtype)
-        return learn_in_view(evidence, capacity, joined.slots, joined.seen, views, frame, anchors, config), views
-    learnt = learn(evidence, in_slots(joined.seen, joined.slots, capacity), frame, anchors, config)
-    for slots, one, beyond in zip(joined.slots, joined.seen, array(learnt.beyond), strict=True):
-        one.features[:, -3:-1] = beyond[slots]
-    return learnt, None
+        views = look(joined.seen, frame.depth, frame.intrinsics, config, state.covariance.dtype)
+        if (found := extensions.in_view(tensors, capacity, joined.slots, joined.seen, views)) is not None:
+            return found[0], views, array(found[1])
+    mixture_cam = in_slots(joined.seen, joined.slots, capacity)
+    changed, with_columns = extensions.before_regression(tensors, mixture_cam, distribute)
+    columns = array(with_columns.features)[..., -extensions.columns :]
+    for slots, one, values in zip(joined.slots, joined.seen, columns, strict=True):
+        one.features[:, -extensions.columns - 1 : -1] = values[slots]
+    return changed, None, None
 
 
 def _distance(b: int, pair: _Pairs, segments: Sequence[Floats], config: UfMStarConfig) -> NDArray[np.float64]:
@@ -235,38 +262,18 @@ def _distance(b: int, pair: _Pairs, segments: Sequence[Floats], config: UfMStarC
     return overlap_disagreement(*map(torch.from_numpy, both)).numpy()
 
 
-def _capacity(present: int, needed: int, limit: int | None) -> int:
-    """As ``GaussianMixture.grown``: doubled until what is needed fits, or to the limit; never less than at present."""
-    capacity = present
-    while capacity < needed:
-        capacity *= 2
-    return capacity if limit is None else max(present, min(capacity, limit))
-
-
-def _counts(
-    frame: FrameInput,
-    pairs: Sequence[_Pairs],
-    seen: Sequence[Seen],
-    measured: Tensor,
-    anchors: AnchorInput | None,
-    used: Tensor | None,
-) -> dict[str, Tensor]:
+def _counts(frame: FrameInput, pairs: Sequence[_Pairs], joined: _Joined, measured: Tensor) -> dict[str, Tensor]:
     """The statistics [B] that the step counts itself."""
     totals = np.zeros((len(_COUNTS), len(pairs)), np.int64)
     valid, shares = array(frame.valid), array(measured)
-    for b, (pair, one) in enumerate(zip(pairs, seen, strict=True)):
-        new = one.occupied - pair.occupied
-        totals[:8, b] = (
+    for b, (pair, one, new, gone) in enumerate(zip(pairs, joined.seen, joined.new, joined.dropped, strict=True)):
+        totals[:, b] = (
             one.occupied,
             pair.found,
             pair.matched,
             pair.c.size,
             new,
-            pair.found - pair.matched - new,  # without a slot, or too near
+            gone + pair.found - pair.matched - new,  # too many, or too near
             *tally(valid[b].reshape(-1), shares[b].reshape(-1), unmeasured.HALF),
         )
-    if anchors is not None:
-        totals[-2] = array(anchors.valid).sum(1)
-    if used is not None:
-        totals[-1] = array(used)
     return dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))

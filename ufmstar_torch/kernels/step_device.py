@@ -7,7 +7,7 @@ found none, before anything else: the next frame matches what it would have matc
 only the map of the frame before was regressed without it. Growth starts before the last slot is taken, so that this is
 rare.
 
-What the paper's step does not have (anchors, a subset of pixels, ``config.disagreement == "overlap"``,
+What the paper's step does not have (columns of extensions, a subset of pixels, ``config.disagreement == "overlap"``,
 ``config.overlap_weighted``, the neighbourhood) runs as ``step.step`` with the GPU's kernels. It grows one frame ahead
 instead: to slots for all that a frame can segment, so that it reads nothing but the count of the frame before.
 """
@@ -19,9 +19,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.hook import AnchorInput
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.extension import NONE, FrameExtensions
 from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.fuse import make_room
 from ufmstar_torch.kernels.triton import append as ends
 from ufmstar_torch.kernels.triton.append import append, cameras
 from ufmstar_torch.kernels.triton.correspond import candidates, match_bits
@@ -33,7 +34,8 @@ from ufmstar_torch.output import FrameStatistics, StepOutput
 from ufmstar_torch.segment import most_kept
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.step import Kernels, StepObserver, step
+from ufmstar_torch.step import step
+from ufmstar_torch.step_parts import Kernels, StepObserver
 
 _ROOM = 4 / 3  # slots for each that is needed, below which the mixture grows ahead of need
 
@@ -109,22 +111,15 @@ class DeviceStep:
         *,
         pixels: Tensor | None = None,
         smooth: bool = True,
-        anchors: AnchorInput | None = None,
+        extensions: FrameExtensions = NONE,
         observer: StepObserver | None = None,
     ) -> tuple[UfMStarState, StepOutput]:
         plain = config.disagreement == "w2" and config.regression == "exact"
-        if (
-            config.anchors is not None
-            or config.overlap_weighted
-            or not plain
-            or pixels is not None
-            or observer is not None
-        ):
+        if extensions.columns or config.overlap_weighted or not plain or pixels is not None or observer is not None:
             state = self._with_room(state, config, ahead=most_kept(SegmentInput.of_frame(frame, config)))
-            fixed = replace(config, max_components=state.mixture.capacity)
             updated, out = step(
-                state, frame, fixed, pixels=pixels, smooth=smooth, anchors=anchors, observer=observer,
-                kernels=self._kernels,
+                state, frame, config, pixels=pixels, smooth=smooth, extensions=extensions, observer=observer,
+                kernels=self._kernels, grow=False,
             )  # fmt: skip
             waiting = None if _full(state.mixture.capacity, config) else Waiting.after(out.statistics.components)
         else:
@@ -134,7 +129,7 @@ class DeviceStep:
             dropped = out.statistics.dropped + self._lost
             out = replace(out, statistics=replace(out.statistics, dropped=dropped))
         self._waiting, self._of, self._lost = waiting, updated.mean, None
-        return updated, out
+        return self.settled(updated, config) if extensions.changes_mixture else updated, out
 
     def settled(self, state: UfMStarState, config: UfMStarConfig) -> UfMStarState:
         """The state with everything appended that was waiting; waits for the device."""
@@ -193,7 +188,12 @@ def device_step(
     counts = torch.zeros(ends.COUNTS, b, dtype=torch.int64, device=frame.depth.device)
     bits, matched = match_bits(previous, new, config, counts[ends.PAIRS])
     mixture = fuse_bits(state.mixture, current, here.to_first, (bits, new.index, previous.place, new.count), config)
-    full = _full(mixture.capacity, config)
+    full, gone = _full(mixture.capacity, config), torch.zeros_like(frame.fault)
+    if full and config.max_components is not None:
+        coming = (current.valid & (current.mean[..., 2] > config.near_plane) & ~matched).sum(1)
+        position = here.to_first[1]
+        room = make_room(mixture, {}, mixture.components, coming, position, config.max_components)
+        mixture, gone = room.mixture, room.dropped
     left, needed = append(
         mixture, current, here.to_first, matched, counts, near_plane=config.near_plane, again=False, last=full
     )
@@ -205,15 +205,13 @@ def device_step(
         matched=counts[ends.MATCHED],
         pairs=counts[ends.PAIRS],
         new=counts[ends.NEW],
-        dropped=counts[ends.DROPPED],
+        dropped=counts[ends.DROPPED] + gone,
         valid_pixels=counts[ends.VALID],
         beyond=frame.beyond,
         out_of_range=frame.out_of_range,
         unmeasured=counts[ends.UNMEASURED],
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
-        anchors=torch.zeros_like(frame.fault),
-        anchors_used=torch.zeros_like(frame.fault),
     )
     updated = replace(
         state,
@@ -224,7 +222,7 @@ def device_step(
         skipped=here.skipped,
         smoothed=result.memory,
     )
-    out = StepOutput(result.disagreement, result.features, None, result.measured, read_labels, current, statistics)
+    out = StepOutput(result.disagreement, result.features, result.measured, read_labels, current, statistics)
     return updated, out, waiting
 
 

@@ -1,0 +1,247 @@
+"""Anchors as an extension of UfM* (``ufmstar_torch.extension``): columns of step 5's regression, and the term B.
+
+Before the regression a frame's anchors become evidence. Of each component the mean r and e less the stream's are
+regressed beside H; the stream's are added at every pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.anchors.evidence import SUMS, Evidence, inliers, means, observe
+from ufmstar_torch.anchors.given import AnchorInput, CheckKernel, check_anchors, check_values
+from ufmstar_torch.camera import unproject_at
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.extension import Columns, Distribute, Extension, FrameExtension, Tensors, Total
+from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.output import StepOutput
+from ufmstar_torch.state import UfMStarState
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What is known after a frame's anchors.
+
+    Attributes:
+        evidence: this frame's included.
+        used: [B] how many anchors were used.
+        beyond: [B, K, 2] mean r and e of the components less the stream's (``evidence.means``).
+        stream: [B, 2] the stream's.
+    """
+
+    evidence: Evidence
+    used: Tensor
+    beyond: Tensor
+    stream: Tensor
+
+
+class LearnKernel(Protocol):
+    """Evidence with room for the mixture, M_i in the camera frame, a frame and its anchors (:func:`learn`)."""
+
+    def __call__(
+        self,
+        evidence: Evidence,
+        mixture_cam: GaussianMixture,
+        frame: FrameInput,
+        anchors: AnchorInput | None,
+        config: UfMStarConfig,
+        /,
+        distribute: Distribute,
+    ) -> Learnt: ...
+
+
+class LearnInView(Protocol):
+    """Like :func:`learn`, from what the compiled step has in view, into which it writes the columns; see
+    ``kernels.anchors_cpu.learn_in_view``."""
+
+    def __call__(
+        self,
+        evidence: Evidence,
+        capacity: int,
+        slots: Any,
+        seen: Any,
+        views: Any,
+        frame: FrameInput,
+        anchors: AnchorInput | None,
+        config: UfMStarConfig,
+        /,
+    ) -> Learnt: ...
+
+
+def learn(
+    evidence: Evidence,
+    mixture_cam: GaussianMixture,
+    frame: FrameInput,
+    anchors: AnchorInput | None,
+    config: UfMStarConfig,
+    distribute: Distribute,
+    supported: Callable[[AnchorInput], Tensor] = inliers,
+) -> Learnt:
+    """Add a frame's anchors to the evidence.
+
+    Args:
+        evidence: up to the frame before.
+        mixture_cam: M_i in the camera frame, [B, K].
+        frame: the same B streams.
+        anchors: of this frame, or None.
+        config: of UfM*.
+        distribute: sums values at points by component (:func:`ufmstar_torch.regress.distribute`).
+        supported: which anchors their neighbours support (``evidence.inliers``).
+    """
+    assert config.anchors is not None
+    used = torch.zeros_like(frame.fault)
+    if anchors is not None:
+        points = unproject_at(anchors.predicted, anchors.index, frame.size[1], frame.intrinsics)
+
+        def by_component(rows: Tensor) -> Tensor:
+            return distribute(mixture_cam, points, rows, config)
+
+        memory = 0.5 ** (1 / config.anchors.half_life)
+        # A faulty frame's anchors are not valid.
+        evidence, each = observe(evidence, anchors, by_component, memory, supported)
+        used = each.sum(1)
+    return Learnt(evidence, used, *means(evidence, config.anchors.shrinkage))
+
+
+class TermKernel(Protocol):
+    """B and M + B; see :func:`anchored_term`."""
+
+    def __call__(self, depth: Tensor, excess: Tensor, disagreement: Tensor, /) -> tuple[Tensor, Tensor]: ...
+
+
+def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> tuple[Tensor, Tensor]:
+    """B = max(0, d^2 e - M) [m^2], the mean square error that anchors show beyond M, and M + B; NaN where M is.
+
+    Args:
+        depth: d, any shape [m].
+        excess: e, likewise, the relative mean square error that the network does not state (``evidence``).
+        disagreement: M, likewise [m^2].
+    """
+    term = depth.square().mul_(excess).sub_(disagreement).clamp_min_(0)
+    return term, disagreement + term
+
+
+@dataclass(frozen=True)
+class AnchorKernels:
+    """The replaceable parts.
+
+    Attributes:
+        check: see ``given.check_values``.
+        learn: see :func:`learn`.
+        learn_in_view: the same for the compiled step; None = ``learn`` serves.
+        term: see :func:`anchored_term`.
+    """
+
+    check: CheckKernel
+    learn: LearnKernel
+    learn_in_view: LearnInView | None
+    term: TermKernel
+
+
+REFERENCE = AnchorKernels(check_values, learn, None, anchored_term)
+
+
+class AnchorFrame(FrameExtension):
+    """The anchors of one frame.
+
+    Args:
+        frame: of B streams.
+        anchors: of the frame, checked, or None.
+        config: with ``anchors``.
+        kernels: which implementation of each part.
+
+    Attributes:
+        frame, anchors: as above.
+    """
+
+    columns = 2  # mean r and mean e
+
+    def __init__(
+        self, frame: FrameInput, anchors: AnchorInput | None, config: UfMStarConfig, kernels: AnchorKernels
+    ) -> None:
+        self.frame, self.anchors = frame, anchors
+        self._config, self._kernels = config, kernels
+        self._used = self._residual = self._term = torch.empty(0)
+
+    def before_regression(self, tensors: Tensors, mixture_cam: GaussianMixture, distribute: Distribute) -> Columns:
+        """Add the frame's anchors to the evidence."""
+        evidence = _evidence(tensors).padded(mixture_cam.capacity)
+        return self._columns(
+            self._kernels.learn(evidence, mixture_cam, self.frame, self.anchors, self._config, distribute=distribute)
+        )
+
+    def in_view(self, tensors: Tensors, capacity: int, slots: Any, seen: Any, views: Any) -> Columns | None:
+        """Add the frame's anchors to the evidence, in the compiled step."""
+        if self._kernels.learn_in_view is None:
+            return None
+        given = (_evidence(tensors), capacity, slots, seen, views, self.frame, self.anchors, self._config)
+        return self._columns(self._kernels.learn_in_view(*given))
+
+    def _columns(self, learnt: Learnt) -> Columns:
+        self._used = learnt.used
+        tensors = {"evidence": learnt.evidence.component, "overall_evidence": learnt.evidence.overall}
+        return Columns(learnt.beyond, learnt.stream, tensors)
+
+    def after_regression(self, values: Tensor) -> None:
+        """The residual [..., 2] to expect at each pixel, mean r and mean e."""
+        self._residual = values
+
+    def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
+        """Count the anchors, and those that were used."""
+        given = torch.zeros_like(self._used) if self.anchors is None else self.anchors.valid.sum(1)
+        return state, replace(out, statistics=replace(out.statistics, anchors=given, anchors_used=self._used))
+
+    def disagreement(self, disagreement: Tensor, depth: Tensor) -> Tensor:
+        """M + B [m^2]."""
+        self._term, both = self._kernels.term(depth, self._residual[..., 1], disagreement)
+        return both
+
+    def outputs(self) -> dict[str, Tensor]:
+        """B and r."""
+        return {"anchored": self._term, "bias": self._residual[..., 0]}
+
+
+class AnchorExtension(Extension):
+    """What anchors teach of the network's error.
+
+    Args:
+        config: with ``anchors``.
+        kernels: makes the kernels for a backend and a device's type.
+    """
+
+    argument = "anchors"
+
+    def __init__(self, config: UfMStarConfig, kernels: Callable[[str, str], AnchorKernels]) -> None:
+        self._config, self._kernels = config, kernels
+
+    def by_component(
+        self, streams: int, slots: int, dtype: torch.dtype, device: torch.device | str
+    ) -> dict[str, Tensor]:
+        """``evidence`` [B, K, 3], sums over anchors."""
+        return {"evidence": torch.zeros(streams, slots, SUMS, dtype=dtype, device=device)}
+
+    def by_stream(self, streams: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, Tensor]:
+        """``overall_evidence`` [B, 3], sums over anchors of the stream."""
+        return {"overall_evidence": torch.zeros(streams, SUMS, dtype=dtype, device=device)}
+
+    def of_frame(
+        self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool
+    ) -> AnchorFrame:
+        """With the frame's anchors checked.
+
+        Raises:
+            TypeError, ValueError: as :func:`check_anchors`.
+        """
+        kernels = self._kernels(self._config.backend, frame.depth.device.type)
+        anchors = None if given is None else check_anchors(given, frame, own, kernels.check)
+        return AnchorFrame(frame, anchors, self._config, kernels)
+
+
+def _evidence(tensors: Tensors) -> Evidence:
+    return Evidence(tensors["evidence"], tensors["overall_evidence"])

@@ -1,0 +1,261 @@
+"""How an extension hangs on UfM*: tensors of its own in the state, and calls around a frame.
+
+An :class:`Extension` belongs to a module. For each frame it makes a :class:`FrameExtension`, whose methods are called
+in this order: ``before_regression`` adds columns that are regressed beside H with the same weights,
+``after_regression`` receives them at every pixel, ``after_frame`` may change the state, and ``disagreement`` M. An
+extension may also map V. By default nothing is changed. ``extensions.py`` makes the extensions of a config.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.output import StepOutput
+from ufmstar_torch.regress import Regression
+from ufmstar_torch.state import UfMStarState
+
+Tensors = Mapping[str, Tensor]
+# (mixture in the camera frame, points [B, N, 3], values [B, N, C], config) -> sums by component [B, K, C]
+Distribute = Callable[[GaussianMixture, Tensor, Tensor, UfMStarConfig], Tensor]
+# M -> V without what extensions add to M
+Total = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What is regressed beside H, C numbers a component.
+
+    Attributes:
+        values: [B, K, C], 0 for the prior.
+        shift: [B, C], added to the regressed values at every pixel.
+        tensors: the extension's tensors of the state that change, after the frame.
+    """
+
+    values: Tensor
+    shift: Tensor
+    tensors: dict[str, Tensor]
+
+
+class FrameExtension:
+    """An extension during one frame.
+
+    Attributes:
+        columns: C, how many columns it regresses.
+        changes_mixture: whether ``after_frame`` may change the mixture, which must be complete then.
+    """
+
+    columns: int = 0
+    changes_mixture: bool = False
+
+    def before_regression(self, tensors: Tensors, mixture_cam: GaussianMixture, distribute: Distribute) -> Columns:
+        """The columns of M_i [B, K] in the camera frame; only where ``columns`` is not 0.
+
+        Args:
+            tensors: of the state before the frame.
+            mixture_cam: after the fusion.
+            distribute: sums values at points by component (:func:`ufmstar_torch.regress.distribute`).
+        """
+        raise NotImplementedError
+
+    def in_view(self, tensors: Tensors, capacity: int, slots: Any, seen: Any, views: Any) -> Columns | None:
+        """Like :meth:`before_regression` for the compiled step, where it has a faster way (None: it has none): the
+        columns are written into ``seen`` and ``views`` (``kernels.regress_cpu``) of the components in ``slots``."""
+        return None
+
+    def after_regression(self, values: Tensor) -> None:
+        """Receive the columns [B, H, W, C] or [B, n, C] at the pixels."""
+
+    def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
+        """State and output after a step; ``total`` is V as a function of M at the pixels of the output."""
+        return state, out
+
+    def disagreement(self, disagreement: Tensor, depth: Tensor) -> Tensor:
+        """M with what the extension adds to it [m^2], at pixels of this depth [m]."""
+        return disagreement
+
+    def outputs(self) -> dict[str, Tensor]:
+        """Further maps for :class:`~ufmstar_torch.output.UfMStarOutput`, by name."""
+        return {}
+
+
+class Extension:
+    """An extension of UfM*.
+
+    Attributes:
+        argument: name of what a frame may bring for it (``UfMStar.forward``), "" = nothing.
+        always_float64: names of the tensors that stay float64.
+    """
+
+    argument: ClassVar[str] = ""
+    always_float64: ClassVar[tuple[str, ...]] = ()
+
+    def require(self, config: UfMStarConfig) -> None:
+        """Raise a ValueError unless the extension fits the config."""
+
+    def by_component(
+        self, streams: int, slots: int, dtype: torch.dtype, device: torch.device | str
+    ) -> dict[str, Tensor]:
+        """Its tensors [B, K, C] of the empty state: sums over what was observed of each component, row k of slot k."""
+        return {}
+
+    def by_stream(self, streams: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, Tensor]:
+        """Its tensors [B, C] of the empty state that describe a stream as a whole."""
+        return {}
+
+    def of_frame(
+        self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool
+    ) -> FrameExtension:
+        """The extension during a frame.
+
+        Args:
+            frame: checked.
+            own: the network's own variances that count, A and E [B, H, W] [m^2].
+            given: what the frame brings under ``argument``, or None.
+            before: the extensions that come before this one, during the same frame.
+            dense: whether the whole map is regressed.
+
+        Raises:
+            TypeError, ValueError: ``given`` is not what the extension takes.
+        """
+        return FrameExtension()
+
+    def map_variance(self, variance: Tensor) -> Tensor:
+        """V [m^2] after everything else."""
+        return variance
+
+
+@dataclass(frozen=True)
+class FrameExtensions:
+    """All extensions during one frame, in their order."""
+
+    each: Sequence[FrameExtension] = ()
+    _shifts: list[Tensor] = field(default_factory=list)
+
+    @property
+    def columns(self) -> int:
+        """How many columns they add."""
+        return sum(one.columns for one in self.each)
+
+    @property
+    def changes_mixture(self) -> bool:
+        """Whether any of them may change the mixture after the frame."""
+        return any(one.changes_mixture for one in self.each)
+
+    def before_regression(
+        self, tensors: Tensors, mixture_cam: GaussianMixture, distribute: Distribute
+    ) -> tuple[dict[str, Tensor], GaussianMixture]:
+        """The tensors that change, and the mixture with the columns behind its features."""
+        after, features = dict[str, Tensor](), [mixture_cam.features]
+        for one in self.each:
+            if one.columns:
+                columns = one.before_regression(tensors, mixture_cam, distribute)
+                after |= columns.tensors
+                features.append(columns.values.to(mixture_cam.features.dtype))
+                self._shifts.append(columns.shift)
+        return after, mixture_cam.replace(features=torch.cat(features, -1)) if self._shifts else mixture_cam
+
+    def in_view(
+        self, tensors: Tensors, capacity: int, slots: Any, seen: Any, views: Any
+    ) -> tuple[dict[str, Tensor], Tensor] | None:
+        """As :meth:`FrameExtension.in_view`, of a single extension with columns: the tensors that change, and the shift
+        [B, C], which the regression then adds. None: take :meth:`before_regression`."""
+        with_columns = [one for one in self.each if one.columns]
+        if len(with_columns) != 1:
+            return None
+        columns = with_columns[0].in_view(tensors, capacity, slots, seen, views)
+        return None if columns is None else (columns.tensors, columns.shift)
+
+    def after_regression(self, result: Regression) -> Regression:
+        """Hand out the columns, which are the last features; what was shifted in the regression is not again."""
+        if not self.columns:
+            return result
+        first = result.features.shape[-1] - self.columns
+        values = result.features[..., first:]
+        if self._shifts:
+            shift = torch.cat(self._shifts, -1).to(values.dtype)
+            values = values + shift.view(-1, *[1] * (values.dim() - 2), self.columns)
+        for one, part in zip(self.each, values.split([one.columns for one in self.each], -1), strict=True):
+            if one.columns:
+                one.after_regression(part)
+        return replace(result, features=result.features[..., :first])
+
+    def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
+        """See :meth:`FrameExtension.after_frame`."""
+        for one in self.each:
+            state, out = one.after_frame(state, out, total)
+        return state, out
+
+    def disagreement(self, disagreement: Tensor, depth: Tensor) -> Tensor:
+        """See :meth:`FrameExtension.disagreement`."""
+        for one in self.each:
+            disagreement = one.disagreement(disagreement, depth)
+        return disagreement
+
+    def outputs(self) -> dict[str, Tensor]:
+        """See :meth:`FrameExtension.outputs`."""
+        return {name: value for one in self.each for name, value in one.outputs().items()}
+
+
+NONE = FrameExtensions()
+
+
+class Extensions:
+    """The extensions of a module, in their order."""
+
+    def __init__(self, each: Sequence[Extension], config: UfMStarConfig) -> None:
+        for one in each:
+            one.require(config)
+        self.each = tuple(each)
+
+    @property
+    def always_float64(self) -> tuple[str, ...]:
+        """Names of the tensors that stay float64."""
+        return tuple(name for one in self.each for name in one.always_float64)
+
+    def initial(
+        self, streams: int, config: UfMStarConfig, dtype: torch.dtype, device: torch.device | str
+    ) -> UfMStarState:
+        """The empty state of ``streams`` independent streams."""
+        state = UfMStarState.initial(streams, config, dtype, device)
+        slots = state.weight.shape[1]
+        return replace(
+            state,
+            by_component={
+                n: v for one in self.each for n, v in one.by_component(streams, slots, dtype, device).items()
+            },
+            by_stream={n: v for one in self.each for n, v in one.by_stream(streams, dtype, device).items()},
+        )
+
+    def of_frame(
+        self, frame: FrameInput, own: Sequence[Tensor], given: Mapping[str, Any], *, dense: bool
+    ) -> FrameExtensions:
+        """All of them during a frame.
+
+        Raises:
+            TypeError: an argument of no extension, or as :meth:`Extension.of_frame`.
+            ValueError: an argument of an extension that is off, or as :meth:`Extension.of_frame`.
+        """
+        known = {one.argument for one in self.each}
+        for name in [name for name, value in given.items() if name not in known]:
+            if name not in UfMStarConfig.__dataclass_fields__:
+                raise TypeError(f"UfM* takes no argument {name!r}")
+            if given[name] is not None:
+                raise ValueError(f"{name} are given, but UfMStarConfig.{name} is None: switch the extension on")
+        each: list[FrameExtension] = []
+        for one in self.each:
+            each.append(one.of_frame(frame, own, given.get(one.argument), each, dense=dense))
+        return FrameExtensions(each) if each else NONE
+
+    def map_variance(self, variance: Tensor) -> Tensor:
+        """V [m^2] after everything else."""
+        for one in self.each:
+            variance = one.map_variance(variance)
+        return variance

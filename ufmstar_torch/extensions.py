@@ -1,0 +1,28 @@
+"""The extensions that a config asks for: the one place that knows all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ufmstar_torch.anchors.extension import AnchorExtension
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.extension import Extension, Extensions
+from ufmstar_torch.kernels.select import select_anchors, select_merge, select_posterior
+from ufmstar_torch.merge import MergeExtension
+from ufmstar_torch.posterior.extension import PosteriorExtension
+
+
+def extensions_of(config: UfMStarConfig, further: Sequence[Extension] = ()) -> Extensions:
+    """The extensions of a config, and ``further`` ones behind them.
+
+    Raises:
+        ValueError: one of them does not fit the config.
+    """
+    each: list[Extension] = []
+    if config.anchors is not None:
+        each.append(AnchorExtension(config, select_anchors))
+    if config.posterior is not None:
+        each.append(PosteriorExtension(config, select_posterior))
+    if config.merge is not None:
+        each.append(MergeExtension(config, select_merge))
+    return Extensions([*each, *further], config)

@@ -1,0 +1,77 @@
+"""The posterior as an extension of UfM* (``ufmstar_torch.extension``), which follows the one of anchors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.anchors.extension import AnchorFrame
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.extension import Extension, FrameExtension, Total
+from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.output import StepOutput
+from ufmstar_torch.posterior.running import SIZE
+from ufmstar_torch.posterior.update import Posterior, PosteriorUpdate
+from ufmstar_torch.state import UfMStarState
+
+
+class PosteriorFrame(FrameExtension):
+    """The posterior of one frame.
+
+    Args:
+        of_anchors: the anchors during the same frame.
+        config: with ``posterior``.
+        update: an implementation of :func:`ufmstar_torch.posterior.update.update`.
+    """
+
+    def __init__(self, of_anchors: AnchorFrame, config: UfMStarConfig, update: PosteriorUpdate) -> None:
+        self._anchors, self._config, self._update = of_anchors, config, update
+        self._posterior: Posterior | None = None
+
+    def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
+        """Learn from the frame's anchors, and correct the depth."""
+        assert self._config.posterior is not None
+        claimed = total(out.disagreement).detach()
+        frame, anchors, packed = self._anchors.frame, self._anchors.anchors, state.by_stream["posterior"]
+        learnt, posterior = self._update(packed, frame, anchors, claimed, self._config.posterior)
+        floor = self._config.variance_floor
+        self._posterior = replace(posterior, variance=posterior.variance.clamp_min(floor))
+        statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
+        return state.with_tensors({"posterior": learnt}), replace(out, statistics=statistics)
+
+    def outputs(self) -> dict[str, Tensor]:
+        """The corrected depth and its variance."""
+        assert self._posterior is not None
+        return {"posterior_depth": self._posterior.depth, "posterior_variance": self._posterior.variance}
+
+
+class PosteriorExtension(Extension):
+    """p(depth | network, UfM*, anchors).
+
+    Args:
+        config: with ``posterior`` and ``anchors``.
+        update: makes the implementation for a backend and a device's type.
+    """
+
+    always_float64: ClassVar[tuple[str, ...]] = ("posterior",)
+
+    def __init__(self, config: UfMStarConfig, update: Callable[[str, str], PosteriorUpdate]) -> None:
+        self._config, self._update = config, update
+
+    def by_stream(self, streams: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, Tensor]:
+        """``posterior`` [B, S] float64, what was learnt of the stream (``posterior.running``)."""
+        return {"posterior": torch.zeros(streams, SIZE, dtype=torch.float64, device=device)}
+
+    def of_frame(
+        self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool
+    ) -> FrameExtension:
+        """It needs whole maps: with a subset of pixels it does nothing."""
+        of_anchors = [one for one in before if isinstance(one, AnchorFrame)]
+        if not dense or not of_anchors:
+            return FrameExtension()
+        update = self._update(self._config.backend, frame.depth.device.type)
+        return PosteriorFrame(of_anchors[0], self._config, update)
