@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ufmstar_torch.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from ufmstar_torch.models.aligned import AlignedNetwork as AlignedNetwork
+    from ufmstar_torch.models.alignment import AlignedNetwork as AlignedNetwork
     from ufmstar_torch.models.alignment import Alignment as Alignment
     from ufmstar_torch.models.alignment import AlignmentFit as AlignmentFit
     from ufmstar_torch.models.alignment import AlignmentSums as AlignmentSums

@@ -1,4 +1,4 @@
-"""Relative depth made metric, on purpose: scale and shift fitted to sparse measurements.
+"""Scale and shift that make relative depth metric, fitted to sparse measurements.
 
 Relative networks (MiDaS, Depth Anything without "Metric") predict inverse depth up to a scale and a shift,
 1/d = scale x + shift; others predict depth itself so, d = scale x + shift (scale alone: shift = 0). Either
@@ -15,9 +15,13 @@ from dataclasses import dataclass, field
 from typing import Any, TypedDict, Unpack
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.outputs import as_map
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.prediction import DepthPrediction, infer
 
 KINDS = ("inverse", "affine")
 # Reweighted fits: with a third of outliers on one side each leaves .85 of the error, so 25 leave less than .02.
@@ -28,7 +32,7 @@ _TRIMMED = 15
 _HUBER, _CUT = 1.345, 3.0
 # Standard deviation of a normal residual per median of its magnitude.
 _MAD_TO_STD = 1.4826
-# Of the size of the values: exact data leave residuals of float64 rounding, which are no outliers.
+# [1] Share of the median value: exact data leave residuals of float64 rounding, which are no outliers.
 _ROUNDING = 1e-9
 # Smallest variance of x per mean square: a relative spread of 1e-5, where what float32 predictions resolve (1e-7)
 # still determines a slope to 1 %.
@@ -37,7 +41,7 @@ _RANK = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Alignment(Checked):
-    """What makes a relative prediction x metric: 1/d or d is scale x + shift.
+    """Scale and shift that make a relative prediction x metric: 1/d or d is scale x + shift.
 
     Attributes:
         kind: "inverse" (1/d, units 1/m) or "affine" (d, units m).
@@ -104,7 +108,7 @@ class Alignment(Checked):
 
 @dataclass(frozen=True, eq=False)
 class AlignmentFit:
-    """An alignment with what supports it; [] instead of [B] where the images were pooled."""
+    """An alignment and its statistics; [] instead of [B] where the images were pooled."""
 
     alignment: Alignment  # the result
     points: Tensor  # [B] usable measurements
@@ -135,6 +139,42 @@ class AlignmentSums:
         sentence = f"does not grow with {grows}, as kind {self.kind!r} declares; the fitted scale is"
         require_each(scale > 0, scale, sentence)
         return Alignment(self.kind, scale, offset, max_depth)
+
+
+class AlignedNetwork(DepthNetwork):
+    """Metric depth from a network that predicts it up to scale (and shift).
+
+    Args:
+        network: image [B, 3, H, W] -> relative depth [B, H, W] or [B, 1, H, W].
+        alignment: the same for every frame, fitted once; the module states why.
+        preprocess: what the network's input needs; None: images in [0, 1] at their own size.
+    """
+
+    def __init__(self, network: nn.Module, alignment: Alignment, preprocess: Preprocess | None = None) -> None:
+        super().__init__()
+        self.network = network
+        self.alignment = alignment
+        self.preprocess = preprocess or Preprocess()
+
+    @property
+    def wrapped(self) -> tuple[nn.Module]:
+        """The relative network."""
+        return (self.network,)
+
+    @property
+    def max_depth(self) -> float | None:
+        """[m] The alignment's: farther pixels have no prediction."""
+        return self.alignment.max_depth
+
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
+        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; 0 (no prediction) where the
+        alignment is not possible. Raises ValueError: the network returns another shape."""
+        relative = as_map(infer(self.network, image, intrinsics), "the network's relative depth")
+        if relative.shape[-2:] != image.shape[-2:]:
+            raise ValueError(f"network must return {tuple(image.shape[-2:])} px, got {tuple(relative.shape)}")
+        if relative.dtype in (torch.float16, torch.bfloat16):
+            relative = relative.float()  # a scale of 1e-3 and less is no number in half precision
+        return DepthPrediction(self.alignment.depth(relative))
 
 
 class FitOptions(TypedDict, total=False):

@@ -19,14 +19,14 @@ from torch import Tensor, nn
 from ufmstar_torch.models.atomic import write_atomic
 from ufmstar_torch.optional import optional
 
-# Where training programs put the weights inside a checkpoint, and what wrappers put before every key.
+# Keys under which training programs store the weights in a checkpoint, and prefixes that wrappers add to every key.
 _CONTAINERS = ("state_dict", "model_state_dict", "model")
 _PREFIXES = ("module.", "_orig_mod.", "state_dict.", "model.", "network.")
 _TORCH_SUFFIXES = (".pth", ".pt", ".ckpt", ".bin", ".tar")
 _UNKNOWN_SUFFIX = f"{{}} must end in .safetensors or one of {', '.join(_TORCH_SUFFIXES)}"
 # How the files of torch.save begin: an archive, or (before 1.6) the pickled magic number of its own format.
 _BEGINNINGS = (b"PK\x03\x04", b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.")
-# What the restricted unpickler was seen to raise on damaged bytes; it documents none of it.
+# Exceptions that the restricted unpickler raises on damaged bytes; it does not document them.
 DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, AttributeError, AssertionError)
 _SHOWN = 8  # keys named in an error message
 
@@ -154,7 +154,7 @@ def _read(path: Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
 
 
 def read_tensors(file: BinaryIO, name: str | Path) -> Any:
-    """What ``torch.save`` wrote into an open file, without running code from it. Raises CheckpointError: it is damaged,
+    """The content of an open file of ``torch.save``; no code from it is run. Raises CheckpointError: it is damaged,
     or holds more than tensors and plain values; the message has ``name``."""
     beginning = file.read(max(map(len, _BEGINNINGS)))
     if not beginning.startswith(_BEGINNINGS):

@@ -61,15 +61,12 @@ class DepthAnything(HuggingFaceDepth):
         revision: str | None = None,
         local_files_only: bool = False,
     ) -> Self:
-        """As :func:`from_hugging_face`, for this architecture; colours as the published checkpoints have them where the
-        directory does not state them.
+        """As :func:`from_hugging_face`, for this architecture; where the directory does not state colours, they are
+        those of the published checkpoints.
 
         Args:
-            name_or_dir: a hub name (:func:`depth_anything_name`) or a directory.
             size: (height, width) [px] of the input, multiples of the patch (14).
             keep_aspect: keep the image's aspect as the checkpoint's own processor does: 480 x 640 becomes 518 x 686.
-                The intrinsics follow in either case.
-            dtype, device, revision, local_files_only: as in :func:`from_hugging_face`; errors too.
 
         Raises:
             ValueError: ``size`` is no multiple of the patch.

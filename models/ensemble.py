@@ -114,7 +114,7 @@ class LazyMember(DepthNetwork):
         return takes_intrinsics(self.network())
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """What the network returns; ``intrinsics`` [B, 3, 3] [px] of ``image`` for a network that takes them. Raises
+        """The network's prediction; ``intrinsics`` [B, 3, 3] [px] of ``image`` for a network that takes them. Raises
         CheckpointError: it cannot be loaded."""
         network, device = self.network(), self._where.device
         if not self.offload or device.type == "cpu":

@@ -189,7 +189,7 @@ class FastDepth(Backbone):
 
     @property
     def pyramid_channels(self) -> tuple[int, ...]:
-        """Of full resolution, 1/2, 1/4, 1/8 and 1/16."""
+        """Channels at full resolution, 1/2, 1/4, 1/8 and 1/16."""
         return self.widths.decoder[::-1]
 
     def features(self, image: Tensor) -> Tensor:

@@ -19,8 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ufmstar_torch.checked import Checked
-from ufmstar_torch.models.aligned import AlignedNetwork
-from ufmstar_torch.models.alignment import KINDS, Alignment
+from ufmstar_torch.models.alignment import KINDS, AlignedNetwork, Alignment
 from ufmstar_torch.models.checkpoints import DAMAGE, CheckpointError, some
 from ufmstar_torch.models.network import DepthNetwork, require_image
 from ufmstar_torch.models.outputs import METRIC, as_map
@@ -40,7 +39,7 @@ _PADDING = 3.0  # [sqrt(px)] ZoeDepth pads each border by this times the square 
 
 @dataclass(frozen=True)
 class HuggingFaceSpec(Checked):
-    """What is declared about a checkpoint.
+    """The user's declarations about a checkpoint.
 
     Attributes:
         kind: what it predicts: "metric" (GLPN, DPT trained on NYU or KITTI; Depth Pro and ZoeDepth always), "inverse"

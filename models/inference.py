@@ -53,7 +53,7 @@ class Inference(Checked):
             raise ValueError("precision bf16 is torch's: ONNX Runtime computes in the file's own, use runtime torch")
 
     def options(self, model: str, device: torch.device) -> dict[str, Any]:
-        """What ``load_network`` takes beside weights and spec for a model of that name."""
+        """Further arguments of ``load_network`` for a model of that name."""
         if model != "onnx":
             return {}
         return {"threads": self.threads or torch.get_num_threads(), "providers": providers_for(device)}
@@ -105,7 +105,7 @@ class Inference(Checked):
 
 
 def runtime_of(network: nn.Module, precision: str) -> dict[str, Any]:
-    """What runs a network, for the record: name and version, threads, provider (ONNX Runtime) and precision."""
+    """The runtime of a network, for the record: name, version, threads, provider (ONNX Runtime) and precision."""
     if isinstance(network, OnnxNetwork):
         own = {"provider": network.session.get_providers()[0], "threads": network.threads or None}
         return {"name": "onnxruntime", "version": version("onnxruntime"), **own, "precision": "as in the file"}

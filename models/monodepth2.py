@@ -146,7 +146,7 @@ class MonodepthResNet(Backbone):
 
     @property
     def pyramid_channels(self) -> tuple[int, ...]:
-        """Of full resolution, 1/2, 1/4, 1/8 and 1/16."""
+        """Channels at full resolution, 1/2, 1/4, 1/8 and 1/16."""
         return self._widths
 
     def features(self, image: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from torch import Tensor
 from ufmstar_torch.models.checkpoints import CheckpointError, load_state_dict_file
 from ufmstar_torch.models.monodepth2 import IMAGENET_MEAN, IMAGENET_STD, LEVELS, MonodepthResNet
 
-# What encoder.pth holds beside the weights.
+# Keys of encoder.pth that are no weights.
 _NO_WEIGHTS = ("height", "width", "use_stereo")
 # Monodepth2 normalises every colour of an image in [0, 1] by these.
 _MEAN, _STD = 0.45, 0.225
@@ -27,7 +27,7 @@ _CONVOLUTION = re.compile(r"decoder\.(\d+)(?:\.conv)?\.conv\.(weight|bias)")
 
 @dataclass(frozen=True)
 class Imported:
-    """What became of the tensors of two files."""
+    """The tensors of two files that were loaded, and those that were not."""
 
     loaded: tuple[str, ...]  # keys of the network that were filled
     skipped: Mapping[str, str]  # keys of the files that were not used, with the reason

@@ -1,4 +1,4 @@
-"""What all depth networks here have in common."""
+"""The base classes of all depth networks."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Any depth network that was exported to ONNX, run by ONNX Runtime.
 
-What the graph states (names, sizes, types, a fixed batch) is read from it; what it cannot state (how the
-input is scaled, in which unit the output is) is declared by an :class:`OnnxSpec`.
+Names, sizes, types and a fixed batch are read from the graph. An :class:`OnnxSpec` declares the scale of the input and
+the unit of the output, which no graph states.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _ERRORS_ONLY = 3  # ONNX Runtime's severity; below it, it reports every unused w
 
 @dataclass(frozen=True)
 class OnnxSpec(ProgramSpec):
-    """What an ONNX file does not state.
+    """Declarations that an ONNX file does not contain.
 
     Attributes:
         outputs: as in :class:`ProgramSpec`; outputs are named.
@@ -257,7 +257,7 @@ def _onnxruntime() -> Any:
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:
-    """What ONNX Runtime raises for a graph that it cannot load or run; its classes have no common base."""
+    """Exceptions of ONNX Runtime for a graph that it cannot load or run; they have no common base class."""
     from onnxruntime.capi import onnxruntime_pybind11_state as state
 
     names = ("InvalidProtobuf", "InvalidGraph", "InvalidArgument", "Fail", "NotImplemented", "RuntimeException")

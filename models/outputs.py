@@ -1,4 +1,4 @@
-"""What a network's raw outputs mean: which one is depth, in which unit, and which are variances.
+"""The meaning of a network's raw outputs: which one is depth, in which unit, and which are variances.
 
 UfM* compares 3D points of different views, so depth has to be metric. Networks that predict inverse
 depth, disparity or depth up to scale (and shift) are refused here, where their output is declared.
@@ -159,7 +159,7 @@ def as_map(value: Any, name: str) -> Tensor:
 
 @dataclass(frozen=True)
 class ProgramSpec(Checked):
-    """What the file of a saved program does not state, in JSON for instance::
+    """Declarations that the file of a saved program does not contain, in JSON for instance::
 
         {"preprocess": {"resize_height": 250, "crop": [228, 304], "size": [224, 224]},
          "outputs": {"kind": "metric", "scale": 1.0}}

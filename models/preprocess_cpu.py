@@ -47,7 +47,7 @@ def resample(
 
 @lru_cache(maxsize=16)
 def taps(size: int, wanted: int) -> Taps:
-    """How ``interpolate`` resizes one axis: [wanted] the first pixel that counts, and [wanted, T] float32 the weights
+    """The weights of ``interpolate`` along one axis: [wanted] the first source pixel, and [wanted, T] float32 weights
     from there on, 0 behind the last one."""
     pulses = torch.arange(size).split(_PULSES)
     weights = np.concatenate([_answers(F.one_hot(part, size), wanted) for part in pulses]).T

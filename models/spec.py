@@ -85,7 +85,7 @@ class NetworkSpec(Checked):
         return {**super().to_dict(), "size": list(self.size)}
 
     def input(self) -> Preprocess:
-        """What brings a camera image to the network's input."""
+        """The preprocessing from a camera image to the network's input."""
         statistics: dict[str, Any] = {}
         if self.architecture == "monodepth2":
             from ufmstar_torch.models.monodepth2 import IMAGENET_MEAN, IMAGENET_STD

@@ -32,7 +32,7 @@ _KEYS = {"format", "version", "spec", "networks", "info"}
 
 @dataclass(frozen=True)
 class TrainedInfo:
-    """What a file holds besides weights."""
+    """The metadata of a file."""
 
     path: Path  # of the file
     spec: NetworkSpec  # of every network in it
@@ -88,7 +88,7 @@ def save_trained(
 
 
 def read_info(path: str | Path) -> TrainedInfo:
-    """What a file holds besides its weights, which are not read. Raises FileNotFoundError: there is no such file;
+    """The metadata of a file, whose weights are not read. Raises FileNotFoundError: there is no such file;
     CheckpointError: it is damaged, of another format or of a newer version; ModuleNotFoundError: safetensors is not
     installed."""
     return _TrainedFile(Path(path)).info
@@ -141,7 +141,7 @@ def load_for_training(path: str | Path) -> list[UncertaintyNetwork | BatchEnsemb
 
 
 class _TrainedFile:
-    """One file, whose networks are read one by one. What they share is read once. Raises FileNotFoundError,
+    """One file, whose networks are read one by one. Shared weights are read once. Raises FileNotFoundError,
     CheckpointError, ModuleNotFoundError: as :func:`read_info`."""
 
     def __init__(self, path: Path) -> None:
@@ -166,7 +166,7 @@ class _TrainedFile:
         return _TrainedFile, (self.path,)  # a copy reads the file again
 
     def read(self, index: int) -> UncertaintyNetwork | BatchEnsemble:
-        """What is stored under an index, in eval mode. Raises CheckpointError: as :meth:`member`."""
+        """The network stored under an index, in eval mode. Raises CheckpointError: as :meth:`member`."""
         network = _new(self.info.spec)
         fill(network, read_safetensors(self.path, f"member.{index}.")[0], f"{self.path}, member {index},")
         return network.eval()

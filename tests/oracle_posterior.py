@@ -9,17 +9,18 @@ import numpy as np
 
 SIDE, FEATURES = 28, 4
 START = {
-    "roughness": (0.0025, 40.0, 1e-4, 0.04),
-    "noise": (1.0, 40.0, 0.25, 16.0),
-    "unseen": (0.1, 40.0, 0.0, 16.0),
+    "amplitude": (1.0, 20.0, 0.1, 100.0),
+    "roughness": (0.0025, 20.0, 1e-4, 0.04),
+    "noise": (1.0, 20.0, 0.25, 16.0),
+    "unseen": (0.1, 20.0, 0.0, 16.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
-PRIOR, DRIFT, MEMORY = 0.5**2, 0.05**2, 0.5 ** (1 / 20)
+PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
 REACH, RADIUS, WEAK, CLIP = 1.0, 5 / 28, 0.25**2, 9.0
 
 
 def start():
-    return {"frames": 0, "m0": 0.0, "b": np.zeros(4), "C": PRIOR * np.eye(4),
+    return {"frames": 0, "m0": 0.0, "b": np.zeros(4), "C": np.diag(PRIOR),
             "sums": {k: [v * n, n] for k, (v, n, _, _) in START.items()}}  # fmt: skip
 
 
@@ -70,7 +71,7 @@ def node_features(logs):
 
 def joint_prior(logs, state):
     """Mean and precision of (b, f)."""
-    n, m0, q = logs.size, logs.mean(), FEATURES
+    n, m0, q, amplitude = logs.size, logs.mean(), FEATURES, ratio(state, "amplitude")
     T = np.eye(4)
     T[0, 1] = m0 - state["m0"] if state["frames"] else 0.0
     C = T @ state["C"] @ T.T
@@ -78,9 +79,9 @@ def joint_prior(logs, state):
         C = C + np.diag(DRIFT * np.clip(1 - np.diag(C) / PRIOR, 0, 1))
     Q = np.zeros((q + n, q + n))
     Q[:4, :4] = np.linalg.inv(C)
-    Q[q:, q:] = np.eye(n) * 0.5
+    Q[q:, q:] = np.eye(n) * 0.5 / amplitude
     for i, j, variance, _ in links(logs):
-        w = 1 / variance
+        w = 1 / (variance * amplitude)
         for a, b, s in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
             Q[q + a, q + b] += s * w
     mean = np.zeros(q + n)
@@ -215,6 +216,7 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
     fit, var = H @ mean, np.einsum("ij,jk,ik->i", H, C, H)
     away = distances(logs, set(node[rest]))[node]
     total, error = var + noise, (y - fit) ** 2
+    square = np.minimum(error, CLIP * total)
     believed = np.where(held, 1 / (1 + noise / WEAK), 0.0)
     area = believed / np.maximum(np.bincount(node, believed, minlength=logs.size)[node], 1e-12)
     share, around = away / REACH, y_variance(logs.shape, node, y, noise, rest, mean[0])[node]
@@ -222,6 +224,7 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
     final = total + away * ratio(state, "unseen") + share * claimed
     final += [tail(*each) for each in zip(share, offset, around, strict=True)]
     return {
+        "amplitude": ((area * (square - noise) / total).sum(), (area * var / total).sum() / ratio(state, "amplitude")),
         "unseen": ((area * (error - total)).sum(), (area * away).sum()),
         "calibration": ((area * error / final).sum(), area.sum()),
     }

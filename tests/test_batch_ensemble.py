@@ -25,7 +25,7 @@ from ufmstar_torch.models import (
     Preprocess,
     convert,
 )
-from ufmstar_torch.models.batch_ensemble import INIT_STD, converted_layers
+from ufmstar_torch.models.batch_ensemble import converted_layers
 from ufmstar_torch.models.batch_layer import BatchLayer, Selection
 from ufmstar_torch.pipeline import combine
 
@@ -136,16 +136,6 @@ def test_a_linear_layer_is_the_formula(shape, bias):
         torch.testing.assert_close(layer.plain(n)(x), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_every_image_by_its_own_member():
-    layer = convert(nn.Conv2d(3, 2, 3).double(), N, std=0.5)
-    x, turns = torch.randn(5, 3, 6, 6, dtype=torch.float64), [2, 0, 0, 1, 2]
-    layer.selection.members = torch.tensor(turns)
-    together = layer(x)
-    layer.selection.members = None
-    for b, n in enumerate(turns):
-        torch.testing.assert_close(together[b : b + 1], layer.plain(n)(x[b : b + 1]), rtol=1e-12, atol=1e-12)
-
-
 def test_a_layer_needs_its_ensemble():
     layer = convert(nn.Conv2d(3, 2, 3), N)
     with pytest.raises(RuntimeError, match="which selects the members"):
@@ -165,23 +155,6 @@ def test_autocast_does_not_widen_what_follows():
 # ---- how factors begin ----
 
 
-def test_factors_of_signs():
-    layer = convert(nn.Conv2d(300, 400, 1), 10, init="sign", generator=seeded())
-    for factor in (layer.r, layer.s):
-        assert set(factor.unique().tolist()) == {-1.0, 1.0}
-        assert abs(factor.mean().item()) < 4 / factor.numel() ** 0.5
-        assert not torch.equal(factor[0], factor[1])
-
-
-@pytest.mark.parametrize("std", [INIT_STD, 0.5])
-def test_factors_around_one(std):
-    layer = convert(nn.Linear(300, 400), 10, std=std, generator=seeded())
-    for factor in (layer.r, layer.s):
-        error = std / factor.numel() ** 0.5
-        assert abs(factor.mean().item() - 1) < 4 * error
-        assert abs(factor.std().item() - std) < 4 * error
-
-
 def test_a_seed_decides_the_factors_and_nothing_else_does():
     torch.manual_seed(1)
     first = convert(nn.Linear(4, 5), N, generator=seeded(7))
@@ -195,19 +168,6 @@ def test_a_seed_decides_the_factors_and_nothing_else_does():
     torch.set_rng_state(state)
     convert(nn.Linear(4, 5), N, generator=seeded())
     assert torch.equal(torch.get_rng_state(), after)
-
-
-def test_without_spread_all_members_are_the_network():
-    network, _ = tiny()
-    ensemble = BatchEnsemble(network, N, std=0.0)
-    x = images()
-    expected = network(x)
-    for member in ensemble.all_members():
-        torch.testing.assert_close(member(x).depth, expected.depth, rtol=1e-12, atol=1e-12)
-    combined = ensemble(x)
-    torch.testing.assert_close(combined.depth, expected.depth, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(combined.aleatoric_variance, expected.aleatoric_variance, rtol=1e-12, atol=1e-12)
-    assert combined.epistemic_variance.max() < 1e-28
 
 
 # ---- conversion ----
@@ -247,21 +207,6 @@ def test_conversion_replaces_layers_wherever_they_are_kept():
     assert not converted_layers(plain)
 
 
-def test_a_module_that_is_used_twice_is_converted_once():
-    shared = nn.Conv2d(3, 3, 1)
-    network = convert(nn.Sequential(shared, nn.ReLU(), shared), N)
-    assert network[0] is network[2]
-    assert len(converted_layers(network)) == 1
-
-
-def test_tied_weights_stay_tied():
-    plain = nn.Sequential(nn.Linear(4, 4), nn.Linear(4, 4))
-    plain[1].weight = plain[0].weight
-    network = convert(plain, N)
-    assert network[0].shared.weight is network[1].shared.weight
-    assert network[0].r is not network[1].r
-
-
 def test_weights_and_biases_are_copied():
     plain = nn.Sequential(nn.Conv2d(2, 3, 3), nn.BatchNorm2d(3), nn.Linear(4, 5, bias=False))
     network = convert(plain, N)
@@ -271,22 +216,6 @@ def test_weights_and_biases_are_copied():
     shapes = {key: tuple(value.shape) for key, value in network[0].state_dict().items()}
     assert shapes == {"r": (N, 2), "s": (N, 3), "bias": (N, 3), "shared.weight": (3, 2, 3, 3)}
     assert torch.equal(network[1].running_mean, plain[1].running_mean)
-
-
-@pytest.mark.parametrize(
-    ("network", "options", "message"),
-    [
-        (nn.Sequential(nn.BatchNorm2d(3), nn.ReLU()), {}, "nothing to convert"),
-        (convert(nn.Linear(3, 3), N), {}, "converted already"),
-        *[
-            (nn.Linear(3, 3), options, "need members >= 2")
-            for options in ({"members": 1}, {"init": "zeros"}, {"std": -1.0}, {"std": float("nan")})
-        ],
-    ],
-)
-def test_what_cannot_be_converted(network, options, message):
-    with pytest.raises(ValueError, match=message):
-        convert(network, **{"members": N, **options})
 
 
 class Standardised(nn.Conv2d):
@@ -302,44 +231,6 @@ def test_layers_that_compute_something_else_are_refused():
     ):
         with pytest.raises(TypeError, match=r"1.* cannot be converted"):
             convert(nn.Sequential(nn.Conv2d(3, 3, 1), layer), N)
-
-
-class HidesOne(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.seen = nn.Conv2d(3, 3, 1)
-        self.hidden = [nn.ReLU(), nn.Sequential(nn.Conv2d(3, 3, 1))]
-
-
-def test_a_layer_in_a_plain_list_only_is_refused():
-    with pytest.raises(ValueError, match=r"HidesOne\.hidden keeps a Sequential .* nn\.ModuleList"):
-        convert(HidesOne(), N)
-    network = HidesOne()
-    network.hidden.pop()
-    assert isinstance(convert(network, N).hidden[0], nn.ReLU)
-
-
-class Out:
-    """An object of one's own that holds a layer where no conversion looks."""
-
-    def __init__(self, layer):
-        self.layer = layer
-
-
-class KeepsOut(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.conv = nn.Conv2d(3, 3, 1)
-        self.out = Out(self.conv)
-
-    def forward(self, x):
-        return self.out.layer(x)
-
-
-def test_a_reference_that_no_conversion_can_see_fails_when_used():
-    network = convert(KeepsOut(), N)
-    with pytest.raises(AttributeError, match="weight"):
-        network(torch.zeros(1, 3, 2, 2))
 
 
 def test_fastdepth_and_monodepth2_are_converted_whole():
@@ -416,29 +307,6 @@ def test_a_batch_is_split_among_the_members(batch):
         torch.testing.assert_close(depth[b], ensemble.member(n)(x).depth[b], rtol=1e-12, atol=1e-12)
 
 
-def test_impossible_batches_and_members():
-    _, ensemble = tiny()
-    with pytest.raises(ValueError, match="batch of 2 cannot be split among 3"):
-        ensemble.distribution(images(2), repeat=False)
-    for call in (ensemble.member, ensemble.folded, lambda k: ensemble.distribution(images(), k)):
-        for n in (-1, N):
-            with pytest.raises(IndexError, match="from 0 to 2"):
-                call(n)
-
-
-def test_gradients_reach_the_shared_weights_and_the_member_in_turn_only():
-    _, ensemble = tiny()
-    ensemble.member(1).distribution(images()).depth.sum().backward()
-    reached = [layer for layer in converted_layers(ensemble) if layer.shared.weight.grad is not None]
-    assert len(reached) == len(converted_layers(ensemble)) - 1  # all but the variance's head
-    for layer in reached:
-        assert layer.shared.weight.grad.abs().sum() > 0
-        for value in (layer.r, layer.s, *([layer.bias] if layer.bias is not None else [])):
-            rows = value.grad.abs().sum(1)
-            assert rows[1] > 0
-            assert rows[0] == rows[2] == 0
-
-
 def test_gradients_are_those_of_the_formula():
     layer = convert(nn.Conv2d(4, 2, 3, groups=2).double(), 2, std=0.3)
     x = torch.randn(2, 4, 5, 5, dtype=torch.float64, requires_grad=True)
@@ -449,39 +317,6 @@ def test_gradients_are_those_of_the_formula():
         return torch.func.functional_call(layer, parameters, (x,))
 
     assert torch.autograd.gradcheck(call, (x, layer.r, layer.s, layer.bias, layer.shared.weight))
-
-
-def test_training_makes_members_differ_from_each_other_and_fits_them():
-    torch.manual_seed(0)
-    ensemble = BatchEnsemble(AleatoricNetwork(Tiny()), N, init="sign", generator=seeded())
-    x, target = torch.rand(12, 3, 6, 8), torch.full((12, 6, 8), 4.0)
-    optimiser = torch.optim.Adam(ensemble.parameters(), 0.03)
-    losses = []
-    for _ in range(60):
-        optimiser.zero_grad()
-        loss = (ensemble.distribution(x, repeat=False).depth - target).square().mean()
-        loss.backward()
-        optimiser.step()
-        losses.append(loss.item())
-    assert losses[-1] < 0.05 * losses[0]
-    depths = torch.stack([member(x).depth for member in ensemble.eval().all_members()])
-    assert (depths - 4).abs().mean() < 1
-    assert depths.std(0).min() > 0
-
-
-def test_factors_are_what_weight_decay_should_leave_alone():
-    _, ensemble = tiny()
-    layers = converted_layers(ensemble)
-    assert {id(f) for f in ensemble.factors()} == {id(f) for layer in layers for f in (layer.r, layer.s)}
-    assert len(ensemble.factors()) == 2 * len(layers)
-
-
-def test_a_member_costs_three_vectors_per_layer():
-    network, ensemble = tiny()
-    plain = sum(p.numel() for p in network.parameters())
-    own = sum(p[0].numel() for layer in converted_layers(ensemble) for p in (layer.r, layer.s))
-    biases = sum(layer.bias[0].numel() for layer in converted_layers(ensemble) if layer.bias is not None)
-    assert sum(p.numel() for p in ensemble.parameters()) == plain - biases + N * (own + biases)
 
 
 # ---- members as networks ----
@@ -516,20 +351,6 @@ def test_members_stay_one_when_they_are_moved(moved):
     assert networks[1](x).depth.device == device
     if device.type == "cpu":
         torch.testing.assert_close(networks[1](x).depth.double(), expected, rtol=1e-4, atol=1e-4)
-
-
-def test_a_state_dict_repeats_names_but_not_tensors():
-    _, ensemble = tiny(0)
-    networks = nn.ModuleList(ensemble.all_members())
-    state = networks.state_dict()
-    assert len(state) == N * len(ensemble.state_dict())
-    assert len({value.data_ptr() for value in state.values()}) <= len(ensemble.state_dict())
-    _, other = tiny(5)
-    target = nn.ModuleList(other.all_members())
-    target.load_state_dict(state)
-    x = images()
-    for ours, theirs in zip(networks, target, strict=True):
-        assert torch.equal(ours(x).depth, theirs(x).depth)
 
 
 def test_a_copy_or_pickle_has_its_own_selection():

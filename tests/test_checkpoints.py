@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -67,15 +66,6 @@ def test_other_programs_read_weights_and_metadata(tmp_path: Path) -> None:
         assert file.metadata() == {"metadata": '{"widths": [3, 2]}'}
 
 
-def test_tensors_that_share_memory(tmp_path: Path) -> None:
-    """Tied weights, transposed and expanded views are written as they read."""
-    base = torch.arange(6.0).reshape(2, 3)
-    state = {"a": base, "b": base, "t": base.mT, "e": base[:1].expand(4, 3)}
-    for name in FORMATS:
-        save_checkpoint(tmp_path / name, state)
-        assert same(load_state_dict_file(tmp_path / name), state)
-
-
 @pytest.mark.parametrize(
     "wrap",
     [
@@ -107,15 +97,6 @@ def test_a_part_called_model_keeps_its_name(tmp_path: Path) -> None:
     assert same(target.state_dict(), source.state_dict())
 
 
-def test_half_precision_fills_a_float32_network(tmp_path: Path) -> None:
-    source, target = Small().half(), Small()
-    save_checkpoint(tmp_path / "w.safetensors", source)
-    assert load_state_dict_file(tmp_path / "w.safetensors")["conv.weight"].dtype == torch.float16
-    load_weights(target, tmp_path / "w.safetensors")
-    assert target.conv.weight.dtype == torch.float32
-    assert torch.equal(target.conv.weight, source.conv.weight.float())
-
-
 def test_everything_that_does_not_fit_is_named_and_nothing_is_loaded(tmp_path: Path) -> None:
     state = dict(Small().state_dict())
     del state["conv.bias"]
@@ -139,12 +120,6 @@ def test_weights_that_are_not_finite(tmp_path: Path) -> None:
     state["conv.bias"][1] = float("nan")
     save_checkpoint(tmp_path / "w.pth", state)
     with pytest.raises(CheckpointError, match=r"w.pth does not fit .*1 with NaN or infinity: conv.bias"):
-        load_weights(Small(), tmp_path / "w.pth")
-
-
-def test_long_lists_of_keys_are_shortened(tmp_path: Path) -> None:
-    torch.save({f"k{i:02}": torch.zeros(1) for i in range(30)}, tmp_path / "w.pth")
-    with pytest.raises(CheckpointError, match=r"30 unexpected: k00, .*k07, \.\.\. \(22 more\)"):
         load_weights(Small(), tmp_path / "w.pth")
 
 
@@ -263,12 +238,6 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, name: str, monkeypat
         save_checkpoint(tmp_path / name, Small())
     assert [p.name for p in tmp_path.iterdir()] == [name]
     assert same(load_state_dict_file(tmp_path / name), old.state_dict())
-
-
-def test_written_files_are_as_readable_as_others(tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "w.pth", Small())
-    (tmp_path / "other").write_bytes(b"")
-    assert stat.S_IMODE((tmp_path / "w.pth").stat().st_mode) == stat.S_IMODE((tmp_path / "other").stat().st_mode)
 
 
 def test_weights_that_others_trained() -> None:

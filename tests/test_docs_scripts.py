@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ufmstar_torch import PosteriorConfig
+
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 # A camera of 70 degrees.
 K = np.array([[45.7, 0.0, 31.5], [0.0, 45.7, 23.5], [0.0, 0.0, 1.0]])
@@ -75,11 +77,13 @@ def test_the_tables_of_a_tour(script: Any, capsys: pytest.CaptureFixture[str]) -
 
 
 @pytest.mark.slow
-def test_a_faster_growth_of_the_posterior_variance_is_less_confident(script: Any) -> None:
+def test_a_constant_of_the_posterior_variance_leaves_the_depth(script: Any) -> None:
     """A tiny tour and the network that is made of the truth: the depth stays, the variance follows the constant."""
     posterior = script("measure_posterior")
-    taken = posterior.record("tour:1?frames=6&size=96x128", None, (posterior.DENSE, posterior.NEAR))
+    prepared = posterior.prepare("tour:1?frames=6&size=96x128", None)
     for kind in (posterior.DENSE, posterior.NEAR):
-        slow, fast = (posterior.figures(taken, kind, {"growth": value}) for value in (0.0, 1.0))
+        configs = (PosteriorConfig(unseen=value, prior_weight=1e6) for value in (0.0, 1.0))
+        rows = (posterior.figures(prepared, kind, config) for config in configs)
+        slow, fast = (dict(zip(posterior.FIGURES, row, strict=True)) for row in rows)
         assert fast["rmse"] == slow["rmse"] > 0
-        assert fast["overconfidence"] < slow["overconfidence"]
+        assert abs(fast["nll"] - slow["nll"]) > 0.01

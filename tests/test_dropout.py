@@ -7,7 +7,7 @@ import copy
 import pytest
 import torch
 from onnx_files import small_network
-from tiny_networks import Linear, constant_head
+from tiny_networks import Linear
 from torch import Tensor, nn
 from walks import SPGF
 
@@ -65,27 +65,6 @@ def test_when_it_acts() -> None:
     assert layer(x) is x
     assert DecoderDropout(0.0).train()(x) is x
     assert layer.state_dict() == {}
-
-
-@pytest.mark.parametrize("p", [-0.1, 1.0, float("nan")])
-def test_probability_in_range(p: float) -> None:
-    with pytest.raises(ValueError, match=r"probability in \[0, 1\)"):
-        DecoderDropout(p)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
-def test_keeps_the_type(dtype: torch.dtype) -> None:
-    layer = DecoderDropout(P)
-    set_sampling(layer, True, seeded())
-    assert layer(torch.ones(10, dtype=dtype)).dtype == dtype
-
-
-@pytest.mark.parametrize("network", [nn.Conv2d(1, 1, 1), Linear(), nn.Dropout(P)], ids=["none", "p = 0", "not ours"])
-def test_nothing_to_sample_is_an_error(network: nn.Module) -> None:
-    with pytest.raises(ValueError, match="has no decoder dropout"):
-        set_sampling(network, True)
-    with pytest.raises(ValueError, match="has no decoder dropout"):
-        MonteCarloDropout(AleatoricNetwork(Linear()))
 
 
 # --- moments -----------------------------------------------------------------------------------------
@@ -151,18 +130,6 @@ def test_aleatoric_variance_is_averaged_and_evidence_added() -> None:
         torch.testing.assert_close(together.epistemic_variance, between + own.mean(0))
 
 
-def test_batched_keeps_images_apart() -> None:
-    """Images of different depth in one batch: each pass's maps go back to their own image."""
-    backbone = Linear(weights=(1.0, 0.0), offset=0.0, dropout=1e-9)
-    network = AleatoricNetwork(backbone)
-    constant_head(network.head, (0.0,))
-    image = torch.arange(1.0, 4.0)[:, None, None, None].expand(3, 3, 4, 6).contiguous()
-    with torch.no_grad():
-        prediction = MonteCarloDropout(network, 5, batched=True).eval()(image)
-    torch.testing.assert_close(prediction.depth, image[:, 0])
-    torch.testing.assert_close(prediction.epistemic_variance, torch.zeros(3, 4, 6))
-
-
 # --- only the decoder ---------------------------------------------------------------------------------
 
 
@@ -194,34 +161,11 @@ def test_the_encoder_does_not_sample() -> None:
             assert torch.equal(network(image).depth, network(image).depth)
 
 
-def test_dropout_has_no_weights() -> None:
-    """The weights of a network without dropout load, and without sampling it is the same function."""
-    image = torch.rand(1, 3, 64, 64, generator=seeded(7))
-    with torch.no_grad():
-        assert torch.equal(with_dropout()(image).depth, small_network()(image).depth)
-        assert with_dropout(0.5).folded().dropouts[0].p == 0.5
-
-
 # --- both forms in UncertainDepth ---------------------------------------------------------------------
 
 CONFIG = UfMStarConfig(segment=SPGF)
 K = torch.tensor(scenes.intrinsics(64, 64))
 POSE = torch.tensor(scenes.tour(30)[0])
-
-
-def test_single_inference_form_is_one_pass_per_image() -> None:
-    backbone = with_dropout()
-    calls: list[int] = []
-    backbone.encoder[0].register_forward_hook(lambda *_: calls.append(1))
-    network = AleatoricNetwork(backbone)
-    image = torch.rand(1, 3, 64, 64, generator=seeded(8))
-    stream = UncertainDepth(MonteCarloDropout(network, generator=seeded(9)), CONFIG)
-    out = [stream(image, POSE, K) for _ in range(3)]
-    assert len(calls) == 3
-    assert not torch.equal(out[0].depth, out[1].depth)
-    assert out[0].prediction.epistemic_variance is None
-    repeated = UncertainDepth(MonteCarloDropout(network, generator=seeded(9)), CONFIG)
-    assert all(torch.equal(repeated(image, POSE, K).depth, o.depth) for o in out)
 
 
 def test_multi_inference_form_is_ten_passes() -> None:
@@ -242,22 +186,6 @@ def test_multi_inference_form_is_ten_passes() -> None:
     assert full.prediction.epistemic_variance is not None
     torch.testing.assert_close(full.prediction.epistemic_variance, baseline.epistemic_variance)
     assert float(full.prediction.epistemic_variance.mean()) > 0
-
-
-def test_training_and_arguments() -> None:
-    network = AleatoricNetwork(with_dropout())
-    wrapped = MonteCarloDropout(network).train()
-    image = torch.rand(2, 3, 64, 64, generator=seeded(12))
-    wrapped.distribution(image).depth.sum().backward()
-    assert all(p.grad is not None for name, p in network.named_parameters() if "head" not in name)
-    assert wrapped.preprocess is network.preprocess
-    with pytest.raises(ValueError, match="samples must be at least 1"):
-        MonteCarloDropout(network, 0)
-    with pytest.raises(TypeError, match="FastDepth is no UncertaintyNetwork"):
-        MonteCarloDropout(with_dropout()).distribution(image)
-    again = copy.deepcopy(MonteCarloDropout(network, generator=seeded(13)).eval())
-    with torch.no_grad():
-        assert again(image).depth.shape == (2, 64, 64)
 
 
 @pytest.mark.parametrize("kind", ["fastdepth", "monodepth2"])

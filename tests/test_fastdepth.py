@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from onnx import helper, numpy_helper
+from onnx import numpy_helper
 from onnx_files import Edit, edited, run_onnx, small_network, write_fastdepth
 from PIL import Image
 from shared_data import require_shared
@@ -66,40 +66,7 @@ def test_weights_and_operations_are_the_papers(widths: FastDepthWidths, weights:
     assert counted["macs"] == pytest.approx(macs, rel=0.01)
 
 
-def test_widths_that_cannot_be_added_are_refused() -> None:
-    full = FastDepthWidths.full()
-    with pytest.raises(ValueError, match=r"decoder\[1\] = 255 must equal encoder\[5\] = 256"):
-        FastDepthWidths(full.encoder, (512, 255, 128, 64, 32))
-    with pytest.raises(ValueError, match="encoder must be 14"):
-        FastDepthWidths(full.encoder[1:], full.decoder)
-    with pytest.raises(ValueError, match="decoder must be 5 positive"):
-        FastDepthWidths(full.encoder, (512, 256, 128, 64, 0))
-
-
-def test_widths_of_a_state_dict() -> None:
-    network = small_network()
-    assert FastDepthWidths.of_state_dict(network.state_dict()) == network.widths
-    with pytest.raises(ValueError, match=r"no 'decoder.4.pointwise.conv.weight' \(1 such"):
-        FastDepthWidths.of_state_dict({k: v for k, v in network.state_dict().items() if "decoder.4" not in k})
-
-
 SIZE, IMAGE = "multiples of 32 px", r"image must be floating-point \[B, 3, H, W\]"
-
-
-@pytest.mark.parametrize(
-    ("image", "message"),
-    [
-        (torch.zeros(1, 3, 240, 320), SIZE),
-        (torch.zeros(1, 3, 224, 230), SIZE),
-        (torch.zeros(1, 3, 0, 32), SIZE),
-        (torch.zeros(1, 1, 64, 64), IMAGE),
-        (torch.zeros(3, 64, 64), IMAGE),
-        (torch.zeros(1, 3, 64, 64, dtype=torch.uint8), IMAGE),
-    ],
-)
-def test_images_that_do_not_fit(image: Tensor, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        small_network()(image)
 
 
 # --- agreement with ONNX Runtime ---------------------------------------------------------------------
@@ -116,15 +83,6 @@ def test_published_weights_agree_with_onnx_runtime(network: FastDepth) -> None:
     expected = run_onnx(require_shared(WEIGHTS), image)[:, 0]
     assert float(depth.std()) > 0.1  # not a constant that agrees by itself
     torch.testing.assert_close(depth, expected, rtol=0, atol=2e-5)
-
-
-def test_published_weights_are_all_taken(network: FastDepth) -> None:
-    """As many tensors in the file as in the state_dict, with the same sum of absolute values."""
-    initialisers = onnx.load(str(require_shared(WEIGHTS))).graph.initializer
-    state = network.state_dict()
-    assert len(initialisers) == len(state) == 38 * 6
-    total = sum(float(np.abs(numpy_helper.to_array(t).astype(np.float64)).sum()) for t in initialisers)
-    assert sum(float(v.double().abs().sum()) for v in state.values()) == pytest.approx(total, rel=1e-12)
 
 
 @pytest.mark.parametrize("folded", [False, True])
@@ -189,27 +147,6 @@ def other_stride(model: onnx.ModelProto) -> None:
     next(a for a in stem.attribute if a.name == "strides").ints[:] = [1, 1]
 
 
-def other_activation(model: onnx.ModelProto) -> None:
-    node(model, "Relu", 2).op_type = "Sigmoid"
-
-
-def relu_for_relu6(model: onnx.ModelProto) -> None:
-    clip = node(model, "Clip", 3)
-    clip.op_type = "Relu"
-    bounds = list(clip.input[1:])
-    del clip.input[1:]
-    drop_weights(model, bounds)
-
-
-def other_clip(model: onnx.ModelProto) -> None:
-    six = next(t for t in model.graph.initializer if t.name == "encoder.1.depthwise/6")
-    six.CopyFrom(numpy_helper.from_array(np.array(5, np.float32), six.name))
-
-
-def swapped_skips(model: onnx.ModelProto) -> None:
-    node(model, "Add", 1).input[0] = "encoder.2.pointwise"
-
-
 def no_skip(model: onnx.ModelProto) -> None:
     add = node(model, "Add", 0)
     for n in model.graph.node:
@@ -217,21 +154,8 @@ def no_skip(model: onnx.ModelProto) -> None:
     model.graph.node.remove(add)
 
 
-def linear_upsampling(model: onnx.ModelProto) -> None:
-    next(a for a in node(model, "Resize", 0).attribute if a.name == "mode").s = b"linear"
-
-
-def threefold_upsampling(model: onnx.ModelProto) -> None:
-    scales = next(t for t in model.graph.initializer if t.name == "scales0")
-    scales.CopyFrom(numpy_helper.from_array(np.array([1, 1, 3, 3], np.float32), scales.name))
-
-
 def leftover_weight(model: onnx.ModelProto) -> None:
     model.graph.initializer.append(numpy_helper.from_array(np.ones(5, np.float32), "left_over"))
-
-
-def truncated_chain(model: onnx.ModelProto) -> None:
-    model.graph.output[0].name = model.graph.node[-2].output[0]
 
 
 def norm_after_some(model: onnx.ModelProto) -> None:
@@ -248,18 +172,9 @@ def without_last(model: onnx.ModelProto) -> None:
     drop_weights(model, [t.name for t in model.graph.initializer if t.name.startswith("head")])
 
 
-def weight_of_another_shape(model: onnx.ModelProto) -> None:
-    weight = next(t for t in model.graph.initializer if t.name == "encoder.3.depthwise.conv.weight")
-    weight.CopyFrom(numpy_helper.from_array(np.ones((4, 1, 5, 5), np.float32), weight.name))
-
-
 def not_finite(model: onnx.ModelProto) -> None:
     bias = next(t for t in model.graph.initializer if t.name == "decoder.2.pointwise.norm.bias")
     bias.CopyFrom(numpy_helper.from_array(np.full(bias.dims, np.nan, np.float32), bias.name))
-
-
-def second_input(model: onnx.ModelProto) -> None:
-    model.graph.input.append(helper.make_tensor_value_info("pose", onnx.TensorProto.FLOAT, [4, 4]))
 
 
 OTHER_FUNCTION = r"edited.onnx is not a FastDepth: its graph computes another depth from the same weights"
@@ -269,19 +184,10 @@ OTHER_FUNCTION = r"edited.onnx is not a FastDepth: its graph computes another de
     ("edit", "message"),
     [
         (other_stride, r"edited.onnx is not a FastDepth: output 'head' has \(128, 128\) px"),
-        (other_activation, OTHER_FUNCTION),
-        (relu_for_relu6, OTHER_FUNCTION),
-        (other_clip, OTHER_FUNCTION),
-        (swapped_skips, "Incompatible dimensions"),
         (no_skip, OTHER_FUNCTION),
-        (linear_upsampling, OTHER_FUNCTION),
-        (threefold_upsampling, "Incompatible dimensions"),
         (leftover_weight, r"initialiser 'left_over' \(5,\) is used by no layer"),
-        (truncated_chain, OTHER_FUNCTION),
         (norm_after_some, "batch norm after some convolutions only"),
-        (second_input, "must be the graph's only input"),
         (without_last, "edited.onnx is not a FastDepth: expected 38 convolutions, got 37"),
-        (weight_of_another_shape, r"1 of another shape: encoder.3.depthwise.conv.weight is \(4, 1, 5, 5\), expected"),
         (not_finite, "with NaN or infinity: decoder.2.pointwise.norm.bias"),
     ],
 )
@@ -291,34 +197,7 @@ def test_other_graphs_are_refused(tmp_path: Path, edit: Edit, message: str) -> N
         FastDepth.from_onnx(edited(good, tmp_path / "edited.onnx", edit))
 
 
-@pytest.mark.parametrize("kept", [0, 1, 100, 0.5, 0.999])
-def test_cut_off_files_are_named(tmp_path: Path, kept: float) -> None:
-    good = write_fastdepth(tmp_path / "good.onnx", small_network()).read_bytes()
-    broken = tmp_path / "broken.onnx"
-    broken.write_bytes(good[: int(kept * len(good)) if isinstance(kept, float) else kept])
-    with pytest.raises(ValueError, match=r"broken\.onnx"):
-        FastDepth.from_onnx(broken)
-
-
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"none\.onnx"):
-        FastDepth.from_onnx(tmp_path / "none.onnx")
-
-
 # --- real frames and training ------------------------------------------------------------------------
-
-
-def test_depth_of_real_frames(network: FastDepth) -> None:
-    """Out of distribution, but not wrong: over fr1/xyz the median frame has delta1 .48, .30 after a stretch
-    instead of the crop, .37 with red and blue exchanged."""
-    scores = []
-    with torch.inference_mode():
-        for image, truth in tum_frames(4):
-            depth = network(network.preprocess.apply_image(image)).depth
-            target = network.preprocess.apply_depth(truth)
-            right = (depth - target).abs() <= 0.25 * target
-            scores.append(float(right[target > 0].float().mean()))
-    assert 0.4 < float(np.median(scores)) < 0.7
 
 
 def test_fine_tuning_reaches_every_parameter() -> None:
@@ -342,14 +221,6 @@ def test_fine_tuning_reaches_every_parameter() -> None:
     assert int(counter) == 9  # one of them from small_network
 
 
-def test_fine_tuning_of_imported_weights(network: FastDepth) -> None:
-    """The counters and statistics of the published training are there, and go on from there."""
-    norms = [m for m in network.modules() if isinstance(m, nn.BatchNorm2d)]
-    assert len(norms) == 38
-    assert all(int(m.num_batches_tracked) > 50_000 for m in norms if m.num_batches_tracked is not None)
-    assert all(p.requires_grad for p in network.parameters())
-
-
 # --- for training from scratch -------------------------------------------------------------------------
 
 
@@ -365,12 +236,6 @@ def test_width_multiplier(multiplier: float, stem: int, last: int) -> None:
         assert scaled >= 0.9 * multiplier * exact
         assert scaled <= multiplier * exact + 8
     assert FastDepthWidths.scaled(1) == FastDepthWidths.full()
-
-
-@pytest.mark.parametrize("bad", [0.0, -1.0, float("inf"), float("nan")])
-def test_width_multiplier_must_be_positive(bad: float) -> None:
-    with pytest.raises(ValueError, match="width multiplier must be positive"):
-        FastDepthWidths.scaled(bad)
 
 
 @pytest.mark.parametrize("norm", [True, False])
@@ -390,10 +255,3 @@ def test_fastdepth_starts_in_a_room(positive: str, norm: bool) -> None:
     depth.sum().backward()
     gradient = sum(float(p.grad.abs().sum()) for p in network.head.parameters() if p.grad is not None)
     assert (gradient > 0) == (positive == "softplus")
-
-
-def test_fastdepth_arguments_are_checked() -> None:
-    with pytest.raises(ValueError, match=r"positive must be one of \['relu', 'softplus'\], got 'elu'"):
-        FastDepth(positive="elu")
-    with pytest.raises(ValueError, match="size must be multiples of 32"):
-        FastDepth(size=(224, 230))

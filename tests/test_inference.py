@@ -17,7 +17,6 @@ from shared_data import require_shared
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.load import NetworkChoice, network_source
-from ufmstar_torch.eval.run import machine
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.sequences import open_sequence
@@ -27,7 +26,6 @@ from ufmstar_torch.models import (
     FastDepthWidths,
     MonodepthResNet,
     OnnxNetwork,
-    load_network,
     save_trained,
     with_head,
 )
@@ -59,7 +57,7 @@ def frame(height: int = 60, width: int = 80) -> Frame:
 
 def predicted(model: str, file: Path, inference: Inference) -> tuple[Tensor, dict[str, Any]]:
     source = network_source(model, [file], inference=inference)
-    return source.one(frame(), 0).depth, {**source.runtime, "identity": source.identity}
+    return source.one(frame(), 0).maps.depth[0], {**source.runtime, "identity": source.identity}
 
 
 def test_onnx_weights_run_in_onnx_runtime_and_agree_with_torch(weights: Path) -> None:
@@ -76,24 +74,6 @@ def test_published_weights_agree_between_the_runtimes() -> None:
     weights = require_shared("weights/fastdepth_nyu.onnx")
     depth, expected = (predicted("fastdepth", weights, Inference(name, threads=1))[0] for name in ("onnx", "torch"))
     torch.testing.assert_close(depth, expected, rtol=1e-4, atol=1e-4)  # [m]; 2e-5 observed
-
-
-def test_threads_wait_without_spinning(weights: Path) -> None:
-    """As many as torch's where none are asked for."""
-    for threads, expected in ((None, torch.get_num_threads()), (2, 2)):
-        network = Inference(threads=threads).ready(load_network("fastdepth", weights), weights, CPU)
-        assert isinstance(network, OnnxNetwork)
-        options = network.session.get_session_options()
-        assert options.intra_op_num_threads == expected
-        assert options.get_session_config_entry("session.intra_op.allow_spinning") == "0"
-
-
-def test_a_run_leaves_a_core_to_reading_and_writing(monkeypatch: pytest.MonkeyPatch) -> None:
-    for cores, before, expected in ((2, 2, 1), (1, 1, 1), (4, 4, 3), (8, 2, 2)):
-        monkeypatch.setattr(machine, "available_cores", lambda cores=cores: cores)
-        torch.set_num_threads(before)
-        machine.share_threads()
-        assert torch.get_num_threads() == expected
 
 
 def test_without_onnx_runtime_torch_runs_and_says_so(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,13 +165,6 @@ def test_refusals(
             spec=spec if model == "onnx" else None,
             inference=Inference(**inference),
         )
-
-
-def test_impossible_settings() -> None:
-    with pytest.raises(ValueError, match="precision bf16 is torch's"):
-        Inference("onnx", "bf16")
-    with pytest.raises(ValueError, match=r"Inference.runtime must be one of \('auto', 'torch', 'onnx'\)"):
-        Inference("tensorrt")
 
 
 def test_a_resumed_run_is_the_same_and_needs_the_same_runtime(tmp_path: Path, weights: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import pickle
 import sys
 from pathlib import Path
@@ -202,46 +201,6 @@ def test_copies_and_pickles(tmp_path: Path, image: Tensor) -> None:
 # --- refusals ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["inverse", "disparity", "relative", "affine"])
-def test_depth_that_is_not_metric_is_refused(kind: str) -> None:
-    with pytest.raises(ValueError, match=f"declared '{kind}', but UfM\\* needs metric depth"):
-        OnnxSpec.from_dict({"outputs": {"kind": kind}})
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({}, r"OnnxSpec needs \['outputs'\]"),
-        ({"outputs": {}}, r"OutputSpec needs \['kind'\]"),
-        ({"outputs": {"kind": "meters"}}, "kind must be 'metric'"),
-        ({"outputs": {"kind": "metric", "unit": "mm"}}, r"no \['unit'\]"),
-        ({"outputs": {"kind": "metric", "scale": 0}}, r"scale must lie in \(0.0, inf\)"),
-        ({"outputs": {"kind": "metric", "aleatoric_kind": "sigma"}}, "aleatoric_kind must be one of"),
-        ({"outputs": {"kind": "metric", "epistemic_kind": "confidence"}}, "a confidence is no spread of depth"),
-        ({"outputs": {"kind": "metric"}, "inputs": "x"}, r"no \['inputs'\]"),
-        ({"outputs": {"kind": "metric"}, "layout": "CHW"}, "layout must be"),
-        ({"outputs": {"kind": "metric"}, "channels": "gray"}, "channels must be"),
-        ({"outputs": {"kind": "metric", "depth": 0}}, "must name ONNX outputs, got position 0"),
-        ({"outputs": {"kind": "metric"}, "preprocess": {"resize": 3}}, r"Preprocess has no \['resize'\]"),
-    ],
-)
-def test_wrong_specs(tmp_path: Path, values: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        OnnxSpec.from_dict(values)
-    file = tmp_path / "spec.json"
-    file.write_text(json.dumps(values))
-    with pytest.raises(ValueError, match=f"spec.json: .*{message}"):
-        OnnxSpec.from_json(file)
-
-
-@pytest.mark.parametrize(("text", "message"), [("{", "is not JSON"), ("[1]", "JSON object, got list")])
-def test_broken_spec_files(tmp_path: Path, text: str, message: str) -> None:
-    file = tmp_path / "spec.json"
-    file.write_text(text)
-    with pytest.raises(ValueError, match=f"spec.json .*{message}"):
-        OnnxSpec.from_json(file)
-
-
 def test_names_that_the_graph_does_not_have(tmp_path: Path) -> None:
     path = write(tmp_path / "n.onnx", spread="spread")
     with pytest.raises(ValueError, match=r"outputs are \['depth', 'spread'\]; declare which one is depth"):
@@ -322,18 +281,6 @@ def test_files_that_are_no_graphs(tmp_path: Path, content: bytes | None) -> None
         OnnxNetwork(path, OnnxSpec(METRIC))
     with pytest.raises(FileNotFoundError, match=r"none.onnx"):
         OnnxNetwork(tmp_path / "none.onnx", OnnxSpec(METRIC))
-
-
-def test_an_unknown_operator(tmp_path: Path) -> None:
-    nodes = [helper.make_node("DeepMagic", ["image"], ["depth"])]
-    path = save(tmp_path / "n.onnx", nodes, [], [("image", [1, 3, 6, 8])], [("depth", None)])
-    with pytest.raises(ValueError, match=r"n.onnx is not an ONNX file .*DeepMagic"):
-        OnnxNetwork(path, OnnxSpec(METRIC))
-
-
-def test_an_absent_provider(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"providers \['NoSuchProvider'\] are not available"):
-        OnnxNetwork(write(tmp_path / "n.onnx"), OnnxSpec(METRIC), providers=("NoSuchProvider",))
 
 
 def test_missing_packages_name_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

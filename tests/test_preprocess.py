@@ -8,7 +8,6 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from shared_data import require_shared
 from torch import Tensor
 
 from ufmstar_torch.camera import unproject
@@ -155,18 +154,6 @@ def test_nearest_source_pixel_is_within_half_a_pixel(size: tuple[int, int], pres
     assert (taken_v - wanted_v[:, None]).abs().max() <= 0.5 + 1e-6
 
 
-def test_masks_and_missing_depth_survive() -> None:
-    mask = torch.zeros(2, 480, 640, dtype=torch.bool)
-    mask[1, :240] = True
-    got = NYU.apply_depth(mask)
-    assert got.dtype == torch.bool
-    assert not got[0].any()
-    assert got[1, :112].all()
-    assert not got[1, 112:].any()
-    depth = torch.full((1, 480, 640), float("nan"))
-    assert NYU.apply_depth(depth).isnan().all()
-
-
 def test_bytes_and_floats_agree_and_are_scaled() -> None:
     image = torch.randint(0, 256, (2, 3, 300, 400), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     unit = NYU.apply_image(image)
@@ -176,74 +163,6 @@ def test_bytes_and_floats_agree_and_are_scaled() -> None:
     got = Preprocess.nyu(value_range=255.0, mean=mean, std=std).apply_image(image)
     for channel in range(3):
         torch.testing.assert_close(got[:, channel], (255 * unit[:, channel] - mean[channel]) / std[channel])
-
-
-def test_nothing_to_do_changes_nothing() -> None:
-    image, K = torch.rand(1, 3, 30, 50), camera(30, 50)
-    got, K_network = Preprocess()(image, K)
-    assert torch.equal(got, image)
-    assert torch.equal(K_network, K)
-    assert torch.equal(Preprocess().apply_depth(image[:, 0]), image[:, 0])
-
-
-@pytest.mark.parametrize(
-    ("image", "message"),
-    [
-        (torch.zeros(3, 480, 640), r"\[B, 3, H, W\]"),
-        (torch.zeros(1, 1, 480, 640), r"\[B, 3, H, W\]"),
-        (torch.zeros(1, 3, 480, 640, dtype=torch.int64), "uint8 or floating-point"),
-        (torch.full((1, 3, 480, 640), 255.0), r"must lie in \[0, 1\], got \[255, 255\]"),
-        (torch.full((1, 3, 480, 640), float("nan")), r"must lie in \[0, 1\]"),
-        (torch.zeros(1, 3, 0, 640), "at least one pixel"),
-    ],
-)
-def test_wrong_images(image: Tensor, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        NYU.apply_image(image)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"crop": [228, 304], "sise": [224, 224]}, r"no \['sise'\]"),
-        ({"crop": [0, 3]}, "crop must be"),
-        ({"size": [3]}, "size must be"),
-        ({"resize_height": 0}, r"resize_height must lie in \[1, inf\]"),
-        ({"value_range": 0.0}, r"value_range must lie in \(0.0, inf\]"),
-        ({"std": [1.0, 0.0, 1.0]}, "std positive"),
-        ({"mean": [1.0]}, "3 numbers"),
-    ],
-)
-def test_wrong_settings(values: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Preprocess.from_dict(values)
-
-
-def test_crop_larger_than_the_image() -> None:
-    with pytest.raises(ValueError, match=r"crop \(228, 304\) must fit.*200 x 400"):
-        Preprocess(crop=(228, 304)).geometry(200, 400)
-
-
-def test_intrinsics_shape() -> None:
-    with pytest.raises(ValueError, match=r"intrinsics must be \[B, 3, 3\]"):
-        NYU.apply_intrinsics(torch.eye(4)[None], 480, 640)
-
-
-def test_json_round_trip() -> None:
-    import json
-
-    assert Preprocess.from_dict(json.loads(json.dumps(NYU.to_dict()))) == NYU
-
-
-def test_ground_truth_of_a_real_frame_keeps_its_statistics() -> None:
-    """TUM depth through the crop: holes stay holes (0), values stay among the sensor's."""
-    file = sorted((require_shared("data/rgbd_dataset_freiburg1_xyz") / "depth").glob("*.png"))[0]
-    depth = torch.from_numpy(np.array(Image.open(file)).astype(np.float32) / 5000)[None]
-    carried = NYU.apply_depth(depth)
-    assert carried.shape == (1, 224, 224)
-    assert set(carried.unique().tolist()) <= set(depth.unique().tolist())
-    inside = depth[0, 21:459, 27:611]  # the crop in the original
-    assert float((carried == 0).float().mean()) == pytest.approx(float((inside == 0).float().mean()), abs=0.005)
 
 
 @pytest.mark.parametrize("size", [(480, 640), (375, 1242), (100, 120)])

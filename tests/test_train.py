@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +14,6 @@ from shared_data import require_shared
 from trainings import RECIPE, SPEC, logged, scenes, tiny_job, with_network, write_frames
 
 from ufmstar_torch import cli
-from ufmstar_torch.eval.commands.options import parse, parser_of
 from ufmstar_torch.models import (
     CheckpointError,
     MonodepthResNet,
@@ -27,21 +26,14 @@ from ufmstar_torch.models import (
 from ufmstar_torch.models.batch_layer import BatchLayer
 from ufmstar_torch.models.checkpoints import read_safetensors
 from ufmstar_torch.train import (
-    AugmentationConfig,
-    DataConfig,
-    FitSettings,
     NonFiniteLossError,
     Recipe,
     TrainingModule,
-    preset,
     starting_network,
 )
-from ufmstar_torch.train.command import TrainOptions
 from ufmstar_torch.train.examples import camera_image
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.member import WEIGHTS, make_data, new_network
-from ufmstar_torch.train.presets import table
-from ufmstar_torch.train.start import train_only
 
 ONE_STEP = replace(RECIPE, max_steps=1)
 
@@ -146,13 +138,6 @@ def test_every_method_trains(frames, tmp_path, network):
     assert len(load_trained(tmp_path / "out" / WEIGHTS)) == network.get("members", 1)
 
 
-@pytest.mark.slow
-def test_a_resnet_trains(frames, tmp_path):
-    network = NetworkSpec(architecture="monodepth2", layers=18, size=(64, 64), preprocess="resize")
-    summary = fit(tiny_job(frames, tmp_path / "out", replace(ONE_STEP, network=network, average=0.0)))
-    assert math.isfinite(summary["members"][0]["figures"]["val_nll"])
-
-
 def test_bfloat16_trains_and_its_loss_is_in_single_precision(frames, tmp_path):
     """The loss of the first step: later ones depend on the weights that the earlier ones reached."""
     recipe = replace(ONE_STEP, average=0.0)
@@ -185,23 +170,6 @@ def test_a_split_batch_trains_every_member_on_its_own_images(frames, tmp_path):
         (gradient,) = torch.autograd.grad(own.sum(), factor, retain_graph=True)
         assert [bool(row.any()) for row in gradient] == [n == 0, n == 1]
     fit(tiny_job(frames, tmp_path / "out", replace(recipe, epochs=1, max_steps=1)))
-    with pytest.raises(ValueError, match=r"no more members than batch_size, got 2 and 1"):
-        replace(recipe, batch_size=1)
-    with pytest.raises(ValueError, match="split_batch needs a batch_ensemble"):
-        replace(RECIPE, split_batch=True)
-
-
-@pytest.mark.parametrize("network", [{"method": "evidential"}, {"method": "batch_ensemble", "members": 2}])
-def test_heads_at_four_scales_train_and_are_stored(frames, tmp_path, network):
-    """The loss of every scale counts; the stored network predicts with the finest."""
-    recipe = replace(with_network(RECIPE, **network, head_scales=4), epochs=1, max_steps=1)
-    module = TrainingModule(build_network(recipe.network), recipe, 10)
-    image = torch.rand(3, 3, *recipe.network.size, generator=torch.Generator().manual_seed(0))
-    assert len(module._distribution(image).depth) == 3 * 4 * recipe.network.members
-    assert module.network(image).depth.shape == (3, *recipe.network.size)
-    fit(tiny_job(frames, tmp_path / "out", recipe))
-    for trained in load_trained(tmp_path / "out" / "trained.safetensors"):
-        assert trained(image).depth.shape == (3, *recipe.network.size)
 
 
 @pytest.mark.parametrize("average", [0.0, 0.9])
@@ -296,14 +264,6 @@ def test_a_trained_file_is_a_start(tmp_path):
         starting_network(SPEC, tmp_path / "none.safetensors")
 
 
-def test_an_aleatoric_start_of_mc_dropout_keeps_its_head(tmp_path):
-    path = tmp_path / "start.safetensors"
-    network = build_network(SPEC)
-    save_trained(path, network, SPEC)
-    started = starting_network(replace(SPEC, method="mc_dropout", dropout=0.2), path)
-    assert all(torch.equal(started.state_dict()[key], value) for key, value in network.state_dict().items())
-
-
 @pytest.mark.parametrize("architecture", ["fastdepth", "monodepth2"])
 def test_a_batch_ensemble_starts_from_weights_and_near_them(tmp_path, architecture):
     plain = SPEC if architecture == "fastdepth" else NetworkSpec("monodepth2", layers=18, strides="v1", size=(64, 64))
@@ -386,13 +346,6 @@ def test_only_the_named_part_is_trained(frames, tmp_path):
     assert {".".join(key.split(".")[:3]) for key in changed} == {"head.weight", "head.bias", "backbone.decoder.4"}
 
 
-def test_a_part_that_is_not_there_is_named():
-    network = build_network(SPEC)
-    with pytest.raises(ValueError, match=r"no parameter begins with 'tail'; expected one of backbone\.decoder, "):
-        train_only(network, ["head", "tail"])
-    assert train_only(network, ["head"]) == sum(p.numel() for p in network.head.parameters())
-
-
 # ---- pictures ----
 
 
@@ -412,11 +365,6 @@ def words(frames, out, *more):
     base += ["--part", "0:12", "--validation-part", "12:16", "--network.size", "[32,32]", "--network.widths", "0.05"]
     base += ["--accelerator", "cpu", "--batch-size", "4", "--examples", "0", "--no-tensorboard", "--no-progress"]
     return [*base, *more]
-
-
-def test_the_list_of_presets(ufmstar):
-    code, out, err = ufmstar("train", "--list")
-    assert (code, out, err) == (0, table() + "\n", "")
 
 
 def test_a_training_by_command(ufmstar, frames, tmp_path):
@@ -443,15 +391,11 @@ def test_a_stopped_training_says_how_to_go_on(ufmstar, frames, tmp_path):
     ("more", "told"),
     [
         (["--epochs", "0"], r"Recipe\.epochs must lie in \[1"),
-        (["--epochs", "two"], r"epochs"),
         (["--learning-speed", "2"], r"[Uu]nrecognized arguments: --learning-speed 2"),
-        (["--network.widths", "wide"], r"NetworkSpec\.widths must be"),
-        (["--augment.flip", "2"], r"AugmentationConfig\.flip must lie in \[0, 1\]"),
         (["--resume", "--overwrite"], "contradict each other"),
         (["--data", "tour"], "--data tour takes no --root"),
         (["--preset", "resnet"], "preset"),
         (["--threads", "0"], "--threads must be at least 1"),
-        (["--strategy", "ddp_spawn"], "must start processes as scripts"),
     ],
 )
 def test_mistakes_are_one_line(ufmstar, frames, tmp_path, more, told):
@@ -461,43 +405,3 @@ def test_mistakes_are_one_line(ufmstar, frames, tmp_path, more, told):
     assert err.count("\n") == 1
     assert re.search(told, err)
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("missing", ["--preset", "--data", "--out"])
-def test_what_is_missing_is_named(ufmstar, frames, tmp_path, missing):
-    line = words(frames, tmp_path / "out")
-    at = line.index(missing)
-    code, _, err = ufmstar(*line[:at], *line[at + 2 :])
-    assert code == 2
-    assert f"{missing} is missing" in err or missing == "--data"
-
-
-def test_a_file_may_hold_the_options(tmp_path):
-    file = tmp_path / "train.yaml"
-    file.write_text("preset: fastdepth-ensemble\nmembers: 3\nlearning_rate: 0.002\nnetwork: {widths: 0.5}\n")
-    recipe = parse(TrainOptions, ["--config", str(file), "--epochs", "7"], "ufmstar train").recipe()
-    expected = replace(preset("fastdepth-ensemble"), members=3, learning_rate=0.002, epochs=7)
-    assert recipe == replace(expected, network=replace(expected.network, widths=0.5))
-    file.write_text("preset: fastdepth-ensemble\nlearning_speed: 2\n")
-    with pytest.raises(ValueError, match="learning_speed"):
-        parse(TrainOptions, ["--config", str(file)], "ufmstar train")
-
-
-@pytest.mark.parametrize(
-    ("config", "prefix", "without"),
-    [
-        (Recipe, "", {"network"}),
-        (NetworkSpec, "network.", {"members"}),
-        (DataConfig, "", {"kind", "paths", "batch_size", "seed", "augmentation"}),
-        (AugmentationConfig, "augment.", set()),
-        (FitSettings, "", {"progress", "tensorboard"}),
-    ],
-)
-def test_every_value_has_an_option_with_its_meaning(config, prefix, without):
-    actions = {
-        word: action for action in parser_of(TrainOptions, "ufmstar train")._actions for word in action.option_strings
-    }
-    names = [f.name if prefix else f.name.replace("_", "-") for f in fields(config) if f.name not in without]
-    for name in names:
-        assert len(actions[f"--{prefix}{name}"].help) > 8, name
-    assert actions["--beta1"].help.startswith("Adam's first momentum")

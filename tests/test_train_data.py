@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import pickle
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +11,6 @@ import torch
 from layouts import truth, write_generic
 from training_data import PLAIN, TINY, Numbered, loader, numbers, nyu_frame, truncated, write_nyu
 
-from ufmstar_torch.models import Preprocess
 from ufmstar_torch.train import (
     Augmentation,
     AugmentationConfig,
@@ -40,14 +38,6 @@ def test_a_sample_is_what_the_network_and_the_losses_take():
         torch.float32, torch.float32, torch.bool, torch.float64,
     ]  # fmt: skip
     assert np.isnan(raw.depth[0, 2])  # the frame is left as it was
-
-
-def test_normalised_networks_get_normalised_images():
-    """The augmentation sees the image before the network's mean and deviation, so colours stay in [0, 1] for it."""
-    preprocess = Preprocess(mean=(0.4, 0.5, 0.6), std=(0.2, 0.2, 0.25))
-    raw = RawSample(np.full((3, 6, 8), 204, np.uint8), np.ones((6, 8), np.float32), np.eye(3))
-    image = make_sample(raw, preprocess, None, (0, 0, 0))["image"]
-    torch.testing.assert_close(image[:, 0, 0], torch.tensor([2.0, 1.5, 0.8]))
 
 
 def test_epoch_and_index_decide_the_augmentation():
@@ -84,30 +74,9 @@ def test_skipping_takes_the_next_good_frame_whatever_came_before(order, caplog):
     assert "frame-2: torn" in caplog.text
 
 
-def test_a_replaced_frame_does_not_count_twice_in_validation():
-    dataset = SampleDataset(Numbered(4, broken=(1,)), PLAIN, on_bad_file="skip", evaluate=True)
-    assert [bool(dataset[i]["valid"].any()) for i in range(4)] == [True, False, True, True]
-    assert SampleDataset(Numbered(4, broken=(1,)), PLAIN, on_bad_file="skip")[1]["valid"].all()
-
-
 def test_no_good_frame_at_all():
     with pytest.raises(SampleError, match="all others of 3 files are broken"):
         SampleDataset(Numbered(3, broken=(0, 1, 2)), PLAIN, on_bad_file="skip")[1]
-
-
-def test_dataset_arguments_are_checked():
-    with pytest.raises(ValueError, match="on_bad_file"):
-        SampleDataset(Numbered(3), PLAIN, on_bad_file="ignore")
-    with pytest.raises(ValueError, match="at least one frame"):
-        SampleDataset(Numbered(0), PLAIN)
-    for index in (3, -1):
-        with pytest.raises(IndexError, match=r"\[0, 3\)"):
-            SampleDataset(Numbered(3), PLAIN)[index]
-
-
-def test_errors_survive_the_way_from_a_worker():
-    error = pickle.loads(pickle.dumps(SampleError("a.h5", "torn")))
-    assert (error.name, error.reason, str(error)) == ("a.h5", "torn", "a.h5: torn")
 
 
 @pytest.fixture(scope="module")
@@ -149,18 +118,6 @@ def test_parts_must_not_overlap(tmp_path):
         module(tmp_path, paths=(str(path),), validation_paths=(str(other), str(other / ".." / "walk")), **overlapping)
     apart = module(tmp_path, paths=(str(path),), validation_paths=(str(other),), **overlapping)
     assert apart.validation_set.source.name(0) == "other/12"
-
-
-def test_nyu_and_tours_as_data_modules(tmp_path, tours):
-    data = module(tmp_path, kind="nyu", paths=(str(write_nyu(tmp_path / "nyu")),), preprocess=Preprocess(size=(32, 40)))
-    assert (len(data.train_set), len(data.validation_set)) == (6, 3)
-    assert data.train_set[0]["image"].shape == (3, 32, 40)
-    folder, frames = tours
-    tiny = {"tour_frames": 3, "tour_stride": 4, "tour_size": (24, 32), "first_tour": 5, "cache": str(folder)}
-    data = module(tmp_path, tours=1, validation_tours=1, batch_size=3, **tiny)
-    assert data.train_set.source.seeds == (5,)
-    assert data.validation_set.source.seeds == (6,)
-    np.testing.assert_array_equal(data.validation_set[1]["depth"].numpy(), frames.load(4).depth)
 
 
 def test_a_data_module_gives_each_process_its_share_and_tells_broken_files(tmp_path):
@@ -210,39 +167,3 @@ def test_lightning_walks_through_the_epochs(tmp_path):
         batches.set_epoch(epoch)
         expected += [key.frame for batch in batches for key in batch]
     assert recorder.seen == expected
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"kind": "kitti"},
-        {"on_bad_file": "ignore"},
-        {"batch_size": 0},
-        {"workers": -1},
-        {"seed": -1},
-        {"tours": 0},
-        {"batch_size": 2.5},
-        {"paths": ("x",)},
-        {"kind": "nyu"},
-        {"kind": "nyu", "paths": ("a", "b")},
-        {"kind": "sequences"},
-        {"validation_paths": ("x",)},
-        {"part": "70"},
-        {"validation_part": "90%:80%"},
-    ],
-    ids=str,
-)
-def test_impossible_data_are_named(wrong):
-    field = {"nyu": "paths", "sequences": "paths"}.get(wrong.get("kind"), next(iter(wrong)))
-    with pytest.raises(ValueError, match=f"DataConfig.{field}"):
-        DataConfig(**wrong)
-
-
-def test_the_config_goes_through_json():
-    import json
-
-    config = DataConfig(kind="sequences", paths=("a", "b"), augmentation=AugmentationConfig(scale=(1.0, 1.2)))
-    assert DataConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
-    assert DataConfig.from_dict({"augmentation": None}).augmentation is None
-    with pytest.raises(ValueError, match="shuffle"):
-        DataConfig.from_dict({"shuffle": True})

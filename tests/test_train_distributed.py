@@ -18,7 +18,6 @@ import torch
 from trainings import RECIPE, logged, tiny_job, with_network, write_frames
 
 from ufmstar_torch.models.checkpoints import read_safetensors
-from ufmstar_torch.train import FitSettings
 from ufmstar_torch.train.ensemble import share_of_time
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.member import WEIGHTS, make_data
@@ -173,17 +172,6 @@ def test_the_processes_above_had_unequal_numbers_of_valid_pixels(frames, tmp_pat
 def test_a_batch_that_cannot_be_divided_is_refused(frames, tmp_path):
     with pytest.raises(ValueError, match="batch_size 4 must be a multiple of the 3 processes"):
         make_data(tiny_job(frames, tmp_path, PLAIN), 0, 3)
-
-
-def test_settings_that_cannot_be(tmp_path):
-    for values, message in [
-        ({"strategy": "ddp_spawn"}, "'ddp', not 'ddp_spawn'"),
-        ({"member_processes": 2, "devices": 2}, "goes with devices = 1"),
-        ({"log_every": 0}, r"log_every must lie in \[1"),
-        ({"max_minutes": float("nan")}, "max_minutes must be a number"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            FitSettings(out=tmp_path, **values)
 
 
 @pytest.mark.slow

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,12 +10,11 @@ import pytest
 import torch
 from torch import nn
 
-from ufmstar_torch.models import build_network
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.train import PRESETS, DataConfig, FitSettings, Job, Recipe, preset
 from ufmstar_torch.train.member import new_network
-from ufmstar_torch.train.module import move_average, share_of_rate, step_seed
-from ufmstar_torch.train.presets import OURS, table
+from ufmstar_torch.train.module import move_average, share_of_rate
+from ufmstar_torch.train.presets import OURS
 from ufmstar_torch.train.progress import Sums, Validation
 
 
@@ -35,48 +32,6 @@ def test_every_method_of_the_paper_is_a_preset_of_both_architectures():
         assert recipe.network.dropout == 0.2
         assert max(recipe.members, recipe.network.members) == (10 if "ensemble" in name else 1)
         assert recipe.learning_rate == OURS[recipe.network.architecture]["learning_rate"]
-
-
-def test_the_table_has_a_row_for_every_preset():
-    text, sources = table().split("\n\n")
-    lines = text.splitlines()
-    assert [line.split()[0] for line in lines] == ["preset", *PRESETS]
-    assert re.search("From the paper .*size, epochs, .*Ours, .*learning rate", sources, re.DOTALL)
-    row = dict(zip(re.split(r"\s{2,}", lines[0]), re.split(r"\s{2,}", lines[6]), strict=True))
-    assert (row["preset"], row["members"], row["learning rate"]) == ("monodepth2-batch-ensemble", "10", "0.0001 cosine")
-
-
-def test_the_demo_fits_into_six_megabytes():
-    recipe = preset("demo")
-    numbers = sum(value.numel() for value in build_network(recipe.network).state_dict().values())
-    assert recipe.half
-    assert 3 <= recipe.members <= 4
-    # Half precision, with some room for the tensors that it cannot hold and for what the file says of itself.
-    assert 2.1 * numbers * recipe.members < 6e6
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_recipes_survive_json(name):
-    assert Recipe.from_dict(json.loads(json.dumps(PRESETS[name].to_dict()))) == PRESETS[name]
-
-
-@pytest.mark.parametrize(
-    ("values", "told"),
-    [
-        ({"epoch": 3}, r"Recipe has no \['epoch'\]"),
-        ({"epochs": 0}, r"Recipe\.epochs must lie in \[1"),
-        ({"epochs": 2.5}, r"Recipe\.epochs must be a whole number"),
-        ({"learning_rate": 0}, r"Recipe\.learning_rate must lie in \(0"),
-        ({"learning_rate": float("nan")}, r"Recipe\.learning_rate must be a number"),
-        ({"beta2": 1.0}, r"Recipe\.beta2 must lie in \[0, 1\)"),
-        ({"schedule": "linear"}, r"Recipe\.schedule must be one of \('cosine', 'constant'\)"),
-        ({"network": {"width": 2}}, r"NetworkSpec has no \['width'\]"),
-        ({"network": {"method": "batch_ensemble", "members": 4}, "members": 2}, r"members must be 1 for a batch"),
-    ],
-)
-def test_impossible_recipes_are_named(values, told):
-    with pytest.raises(ValueError, match=told):
-        Recipe.from_dict(values)
 
 
 def test_members_are_the_ensembles_or_the_batch_ensembles():
@@ -105,12 +60,6 @@ def test_the_learning_rate_rises_and_falls_as_a_cosine():
     assert rates[4:] == pytest.approx([(1 + math.cos(math.pi * n / 20)) / 2 for n in range(20)])
     assert share_of_rate(30, 24, recipe) == 0
     assert share_of_rate(1000, 24, replace(recipe, schedule="constant")) == 1
-
-
-def test_seeds_of_steps_differ():
-    seeds = {step_seed(s, rank, step) for s in range(4) for rank in range(4) for step in range(-1, 200)}
-    assert len(seeds) == 4 * 4 * 201
-    assert all(0 <= seed < 2**63 for seed in seeds)
 
 
 def test_the_running_mean_is_the_one_by_hand():
@@ -153,16 +102,3 @@ def test_the_yardstick_is_the_likelihood_of_one_variance():
     assert best <= min(constants)
     alone.update(DepthPrediction(predicted), depth, valid)
     assert "val_nll" not in alone.figures(Sums())
-
-
-def test_invalid_pixels_count_for_nothing():
-    depth = torch.tensor([[[1.0, 0.0, float("nan"), 2.0]]])
-    valid = torch.tensor([[[True, True, True, False]]])
-    prediction = DepthPrediction(torch.tensor([[[1.5, 9.0, 9.0, 9.0]]]), torch.ones(1, 1, 4))
-    validation = Validation()
-    validation.update(prediction, depth, valid)
-    figures = validation.figures(Sums())
-    assert (figures["val_rmse"], figures["val_nll"]) == (0.5, pytest.approx(0.125 + math.log(2 * math.pi) / 2))
-    validation = Validation()
-    validation.update(prediction, depth, ~valid & (depth > 5))
-    assert validation.figures(Sums()) == {}

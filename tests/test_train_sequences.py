@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import pickle
 import shutil
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from layouts import write_generic, write_scannet, write_tum
 from training_data import PLAIN, TINY, truncated
 
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.sequences.generic import open_unposed
-from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.train import SampleDataset, SampleError, SequenceFrames, TourSettings, tour_frames
 from ufmstar_torch.train.data_config import Part
 from ufmstar_torch.train.sequence_data import open_rgbd
@@ -40,28 +35,6 @@ from ufmstar_torch.train.tour_data import TourFrames, tour_files
 def test_parts_of_a_sequence(text, length, expected):
     assert Part.parse(text).frames(length) == expected
     assert Part.parse(str(Part.parse(text))) == Part.parse(text)
-
-
-@pytest.mark.parametrize("text", ["", "5", "0:70:90", "a:b", "-5:10", "0:120%", "50%:20%", "7:7", "1.5:3", "0.5:0.7"])
-def test_what_is_no_part_is_named(text):
-    with pytest.raises(ValueError, match="a part must"):
-        Part.parse(text)
-
-
-def test_an_empty_part_is_named():
-    with pytest.raises(ValueError, match="50:60 of 20 frames is empty"):
-        Part.parse("50:60").frames(20)
-
-
-@given(length=st.integers(1, 5000), edge=st.integers(1, 99))
-def test_two_parts_that_meet_divide_every_sequence(length, edge):
-    covered = []
-    for text in (f"0:{edge}%", f"{edge}%:100%"):
-        try:
-            covered += list(Part.parse(text).frames(length))
-        except ValueError:
-            continue
-    assert covered == list(range(length))
 
 
 def test_frames_of_a_sequence_are_the_readers(tmp_path):
@@ -131,37 +104,6 @@ def test_images_and_depth_without_poses(tmp_path):
     np.testing.assert_allclose(unposed.load(0).intrinsics, scene.K)
 
 
-def test_a_tum_recording_without_its_trajectory(tmp_path):
-    """Names are timestamps that differ between image and depth, and depth is in 1/5000 m."""
-    path, *_ = write_tum(tmp_path)
-    posed = open_sequence(path)
-    (path / "groundtruth.txt").unlink()
-    with pytest.raises(ValueError, match="pass intrinsics"):
-        open_rgbd(path)
-    np.savetxt(path / "K.txt", posed.intrinsics)
-    unposed = open_rgbd(path)
-    for frame in posed:
-        if frame.depth is not None:
-            same = unposed[unposed.names.index(frame.name)]
-            np.testing.assert_array_equal(same.depth, frame.depth)
-
-
-def test_what_is_missing_in_an_unposed_folder_is_named(tmp_path):
-    path, scene = write_generic(tmp_path)
-    (path / "poses.txt").unlink()
-    shutil.move(path / "K.txt", tmp_path / "K.txt")
-    with pytest.raises(ValueError, match="pass intrinsics"):
-        open_unposed(path, Options())
-    np.testing.assert_allclose(open_unposed(path, Options(intrinsics=tmp_path / "K.txt")).intrinsics, scene.K)
-    for i, file in enumerate(sorted((path / "depth").iterdir())):
-        file.rename(file.with_name(f"map{i + 500}.png"))
-    with pytest.raises(ValueError, match=r"no depth map .* is named like"):
-        open_unposed(path, Options(intrinsics=tmp_path / "K.txt"))
-    shutil.rmtree(path / "depth")
-    with pytest.raises(ValueError, match="must hold one of"):
-        open_unposed(path, Options(intrinsics=tmp_path / "K.txt"))
-
-
 @pytest.fixture(scope="module")
 def tours(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cache")
@@ -220,19 +162,3 @@ def test_a_truncated_cache_file_is_named(tours, tmp_path):
     with pytest.raises(SampleError, match=r"5\.image\.npy\[1\]"):
         copy.load(1)
     np.testing.assert_array_equal(copy.load(3).depth, frames.load(3).depth)
-
-
-def test_pickled_tours_map_their_files_anew(tours):
-    _, frames = tours
-    frames.load(0)
-    packed = pickle.dumps(frames)
-    assert len(packed) < 2000
-    np.testing.assert_array_equal(pickle.loads(packed).load(0).depth, frames.load(0).depth)
-
-
-def test_impossible_tours_are_named(tmp_path):
-    for wrong in ({"frames": 0}, {"stride": 0}, {"size": (4, 32)}, {"fov": 170.0}, {"style": "castle"}):
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            TourSettings(**wrong)
-    with pytest.raises(ValueError, match="seeds"):
-        tour_frames([], TINY, tmp_path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import pickle
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +32,6 @@ from ufmstar_torch.models import (
     save_trained,
     set_sampling,
 )
-from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.trained import load_for_training
 from ufmstar_torch.pipeline import combine
@@ -111,20 +109,6 @@ def test_what_was_saved_is_loaded_bit_for_bit(tmp_path, image, method, lazy):
     assert stored.info == {"command": "ufmstar train", "nll": 0.25}
 
 
-def test_the_kinds_of_networks_that_are_loaded(tmp_path, image):
-    kinds = {}
-    for method in SPECS:
-        file = tmp_path / f"{method}.safetensors"
-        save_trained(file, trained(spec_of(method), 1), spec_of(method))
-        kinds[method] = load_trained(file)
-    dropout = kinds["mc_dropout"][0]
-    assert isinstance(dropout, MonteCarloDropout)
-    assert not torch.equal(dropout(image).depth, dropout(image).depth)
-    members = kinds["batch_ensemble"]
-    assert all(isinstance(member, BatchEnsembleMember) for member in members)
-    assert len({id(member.ensemble) for member in members}) == 1
-
-
 def test_a_sampling_network_is_saved_as_what_it_wraps(tmp_path, image):
     spec = spec_of("mc_dropout")
     (network,) = trained(spec, 1)
@@ -143,24 +127,6 @@ def test_an_ensemble_of_several_files(tmp_path, image):
         assert torch.equal(predict(restored, image), predict(original, image))
 
 
-def test_loading_leaves_the_callers_random_numbers_alone(tmp_path):
-    save_trained(tmp_path / "n.safetensors", trained(spec_of("batch_ensemble"), 1), spec_of("batch_ensemble"))
-    before = torch.get_rng_state()
-    load_trained(tmp_path / "n.safetensors")
-    assert torch.equal(torch.get_rng_state(), before)
-
-
-def test_saving_and_loading_change_no_network(tmp_path, image):
-    (network,) = trained(spec_of(), 1)
-    before, expected = copy.deepcopy(network.state_dict()), predict(network, image)
-    save_trained(tmp_path / "n.safetensors", network, spec_of(), half=True)
-    with torch.no_grad():
-        for parameter in load_trained(tmp_path / "n.safetensors")[0].parameters():
-            parameter.zero_()
-    assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())
-    assert torch.equal(predict(network, image), expected)
-
-
 def test_training_goes_on_from_a_file(tmp_path, image):
     spec = spec_of("batch_ensemble")
     networks = trained(spec)
@@ -171,17 +137,6 @@ def test_training_goes_on_from_a_file(tmp_path, image):
     for restored, original in zip(again, networks, strict=True):
         state = original.state_dict()
         assert all(torch.equal(value, state[key]) for key, value in restored.state_dict().items())
-
-
-def test_members_of_a_file_alternate(tmp_path, image):
-    networks = trained(spec_of())
-    save_trained(tmp_path / "n.safetensors", networks, spec_of())
-    pipeline = UncertainDepth(load_trained(tmp_path / "n.safetensors"))
-    pose, K = torch.eye(4), torch.tensor([[40.0, 0, 31.5], [0, 40, 15.5], [0, 0, 1]])
-    for turn in range(3):
-        result = pipeline(image, pose, K)
-        assert result.member == turn % 2
-        assert torch.equal(result.depth, networks[turn % 2](image).depth)
 
 
 # ---- lazily ----
@@ -201,16 +156,6 @@ def test_lazy_members_read_their_own_weights_only(tmp_path, image):
         loaded[2](image)
 
 
-def test_offloading_without_lazy_reads_at_once(tmp_path, image):
-    networks = trained(spec_of())
-    save_trained(tmp_path / "n.safetensors", networks, spec_of())
-    loaded = load_trained(tmp_path / "n.safetensors", offload=True)
-    assert all(member.loaded and member.offload for member in loaded)
-    nn.ModuleList(loaded).to("meta")  # its turn there is tested with the members alone
-    assert torch.equal(predict(loaded[1], image), predict(networks[1], image))
-    assert {p.device.type for member in loaded for p in member.network().parameters()} == {"cpu"}
-
-
 @pytest.mark.parametrize("offload", [False, True])
 def test_lazy_members_of_a_batch_ensemble_share_their_weights(tmp_path, image, offload):
     spec = spec_of("batch_ensemble")
@@ -222,13 +167,6 @@ def test_lazy_members_of_a_batch_ensemble_share_their_weights(tmp_path, image, o
             assert torch.equal(predict(restored, image), predict(original, image))
         ensembles = [member.network().ensemble for member in loaded]
         assert [e is ensembles[0] for e in ensembles] == [True] * 3 + [False] * 3
-
-
-def test_lazy_members_can_be_pickled(tmp_path, image):
-    networks = trained(spec_of())
-    save_trained(tmp_path / "n.safetensors", networks, spec_of())
-    loaded = pickle.loads(pickle.dumps(load_trained(tmp_path / "n.safetensors", lazy=True)))
-    assert torch.equal(predict(loaded[1], image), predict(networks[1], image))
 
 
 # ---- half precision ----
@@ -348,15 +286,6 @@ def test_metadata_that_cannot_be_used(file, name):
             load(file)
 
 
-def test_a_file_of_another_program(tmp_path):
-    save_file({"x": torch.zeros(1)}, tmp_path / "bad.safetensors")
-    with pytest.raises(CheckpointError, match=r"bad\.safetensors holds no trained networks of this package"):
-        load_trained(tmp_path / "bad.safetensors")
-    save_file({"x": torch.zeros(1)}, tmp_path / "bad.safetensors", metadata={"metadata": "{"})
-    with pytest.raises(CheckpointError, match=r"bad\.safetensors is not a readable"):
-        load_trained(tmp_path / "bad.safetensors")
-
-
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999, None])
 def test_a_file_that_is_cut_off_or_missing(file, share):
     kind, message = CheckpointError, r"bad\.safetensors is not a readable safetensors file"
@@ -388,13 +317,6 @@ def test_damaged_weights_name_file_and_member(file, image, name):
     loaded[0](image)
     with pytest.raises(CheckpointError, match=rf"bad\.safetensors, member 1, does not fit .*{message}"):
         loaded[1](image)
-
-
-def test_the_file_of_an_ensemble_that_is_bad_is_named(tmp_path, file):
-    save_trained(tmp_path / "good.safetensors", trained(spec_of()), spec_of())
-    truncate(file)
-    with pytest.raises(CheckpointError, match=r"bad\.safetensors"):
-        load_trained([tmp_path / "good.safetensors", file])
 
 
 # ---- by name, and from the command line ----
@@ -472,13 +394,6 @@ def test_a_run_with_all_members_of_two_files(ufmstar, scene, tmp_path, mode, met
     assert (source["mode"], source["samples"]) == (mode, None)
 
 
-def test_a_run_with_offloading_is_the_same(ufmstar, scene, tmp_path):
-    networks = trained(spec_of())
-    save_trained(tmp_path / "a.safetensors", networks, spec_of())
-    assert ufmstar("--weights", tmp_path / "a.safetensors", "--offload")[0] == 0
-    np.testing.assert_array_equal(depths(tmp_path / "out"), by_hand(scene, networks))
-
-
 def test_a_run_that_samples_repeats_itself_and_goes_on(ufmstar, scene, tmp_path):
     spec = spec_of("mc_dropout")
     save_trained(tmp_path / "a.safetensors", trained(spec, 1), spec)
@@ -492,16 +407,6 @@ def test_a_run_that_samples_repeats_itself_and_goes_on(ufmstar, scene, tmp_path)
     np.testing.assert_raises(
         AssertionError, np.testing.assert_array_equal, depths(tmp_path / "out"), by_hand(scene, trained(spec, 1))
     )
-
-
-def test_a_run_of_samples_taken_together(ufmstar, tmp_path):
-    spec = spec_of("mc_dropout")
-    save_trained(tmp_path / "a.safetensors", trained(spec, 1), spec)
-    words = ("--weights", tmp_path / "a.safetensors", "--mode", "full", "--frames", ":1")
-    for samples, expected in (((), 10), (("--samples", "3"), 3)):
-        code, _, err = ufmstar(*words, *samples, "--overwrite")
-        assert code == 0, err
-        assert read_summary(tmp_path / "out")["source"]["samples"] == expected
 
 
 MISTAKES = {
@@ -522,16 +427,3 @@ def test_a_mistake_is_reported_in_one_line(ufmstar, tmp_path, name):
     assert (code, err.count("\n")) == (2, 1)
     assert message in err
     assert not (tmp_path / "out").exists()
-
-
-def test_a_damaged_file_is_reported_in_one_line(ufmstar, file):
-    truncate(file)
-    code, _, err = ufmstar("--weights", file)
-    assert (code, err.count("\n")) == (2, 1)
-    assert "bad.safetensors is not a readable safetensors file" in err
-
-
-def test_offloading_is_for_trained_networks(capfd, scene, tmp_path):
-    words = ("run", scene, "--model", "fastdepth", "--weights", "x", "--offload", "--out", tmp_path / "out")
-    assert cli.main([str(word) for word in words]) == 2
-    assert "--offload goes with --model trained only" in capfd.readouterr().err

@@ -84,7 +84,7 @@ class Augmentation:
 
 
 def draw(config: AugmentationConfig, seed: tuple[int, ...], height: int, width: int) -> Change:
-    """What happens to the frame of height x width [px] with this seed."""
+    """The change of a frame of height x width [px] with this seed."""
     rng = np.random.default_rng(seed)
     scale = rng.uniform(*config.scale)
     angle = math.radians(rng.uniform(-config.rotation, config.rotation))

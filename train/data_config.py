@@ -1,4 +1,4 @@
-"""Where training data come from and how they are loaded, as plain values."""
+"""The source of the training data and how they are loaded, as plain values."""
 
 from __future__ import annotations
 

@@ -45,8 +45,8 @@ def loss_of(
     Args:
         distribution: parameters, each [B, H, W].
         target: [B, H, W] ground truth depth [m]; values at other pixels are not used.
-        valid: [B, H, W] bool, True = use. Of these, pixels whose target is not finite and positive are
-            left out as well.
+        valid: [B, H, W] bool, True = use; pixels whose target is not finite and positive are left out as
+            well.
         evidence_weight: lambda of :func:`evidential_loss`.
         beta_nll: exponent of :func:`gaussian_nll`'s weight; 0 = the likelihood itself.
 

@@ -23,7 +23,7 @@ from ufmstar_torch.train.samples import RawSample, SampleError
 if TYPE_CHECKING:
     import h5py
 
-# Of scenes, taken in alphabetical order, every this many goes into the validation part where no split is given.
+# Without a split, every fourth scene in alphabetical order belongs to the validation part.
 _VALIDATION_EVERY = 4
 
 

@@ -21,7 +21,7 @@ OURS: dict[str, dict[str, Any]] = {
     "monodepth2": {"learning_rate": 1e-4, "batch_size": 8, "schedule": "cosine"},
     "fastdepth": {"learning_rate": 1e-3, "batch_size": 8, "schedule": "cosine"},
 }
-# Of an ensemble; the seeds of two trainings lie that far apart (``train.settings.Job.seed``).
+# Largest ensemble; the seeds of two trainings differ by this (``train.settings.Job.seed``).
 MOST_MEMBERS = 1000
 
 

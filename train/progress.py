@@ -1,6 +1,6 @@
-"""How good a network is while it is trained: figures of a validation, beside those of a constant variance.
+"""Figures of a validation, and those of a constant variance as yardstick.
 
-The yardstick is the best possible likelihood without a variance head: the same depth with one variance for all pixels.
+The yardstick is the best likelihood without a variance head: the same depth with one variance for all pixels.
 It depends on the squared errors only. The variance is taken from the training part ("nll_constant"), as it would be in
 practice, and for comparison from the validation itself ("nll_constant_best"), which no constant can exceed.
 """

@@ -68,7 +68,7 @@ class FrameSource(Protocol):
     def __len__(self) -> int: ...
 
     def name(self, index: int) -> str:
-        """What to call frame ``index`` when it is broken: its file."""
+        """The file of frame ``index``, for messages."""
         ...
 
     def load(self, index: int) -> RawSample:

@@ -1,4 +1,4 @@
-"""How a training is run, and the job: recipe, data and settings together."""
+"""Settings of a session of training, and the job: recipe, data and settings together."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ufmstar_torch.train.presets import MOST_MEMBERS, Recipe
 
 @dataclass(frozen=True, kw_only=True)
 class FitSettings(Checked):
-    """Where and how a training runs. Apart from seed, init, trainable and precision, the settings may change between
+    """Settings of one session. Apart from seed, init, trainable and precision, the settings may change between
     two sessions of one training without changing its result.
 
     Attributes:
@@ -67,7 +67,7 @@ class FitSettings(Checked):
 
 @dataclass(frozen=True)
 class Job:
-    """What is trained, on what data, and how it is run; plain values that pickle."""
+    """Recipe, data and settings of a training; plain values that pickle."""
 
     recipe: Recipe  # decides the weights
     data: DataConfig  # where samples come from; its batch size and seed are replaced by the recipe's and the member's

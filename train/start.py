@@ -1,4 +1,4 @@
-"""Where a training starts: from random or given weights, and which parameters are trained."""
+"""The network at the start of a training: random weights or those of a file, and which parameters are trained."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def _from_resnet(spec: NetworkSpec, path: Path) -> Backbone:
         raise ValueError(f"init: {path} is no start for {spec.architecture}; expected {WAYS}")
     if path.is_dir():
         report = load_monodepth2(backbone, path / "encoder.pth", path / "depth.pth")
-        # Of another ResNet some tensors fit by chance, and the start would be one from nothing.
+        # Some tensors of another ResNet fit by chance; most weights would then stay random.
         wrong = [key for key in report.kept if key.startswith("encoder.") and not key.endswith("num_batches_tracked")]
         wrong += [key for key in report.skipped if key.startswith("encoder.") and not key.startswith("encoder.fc.")]
         if wrong:

@@ -39,7 +39,7 @@ _FARTHEST = np.iinfo(np.uint16).max
 
 @dataclass(frozen=True)
 class TourSettings(Checked):
-    """What the stored frames of a tour show, apart from its seed.
+    """Settings of the stored frames of a tour, apart from its seed.
 
     Attributes:
         frames: of each tour.

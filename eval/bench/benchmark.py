@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -97,7 +97,7 @@ def _random(options: BenchSettings, side: int, device: torch.device) -> TimedNet
     if options.model == ARCHITECTURES[0]:
         network = FastDepth(FastDepthWidths.pruned(), size=size).eval().folded()
     network.preprocess = Preprocess(resize_height=side, crop=size, size=size)
-    return _Random("depth_only", [network.eval().to(device, memory_format=torch.channels_last)], options.model)
+    return _Random("depth_only", [network.eval().to(device).to(memory_format=torch.channels_last)], options.model)
 
 
 def _loaded(options: BenchSettings, threads: int, device: torch.device) -> TimedNetwork:
@@ -106,7 +106,7 @@ def _loaded(options: BenchSettings, threads: int, device: torch.device) -> Timed
     inference = Inference(runtime=options.runtime, threads=threads)
     spec = {} if options.spec is None else {"spec": options.spec}
     loaded = load_network(options.model, options.weights, **spec, **inference.options(options.model, device))
-    members = list(loaded.members) if isinstance(loaded, Ensemble) else [loaded]
+    members = cast("list[DepthNetwork]", list(loaded.members)) if isinstance(loaded, Ensemble) else [loaded]
     ready = [inference.ready(member, options.weights, device).to(device) for member in members]
     return TimedNetwork("ensemble" if len(ready) > 1 else "depth_only", ready, options.model)
 

@@ -1,1 +1,1 @@
-"""What is evaluated: methods, rows (a method in a setting), suites of rows, and UfM (ICRA 2022)."""
+"""The rows of an evaluation: methods, rows (a method in a setting), suites of rows, and UfM (ICRA 2022)."""

@@ -1,4 +1,4 @@
-"""What an ablation does to the frames: leaves some out, and disturbs the poses of the others."""
+"""Ablations of the input: frames that are left out, noise and drift of the poses."""
 
 from __future__ import annotations
 

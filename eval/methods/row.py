@@ -13,7 +13,7 @@ from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, Setting, config
 
 @dataclass(frozen=True)
 class Row:
-    """What is judged."""
+    """A method under a setting."""
 
     method: Method  # which network, how often it is run, and what judges its views
     setting: Setting = DEFAULT  # what an ablation changes about it
@@ -72,7 +72,7 @@ class Row:
 
 
 def plain_rows(rows: Iterable[Row]) -> list[Row]:
-    """Of each method the first row that no ablation varies; of the paper's suites that with the paper's settings."""
+    """The first row of each method that no ablation varies; in the paper's suites it has the paper's settings."""
     first: dict[Method, Row] = {}
     for row in rows:
         if row.setting.plain:

@@ -59,7 +59,7 @@ class UfMConfig(Checked):
 
 @dataclass(frozen=True)
 class UfMStatistics:
-    """What happened to one frame, per stream [B].
+    """Counts of one frame, per stream [B].
 
     Attributes:
         points: kept after the frame.

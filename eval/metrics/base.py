@@ -1,4 +1,4 @@
-"""What the metrics share: sum states in float64 or int64, saved with the state_dict, merged with care."""
+"""The base of all metrics: sum states in float64 or int64, saved with the state_dict, merged with care."""
 
 from __future__ import annotations
 

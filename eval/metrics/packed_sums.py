@@ -24,7 +24,7 @@ def pack(value: Tensor) -> Tensor | dict[str, Any]:
 
 
 def unpack(stored: Tensor | dict[str, Any]) -> Tensor:
-    """What was packed, bit for bit; tensors are taken as they are."""
+    """The packed tensor, bit for bit; tensors are returned unchanged."""
     if isinstance(stored, Tensor):
         return stored
     flat = stored["values"].new_zeros(stored["shape"]).flatten()

@@ -42,14 +42,14 @@ def add_errors(
     depth: Any, variance: Any, target: Any, use: Any, squared: bool, total: Any, pixels: Any
 ) -> None:  # fmt: skip
     """The sum of (d - g)^2 [m^2] or |d - g| / g, and the number of pixels."""
-    own = 0.0
+    added = 0.0
     for i in range(len(depth)):
         d, g = depth[i], target[i]
         if use[i] and _is_truth(g) and np.isfinite(d):
             error = abs(d - g)
-            own += error * error if squared else error / g
+            added += error * error if squared else error / g
             pixels[()] += 1
-    total[()] += own
+    total[()] += added
 
 
 @kernel
@@ -57,15 +57,15 @@ def add_nll(
     depth: Any, variance: Any, target: Any, use: Any, total: Any, pixels: Any, with_truth: Any
 ) -> None:  # fmt: skip
     """The sum of the NLL over v > 0, the number of these pixels, and that of all with ground truth."""
-    own = 0.0
+    added = 0.0
     for i in range(len(depth)):
         d, v, g = depth[i], variance[i], target[i]
         if use[i] and _is_truth(g):
             with_truth[()] += 1
             if _is_prediction(d, v) and v > 0:
-                own += gaussian_nll(d, v, g)
+                added += gaussian_nll(d, v, g)
                 pixels[()] += 1
-    total[()] += own
+    total[()] += added
 
 
 @kernel
@@ -74,16 +74,16 @@ def add_entropy(
 ) -> None:  # fmt: skip
     """Counts [E + 1] of the entropy between rising, equally spaced edges [E] [nats], its sum over v > 0, and the number
     of these pixels. Ground truth is not needed."""
-    own = 0.0
+    added = 0.0
     for i in range(len(depth)):
         d, v = depth[i], variance[i]
         if use[i] and _is_prediction(d, v):
             h = 0.5 * (_LOG_TWO_PI + 1.0 + math.log(v)) if v > 0 else -np.inf
             counts[_entropy_bin(h, edges)] += 1
             if v > 0:
-                own += h
+                added += h
                 pixels[()] += 1
-    total[()] += own
+    total[()] += added
 
 
 @kernel

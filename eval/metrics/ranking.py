@@ -16,13 +16,13 @@ from ufmstar_torch.eval.metrics.base import SumMetric
 from ufmstar_torch.eval.metrics.pixel_sums import add_joint, add_nll_by_error, add_sparsification
 
 
-def kept_mean(count: Tensor, total: Tensor, kept: Tensor) -> Tensor:
-    """[F] mean over the ``kept`` shares (0, 1] of the pixels in the first bins.
+def mean_of_share(count: Tensor, total: Tensor, shares: Tensor) -> Tensor:
+    """[F] mean over the ``shares`` (0, 1] of the pixels in the first bins.
 
     Within a bin the order is random: the expectation over all orders is linear in the pixels taken.
     """
     pixels, sums = count.double().cumsum(0), total.cumsum(0)
-    wanted = kept * pixels[-1]
+    wanted = shares * pixels[-1]
     bin_ = torch.searchsorted(pixels, wanted).clamp(max=count.numel() - 1)
     before, sum_before = pixels[bin_] - count[bin_], sums[bin_] - total[bin_]
     part = (wanted - before) / count[bin_].clamp(min=1)
@@ -60,10 +60,10 @@ class Sparsification(SumMetric):
     def compute(self) -> dict[str, Tensor]:
         kept = 1 - torch.arange(50, dtype=torch.float64, device=self.count.device) / 50
         curves = {
-            "rmse": kept_mean(self.count, self.squared, kept).sqrt(),
-            "oracle_rmse": kept_mean(self.count_squared, self.sum_squared, kept).sqrt(),
-            "abs_rel": kept_mean(self.count, self.relative, kept),
-            "oracle_abs_rel": kept_mean(self.count_relative, self.sum_relative, kept),
+            "rmse": mean_of_share(self.count, self.squared, kept).sqrt(),
+            "oracle_rmse": mean_of_share(self.count_squared, self.sum_squared, kept).sqrt(),
+            "abs_rel": mean_of_share(self.count, self.relative, kept),
+            "oracle_abs_rel": mean_of_share(self.count_relative, self.sum_relative, kept),
         }
         results = {f"sparsification_{name}": curve for name, curve in curves.items()}
         for error in ("rmse", "abs_rel"):
@@ -152,5 +152,5 @@ class NLLByError(SumMetric):
 
     def _groups(self, total: Tensor, kept: Tensor) -> Tensor:
         """[percentiles] mean of each group, from the sums up to its end."""
-        upto = kept_mean(self.count, total, kept) * kept
+        upto = mean_of_share(self.count, total, kept) * kept
         return torch.diff(upto, prepend=upto.new_zeros(1)) * self.percentiles

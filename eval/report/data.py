@@ -96,7 +96,7 @@ class Results:
         return records if sequence is None else tuple(record for record in records if record.sequence == sequence)
 
     def default_rows(self, base: str | None = None) -> list[Row]:
-        """Of each method of a base (None: of all) the first row that no ablation varies."""
+        """The first row of each method of a base (None: of all) that no ablation varies."""
         return [row for row in plain_rows(self.rows) if base in (None, row.method.base)]
 
     def sequences(self, dataset: str | None = None) -> tuple[tuple[str, str], ...]:
@@ -230,7 +230,7 @@ def _failed(out: Path) -> tuple[Failed, ...]:
 def _missing(
     about: Mapping[str, Any], records: Iterable[Record], failed: Iterable[Failed]
 ) -> tuple[tuple[str, str, Row], ...]:
-    """What ``eval.json`` lists, without records and failed sequences."""
+    """Rows and sequences of ``eval.json`` without a record, except failed sequences."""
     done = {(r.dataset, r.sequence, row_of(r)) for r in records}
     broken = {(f.dataset, f.sequence) for f in failed}
     expected = sorted((s["dataset"], s["sequence"]) for s in about.get("sequences", []))
@@ -264,7 +264,7 @@ def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Merge
 
 
 def read_sums(path: Path) -> Sums:
-    """``RowResult.sums`` of one row on one sequence."""
+    """``RowFigures.sums`` of one row on one sequence."""
     try:
         sums = torch.load(path, map_location="cpu", weights_only=True)
     except (EOFError, KeyError, RuntimeError, ValueError, pickle.UnpicklingError) as error:

@@ -52,7 +52,7 @@ def draw_latency(results: Results) -> Any | None:
 
 
 def draw_stages(results: Results) -> Any | None:
-    """Where UfM*'s time goes, stage by stage, as in the paper's figure; None unless ``efficiency.json`` has it."""
+    """Shares of the stages in a step of UfM*, the paper's figure; None unless ``efficiency.json`` has it."""
     staged = [row for row in (results.efficiency or {}).get("rows", ()) if row.get("stages")]
     if not staged:
         return None
@@ -90,15 +90,15 @@ def draw_tradeoff(results: Results) -> Any | None:
     """ECE_delta against the bytes that are kept between frames, and against the time per frame; None without points."""
     points = {row: mean_of(results.of(row), ECE_DELTA) for row in results.default_rows()}
     points = {row: mean for row, mean in points.items() if mean.sequences}
-    kept = {row: mean_of(results.of(row), STATE).value for row in points}
-    kept = {row: 0.0 if math.isnan(x) else x for row, x in kept.items()}  # a method alone keeps nothing
-    took = {row: mean_of(results.of(row), TOTAL_MS).value for row in points}
-    took = {row: x for row, x in took.items() if not math.isnan(x)}
-    if not any(kept.values()):
+    sizes = {row: mean_of(results.of(row), STATE).value for row in points}
+    sizes = {row: 0.0 if math.isnan(x) else x for row, x in sizes.items()}  # a method alone keeps nothing
+    times = {row: mean_of(results.of(row), TOTAL_MS).value for row in points}
+    times = {row: x for row, x in times.items() if not math.isnan(x)}
+    if not any(sizes.values()):
         return None
     figure = style.new_figure(11.0, 4.8, "Calibration against cost on all sequences")
-    words = ("kept between frames [MB]", "time per frame [ms]")
-    for axes, panel, word in zip(figure.subplots(1, 2, sharey=True), (kept, took), words, strict=True):
+    words = ("state [MB]", "time per frame [ms]")
+    for axes, panel, word in zip(figure.subplots(1, 2, sharey=True), (sizes, times), words, strict=True):
         for row, x in panel.items():
             mean = points[row]
             axes.errorbar(

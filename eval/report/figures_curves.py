@@ -39,8 +39,8 @@ def draw_calibration(results: Results, dataset: str) -> Any | None:
     }
     if not panels:
         return None
-    title = f"Calibration on {dataset}, all pixels of {count(len(results.sequences(dataset)), 'sequence')}"
-    return _draw_columns(title, list(panels.values()), PER_LINE, (0.5, 3.4, 0.4, 6.0), ends=True)
+    title = f"Calibration on {dataset}, {count(len(results.sequences(dataset)), 'sequence')}"
+    return _draw_columns(title, list(panels.values()), PER_LINE, (0.9, 4.1, 0.4, 6.0), ends=True)
 
 
 def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any | None:

@@ -49,7 +49,7 @@ class SweepLine:
 
     @property
     def words(self) -> str:
-        """What is fixed, for people: "", "anchored", "truth anchors, shrinkage κ 1 anchors"."""
+        """The settings that are the same along the line: "", "anchored", "truth anchors, shrinkage κ 1 anchors"."""
         values = dict(self.rest)
         anchors = _ANCHORED.get(kind := values.pop("anchors", ""), kind)
         return ", ".join(filter(None, (anchors, names.setting_label(values))))
@@ -118,7 +118,7 @@ def _value(row: Row, name: str) -> Any:
 
 
 def _changed(row: Row) -> list[str]:
-    """What a row's setting changes, the noise's seed aside."""
+    """Names of the settings that a row changes, without the seed."""
     return [name for name in row.setting.to_dict() if name != "seed"]
 
 
@@ -173,7 +173,7 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
 
 
 def _compared(drawn: Sequence[SweepLine], alone: SweepLine | None, name: str) -> tuple[str, _Pairs]:
-    """What the differences are to, in words, and the pairs of points.
+    """The reference of the differences, in words, and the pairs of points.
 
     To the base alone on the same images where these change with the value; else of lines with something fixed to those
     without it, at the same value where that matters; else to the default.

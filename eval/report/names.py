@@ -1,4 +1,4 @@
-"""What figures and settings are called in tables and figures, in which unit, and which way is better."""
+"""Names and units of figures and settings in tables and figures, and which direction is better."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ def limits(results: Results, undrawn: Mapping[str, str]) -> list[tuple[str, tupl
 
 
 def _made(results: Results) -> dict[str, Any]:
-    """What repeats the evaluation: networks, settings, versions, machine, digests of what was read."""
+    """Description of the evaluation: networks, settings, versions, machine, digests of what was read."""
     named = {name: results.about.get(name) for name in ("networks", "settings", "versions", "machine")}
     digests = {f"{r.dataset}, {r.sequence}": r.provenance.get("sequence") for r in results.records}
     return {**named, "sequences (SHA-256)": {name: digest for name, digest in digests.items() if digest}}

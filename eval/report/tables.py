@@ -40,7 +40,7 @@ def main_table(results: Results, dataset: str | None = None) -> Table:
 
 
 def extra_table(results: Results, dataset: str | None = None) -> Table:
-    """What the paper's tables leave out: errors in metres, ranking, pixels without a figure, times."""
+    """Figures beyond the paper's tables: errors in metres, ranking, pixels without a figure, times."""
     return _means(results, dataset, EXTRA, "extra")
 
 

@@ -1,4 +1,4 @@
-"""What a run and the demo leave to look at: contact sheet, preview video, curves, and the mixture for viewers.
+"""Pictures of a run: contact sheet, preview video, and the mixture for viewers.
 
 A run's pictures are drawn from its finished frames on disk, so that their scales fit the whole run, and a run that was
 stopped and continued gets the same ones.

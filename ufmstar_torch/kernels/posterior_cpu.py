@@ -79,7 +79,7 @@ class _Running(NamedTuple):
         covariance, priors = covariance.reshape(FEATURES, FEATURES), ratios(config)
         value, weight, least, largest = np.array(list(priors.values())).T
         if packed[0] == 0:
-            above, below, covariance = value * weight, weight, config.prior_sigma**2 * np.eye(FEATURES)
+            above, below, covariance = value * weight, weight, np.diag(config.prior_variance)
         known = np.where(below > 0, above / np.maximum(below, 1e-12), value).clip(least, largest)
         by_name = dict(zip(priors, known.tolist(), strict=True))
         return cls(config, packed[0], packed[1], above, below, b, covariance, by_name)
@@ -96,7 +96,7 @@ class _Running(NamedTuple):
         T[0, 1] = mean - self.mean if self.frames else 0.0
         walked = T @ self.covariance @ T.T
         if self.frames:
-            left = (1 - walked.diagonal() / self.config.prior_sigma**2).clip(0, 1)
+            left = (1 - walked.diagonal() / self.config.prior_variance).clip(0, 1)
             walked = walked + np.diag(self.config.drift**2 * left)
         return T @ self.coefficients, walked
 
@@ -193,8 +193,10 @@ def _scene(
 
 def _prior(grid: _Grid, running: _Running) -> Prior:
     mean, covariance = running.expected(grid.mean)
-    diagonal = np.full(len(grid.log_depth), running.config.precision)
-    return Prior(diagonal, 1 / grid.right, 1 / grid.down, mean, np.linalg.inv(covariance), grid.cols)
+    amplitude = running.ratios["amplitude"]
+    diagonal = np.full(len(grid.log_depth), running.config.precision / amplitude)
+    right, down = 1 / (grid.right * amplitude), 1 / (grid.down * amplitude)
+    return Prior(diagonal, right, down, mean, np.linalg.inv(covariance), grid.cols)
 
 
 def _fitted(scene: _Scene) -> tuple[Field, _LeftOut, Floats]:
@@ -274,14 +276,22 @@ def _of_discs(scene: _Scene, weight: Floats, claimed: Floats, running: _Running)
     field = given(scene.prior, scene.observed, weight * rest)
     node, x = scene.observed.node[held], scene.observed.features[held]
     mean, variance = at(field, node, x)
-    away, variance = _away(scene, rest)[node], variance + scene.noise[held]
-    error = (scene.observed.value[held] - mean) ** 2
+    away, noise = _away(scene, rest)[node], scene.noise[held]
+    error, field_variance, variance = (scene.observed.value[held] - mean) ** 2, variance, variance + noise
+    square = np.minimum(error, scene.config.clip * variance)
     believed = np.where(held, scene.believed(), 0.0)
     area = (believed / np.maximum(scene.counted(believed), 1e-12))[held]
     share, b = away / scene.config.reach, field.coefficients
     tail = _tail(scene, share, mean - (x * b).sum(1), _spread(scene, rest, b[0])[node])
     stated = variance + away * running.ratios["unseen"] + share * claimed[held] + tail
-    sums = {"unseen": (area * (error - variance), area * away), "calibration": (area * error / stated, area)}
+    sums = {
+        "amplitude": (
+            area * (square - noise) / variance,
+            area * field_variance / variance / running.ratios["amplitude"],
+        ),
+        "unseen": (area * (error - variance), area * away),
+        "calibration": (area * error / stated, area),
+    }
     return {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}
 
 

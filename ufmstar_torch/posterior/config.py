@@ -18,14 +18,15 @@ class PosteriorConfig(Checked):
         link_variance: variance of f's difference between neighbouring nodes of equal predicted depth
         edge_variance: what is added to it, over the square of their difference of log d
         precision: precision of f at a node
-        prior_sigma: standard deviation of b before the first anchor
+        prior_sigma: standard deviation of b's constant and of its slope in log d before the first anchor
+        tilt_sigma: the same of its slopes in u and v
         drift: standard deviation of b's change from frame to frame
         degrees_of_freedom: of the Student-t weights that take outliers out
         roughness: standard deviation of y from one pixel to the next, before it is learnt
         unseen: variance of y a width of the image from evidence, before it is learnt
         prior_weight: anchors for which these values count
         half_life: age after which what an anchor taught counts half
-        clip: largest z^2 of an anchor in what is learnt of the roughness and the noise
+        clip: largest z^2 of an anchor in what is learnt of amplitude, roughness and noise
         weak_sigma: an anchor whose noise has this standard deviation counts half by area; a noisier one is no evidence
         reach: distance from the evidence from which on a node has none
         discs: discs of anchors that are held out in a frame
@@ -39,11 +40,12 @@ class PosteriorConfig(Checked):
     edge_variance: float = number(2.0, "v_1", "1", 0.0, open_low=True)
     precision: float = number(0.5, "kappa", "1", 0.0, open_low=True)
     prior_sigma: float = number(0.5, "sigma_b", "1", 0.0, open_low=True)
+    tilt_sigma: float = number(0.2, "sigma_t", "1", 0.0, open_low=True)
     drift: float = number(0.05, "tau", "1/frame^.5", 0.0)
     degrees_of_freedom: float = number(4.0, "nu", "1", 0.0, open_low=True)
     roughness: float = number(0.05, "sigma_0", "1", 0.0, open_low=True)
     unseen: float = number(0.1, "g", "1/width", 0.0)
-    prior_weight: float = number(40.0, "n_0", "anchors", 0.0, open_low=True)
+    prior_weight: float = number(20.0, "n_0", "anchors", 0.0, open_low=True)
     half_life: float = number(20.0, "ln 2/ln(1/gamma)", "frames", 0.0, open_low=True)
     clip: float = number(9.0, "c", "1", 0.0, open_low=True)
     weak_sigma: float = number(0.25, "sigma_w", "1", 0.0, open_low=True)
@@ -53,3 +55,8 @@ class PosteriorConfig(Checked):
     wrong: float = number(0.03, "p", "1", 0.0, 1 / 3)
     spread: float = number(2.0, "a", "1", 0.0, 4.0)
     edge_contrast: float = number(0.1, "delta", "1", 0.0, open_low=True)
+
+    @property
+    def prior_variance(self) -> tuple[float, float, float, float]:
+        """Of the coefficients b before the first anchor."""
+        return (self.prior_sigma**2, self.prior_sigma**2, self.tilt_sigma**2, self.tilt_sigma**2)

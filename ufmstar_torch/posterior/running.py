@@ -1,9 +1,10 @@
 """What the posterior learns of a stream: sums with a half-life, and the last frame's coefficients.
 
-Everything here is learnt from anchors alone, in frames that have some: how much anchors and network differ from one
-pixel to the next (roughness), by what factor the anchors' variances are stated too small (noise), how fast the error
-grows with the distance from evidence (unseen), and how well held-out anchors were predicted (calibration). Each is a
-ratio of two sums that fade towards a prior, so that a few anchors do not decide.
+Everything here is learnt from anchors alone, in frames that have some: how far the network's error varies (amplitude),
+how much anchors and network differ from one pixel to the next (roughness), by what factor the anchors' variances are
+stated too small (noise), how fast the error grows with the distance from evidence (unseen), and how well held-out
+anchors were predicted (calibration). Each is a ratio of two sums that fade towards a prior, so that a few anchors do
+not decide.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ def ratios(config: PosteriorConfig) -> dict[str, Ratio]:
     """The ratios by name. Nothing is known of the calibration, a mean z^2, before the first frame."""
     weight = config.prior_weight
     return {
+        "amplitude": Ratio(1.0, weight, 0.1, 100.0),
         "roughness": Ratio(config.roughness**2, weight, 0.01**2, 0.2**2),
         "noise": Ratio(1.0, weight, 0.25, 16.0),
         "unseen": Ratio(config.unseen, weight, 0.0, 16.0),
@@ -73,7 +75,7 @@ class Running:
         new = frames == 0
         start = [r.value * r.weight for r in priors.values()] + [r.weight for r in priors.values()]
         above, below = torch.where(new, sums.new_tensor(start), sums).split(RATIOS, 1)
-        P = config.prior_sigma**2 * torch.eye(FEATURES, dtype=packed.dtype, device=packed.device)
+        P = torch.diag(packed.new_tensor(config.prior_variance))
         return cls(
             config, frames[:, 0], mean[:, 0], dict(zip(priors, above.unbind(1), strict=True)),
             dict(zip(priors, below.unbind(1), strict=True)), coefficients,
@@ -104,7 +106,8 @@ class Running:
         T = torch.eye(FEATURES, dtype=mean.dtype, device=mean.device).repeat(len(mean), 1, 1)
         T[:, 0, 1] = torch.where(self.frames > 0, mean - self.mean, torch.zeros_like(mean))
         walked = T @ self.covariance @ T.mT
-        left = (1 - walked.diagonal(dim1=1, dim2=2) / self.config.prior_sigma**2).clamp(0, 1)
+        prior = mean.new_tensor(self.config.prior_variance)
+        left = (1 - walked.diagonal(dim1=1, dim2=2) / prior).clamp(0, 1)
         started = (self.frames > 0).to(mean)[:, None]
         grown = torch.diag_embed(self.config.drift**2 * left * started)
         return (T @ self.coefficients[..., None])[..., 0], walked + grown

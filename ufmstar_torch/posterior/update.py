@@ -17,10 +17,10 @@ Variance of y at a node, with share = min(1, distance/reach):
     the field's + roughness + unseen distance + share V/d^2 + p (1 + 2 share) tail.
 
 The distance from evidence is geodesic, in widths of the image, and differences of log d lengthen it: on tours the
-variance of the error grows in proportion to it. ``unseen`` is learnt (``running``) from anchors of discs that move over
-the image: the field is fitted without them, and they count by area and not by number, since corners cluster on what is
-well textured. ``unseen`` is what their squared error is beyond the rest, over their distance. V = M + A + E counts
-where evidence is far.
+variance of the error grows in proportion to it. ``unseen``, and the amplitude of f, are learnt (``running``) from
+anchors of discs that move over the image: the field is fitted without them, and they count by area and not by number,
+since corners cluster on what is well textured. ``unseen`` is what their squared error is beyond the rest, over their
+distance. V = M + A + E counts where evidence is far.
 
 ``tail`` is the second moment about the posterior depth if the local correction f does not hold, because the evidence is
 wrong or lies on another surface. Then y - b . x is normal with the variance v, and the depth log-normal:
@@ -201,8 +201,10 @@ def _none(frame: FrameInput) -> AnchorInput:
 def _prior(grid: Grid, running: Running) -> Prior:
     """Of b and f, in the frame to come."""
     mean, covariance = running.expected(grid.mean)
-    diagonal = torch.full_like(grid.log_depth, running.config.precision)
-    return Prior(diagonal, 1 / grid.right, 1 / grid.down, mean, torch.linalg.inv_ex(covariance).inverse, grid.size[1])
+    amplitude = running.ratio("amplitude")[:, None]
+    diagonal = (running.config.precision / amplitude).expand_as(grid.log_depth)
+    right, down = 1 / (grid.right * amplitude), 1 / (grid.down * amplitude)
+    return Prior(diagonal, right, down, mean, torch.linalg.inv_ex(covariance).inverse, grid.size[1])
 
 
 def _range(frame: FrameInput, anchors: AnchorInput) -> Tensor:
@@ -304,14 +306,15 @@ def _of_neighbours(scene: _Scene, left_out: _LeftOut, running: Running) -> dict[
 
 
 def _of_discs(scene: _Scene, weight: Tensor, claimed: Tensor, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
-    """Sums for unseen and calibration from anchors whose whole region is left out."""
+    """Sums for amplitude, unseen and calibration from anchors whose whole region is left out."""
     held = _discs(scene, running.frames) & scene.valid
     rest = scene.valid & ~held
     held = held & (rest.sum(1, keepdim=True) >= LEAST_REST)
     field = Field.given(scene.prior, scene.observed, weight * rest)
     mean, variance = field.at(scene.observed.node, scene.observed.features)
     away = torch.gather(_away(scene, rest), 1, scene.observed.node)
-    error, variance = (scene.observed.value - mean).square(), variance + scene.noise
+    error, field_variance, variance = (scene.observed.value - mean).square(), variance, variance + scene.noise
+    square = torch.minimum(error, scene.config.clip * variance)
     believed = torch.where(held, scene.believed(), 0.0)
     area = believed / scene.counted(believed).clamp_min(1e-12)
     share, b = away / scene.config.reach, field.coefficients
@@ -320,6 +323,10 @@ def _of_discs(scene: _Scene, weight: Tensor, claimed: Tensor, running: Running) 
     stated = variance + away * running.ratio("unseen")[:, None] + share * claimed
     stated = stated + _tail(scene, share, offset, spread)
     return {
+        "amplitude": (
+            total(area * (square - scene.noise) / variance, 1),
+            total(area * field_variance / variance, 1) / running.ratio("amplitude"),
+        ),
         "unseen": (total(area * (error - variance), 1), total(area * away, 1)),
         "calibration": (total(area * error / stated, 1), total(area, 1)),
     }
