@@ -248,9 +248,7 @@ class Extensions:
             if name not in UfMStarConfig.__dataclass_fields__:
                 raise TypeError(f"UfM* takes no argument {name!r}")
             if inputs[name] is not None:
-                raise ValueError(
-                    f"{name}: UfMStarConfig.{name} is None, which switches this extension off; expected None"
-                )
+                raise ValueError(f"{name} must be None where UfMStarConfig.{name} is None, which switches it off")
         each: list[FrameExtension] = []
         for one in self.each:
             each.append(one.of_frame(frame, own, inputs.get(one.argument), each, dense=dense))
