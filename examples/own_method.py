@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
 
 from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.eval.engine.estimators import Alone, Estimate, Gaussians
+from ufmstar_torch.eval.engine.estimators import Alone, Answer, Gaussians
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.eval.engine.rows import RowRunner
@@ -27,10 +26,10 @@ from ufmstar_torch.eval.sequences import open_sequence
 class ShareOfDepth(Alone):
     """A method: the standard deviation is a tenth of the depth. It keeps nothing from frame to frame."""
 
-    def update(self, prediction: Any, T_world_cam: torch.Tensor, anchors: Any = None) -> Estimate:
-        """The variance of a frame [h, w] [m^2]."""
-        estimate = super().update(prediction, T_world_cam)
-        return replace(estimate, variance=(0.1 * estimate.depth).square().where(estimate.valid, torch.nan))
+    def update(self, predicted: Any, T_world_cam: torch.Tensor, anchors: Any = None) -> Answer:
+        """The variance of a frame [1, h, w] [m^2]."""
+        answer = super().update(predicted, T_world_cam)
+        return {**answer, "variance": (0.1 * answer["depth"]).square().where(answer["valid"], torch.nan)}
 
 
 class Coverage(FrameSink):
@@ -43,12 +42,12 @@ class Coverage(FrameSink):
     def take(self, result: FrameResult) -> None:
         """Add a frame."""
         for key, row in result.rows.items():
-            if row.truth is None or row.estimate.variance is None:
+            if row.truth is None or row.variance is None:
                 continue
-            truth, estimate = torch.from_numpy(row.truth), row.estimate
-            judged = estimate.valid & (truth > 0)
-            error = (truth - estimate.depth)[judged].abs()
-            hits = int((error <= 2 * estimate.variance[judged].sqrt()).sum())
+            truth = torch.from_numpy(row.truth)
+            judged = row.valid & (truth > 0)
+            error = (truth - row.depth)[judged].abs()
+            hits = int((error <= 2 * row.variance[judged].sqrt()).sum())
             self.inside[key] = self.inside.get(key, 0) + hits
             self.pixels[key] = self.pixels.get(key, 0) + int(judged.sum())
 

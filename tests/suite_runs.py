@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 from layouts import write_generic
 
-from ufmstar_torch.eval.engine.evaluate import RowResult
+from ufmstar_torch.eval.engine.evaluate import RowFigures
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.stream import Stopped
@@ -75,7 +75,7 @@ def _drawn(sequence, row):
     variance = torch.full_like(target, 0.01) if metrics.with_variance else None
     metrics.update(target + 0.1, variance, target)
     counts = {"selected": len(sequence), "done": len(sequence), "skipped": 0, "reasons": {}}
-    return RowResult(row, counts, metrics.compute(), metrics.curves(), {}, {}, {"metrics": metrics.state_dict()})
+    return RowFigures(row, counts, metrics.compute(), metrics.curves(), {}, {}, {"metrics": metrics.state_dict()})
 
 
 def go(job, evaluate=None, **how):

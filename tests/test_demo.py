@@ -176,8 +176,8 @@ def test_the_rows_are_one_member_in_turn_ufm_ufm_star_and_all_members(compared):
         want = pipeline(image, pose, K)
         for method in (NETWORK, UFM, UFM_STAR):
             assert got[method].member == want.member == index % 3
-            assert torch.equal(got[method].estimate.depth, want.depth[0])
-        star, alone = got[UFM_STAR].estimate.variance, got[NETWORK].estimate.variance
+            assert torch.equal(got[method].depth, want.depth[0])
+        star, alone = got[UFM_STAR].variance, got[NETWORK].variance
         assert torch.equal(star.nan_to_num(-1), want.variance[0].nan_to_num(-1))
         assert torch.equal(alone, want.prediction.variance[0])
         added += float((star - alone).nanmean())
@@ -185,10 +185,10 @@ def test_the_rows_are_one_member_in_turn_ufm_ufm_star_and_all_members(compared):
             x, K = networks[0].preprocess(image, K)
             predictions = [network(x) for network in networks]
         points = ufm(want.depth, pose, K, predictions[index % 3].aleatoric_variance)
-        assert torch.equal(got[UFM].estimate.variance, points.variance[0])
+        assert torch.equal(got[UFM].variance, points.variance[0])
         d = torch.stack([p.depth[0] for p in predictions]).double()
         a = torch.stack([p.aleatoric_variance[0] for p in predictions]).double()
-        mixed = got[ENSEMBLE].estimate
+        mixed = got[ENSEMBLE]
         assert torch.allclose(mixed.depth.double(), d.mean(0), atol=1e-6)
         assert torch.allclose(mixed.variance.double(), a.mean(0) + d.var(0, correction=0), rtol=1e-5)
     assert added > 0, "the members disagree"
@@ -221,11 +221,11 @@ def test_figures_by_kind(sequence):
     frames = DemoFrames(NAMES, kinds)
     squares, spread = ([], []), ([], [])
     for (frame, rows), kind in zip(walked(members(), sequence, sinks=[frames]), kinds, strict=True):
-        estimate = rows[UFM_STAR].estimate
+        row = rows[UFM_STAR]
         for number in (0, 1):
-            use = (kind == number) & (frame.depth > 0) & estimate.valid.numpy()
-            squares[number].append((estimate.depth.numpy()[use].astype(float) - frame.depth[use]) ** 2)
-            spread[number].append(estimate.variance.numpy()[use].astype(float))
+            use = (kind == number) & (frame.depth > 0) & row.valid.numpy()
+            squares[number].append((row.depth.numpy()[use].astype(float) - frame.depth[use]) ** 2)
+            spread[number].append(row.variance.numpy()[use].astype(float))
     for number, figures in enumerate(frames.by_kind().values()):
         assert figures[UFM_STAR]["rmse"] == pytest.approx(np.concatenate(squares[number]).mean() ** 0.5, rel=1e-6)
         assert figures[UFM_STAR]["rms_sigma"] == pytest.approx(np.concatenate(spread[number]).mean() ** 0.5, rel=1e-6)

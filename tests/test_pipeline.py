@@ -112,17 +112,6 @@ def test_combine():
         combine([])
 
 
-def test_preprocess_carries_the_intrinsics():
-    from ufmstar_torch.camera import resize_intrinsics
-
-    def half(x, K):
-        return nn.functional.interpolate(x, scale_factor=0.5), resize_intrinsics(K, (H, W), (H // 2, W // 2))
-
-    out = UncertainDepth(Scaled(1.0), CONFIG, preprocess=half)(image(0), POSES[0], K)
-    assert out.depth.shape == (1, H // 2, W // 2)
-    torch.testing.assert_close(out.intrinsics[0], resize_intrinsics(K, (H, W), (H // 2, W // 2)))
-
-
 class ByFocal(nn.Module):
     """Depth = the image times fx [px] of the network's own input / 16."""
 
@@ -147,7 +136,7 @@ def test_the_preprocessed_intrinsics_reach_the_networks_that_take_them(mode):
     source = NetworkSource(NetworksInTurn(ByFocal(), preprocess=half), torch.device("cpu"), {}, seeding=None)
     picture = (x[0] * 255).byte()
     frame = Frame(0, "0", picture.permute(1, 2, 0).numpy(), None, POSES[0].numpy(), K.numpy())
-    depth = torch.as_tensor(source.one(frame, 0).depth)
+    depth = source.one(frame, 0).maps.depth
     torch.testing.assert_close(depth.reshape(H // 2, W // 2), ByFocal()(*half(picture[None], K[None].float())).depth[0])
 
 

@@ -144,7 +144,7 @@ def test_ground_truth_is_at_the_pixels_of_each_rows_maps(sequence):
     assert sink.results[1].rows["network"].truth is None
     FrameStream(sequence, range(1), rows).drive([sink])
     depth = sink.results[-1].rows["depth"]
-    np.testing.assert_array_equal(depth.truth, depth.prediction.depth.numpy())
+    np.testing.assert_array_equal(depth.truth, depth.depth.numpy())
     assert depth.member is None
     assert "network" not in depth.ms
 
@@ -204,7 +204,7 @@ def test_a_state_taken_at_any_frame_gives_the_same_bits(tour):
                 other = actual.rows[key]
                 assert other.member == one.member
                 np.testing.assert_array_equal(other.T_world_cam, one.T_world_cam)
-                np.testing.assert_array_equal(other.estimate.variance.numpy(), one.estimate.variance.numpy())
+                np.testing.assert_array_equal(other.variance.numpy(), one.variance.numpy())
         last = stream.state()
         assert last.keys() == states[-1].keys()
         assert all(torch.equal(value, states[-1][key][name]) for key in last for name, value in last[key].items())

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_suite import Biased, base_network, evaluate, in_memory, row, write_network
+from tiny_suite import Biased, base_network, evaluate, in_memory, row, unbatched, write_network
 
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.anchors import Anchors
@@ -46,7 +46,7 @@ def by_hand(sequence, network, anchors_of, *, config=ON, setting=DEFAULT, correc
     """Metrics and the mean number of anchors used: ``anchors_of(frame, T, predicted, truth)``."""
     ufm, metrics, used = UfMStar(config), SequenceMetrics(), []
     for frame in list(sequence)[:: setting.skip + 1]:
-        T, p = perturbed(frame.T_world_cam, setting, frame.index), network.one(frame, 0)
+        T, p = perturbed(frame.T_world_cam, setting, frame.index), unbatched(network, frame)
         truth = truth_at(frame, p.intrinsics.numpy(), p.size)
         out = ufm(p.depth[None], torch.from_numpy(T)[None], p.intrinsics[None], anchors=anchors_of(frame, T, p, truth))
         depth, variance = out.corrected() if corrected else (out.depth, out.variance)
@@ -217,7 +217,7 @@ def test_ground_truth_helps_a_network_whose_views_agree_on_what_is_wrong(tour):
 
 def test_truth_is_exact_at_random_pixels_and_more_hold_the_fewer(tour):
     frame, p = tour[4], Biased().one(tour[4], 0)
-    truth = truth_at(frame, p.intrinsics.numpy(), p.size)
+    truth = truth_at(frame, p.intrinsics[0].numpy(), p.size)
 
     def drawn(count, seed=0):
         source = AnchorSource(Setting(anchors="truth", anchor_count=count, seed=seed), None)

@@ -11,9 +11,10 @@ import torch
 from layouts import truncate, write_generic, write_image
 from tiny_suite import CPU, base_network, evaluate, row, same, write_networks
 
-from ufmstar_torch.eval.engine.predictions import Prediction, PredictionKey, frame_digest, sequence_digest
+from ufmstar_torch.eval.engine.predictions import Predicted, PredictionKey, frame_digest, sequence_digest
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.suite.cache import CacheError, PredictionCache
+from ufmstar_torch.prediction import DepthPrediction
 
 ROWS = [row(name) for name in ("Ensemble", "UfM*-Ensemble", "UfM*-MCD", "MC-Dropout", "Evidential", "UfM-DepthOnly")]
 KEY = PredictionKey("a" * 64, "b" * 64, "frame-7", "all", "c" * 64)
@@ -34,7 +35,8 @@ def networks(tmp_path_factory):
 def maps(seed=0):
     depth, a, e = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(seed)).unbind()
     depth[0, 0], a[1, 1], e[2, 2] = torch.nan, torch.inf, -0.0
-    return Prediction(depth, a, e, torch.arange(9.0, dtype=torch.float64).reshape(3, 3) / 7)
+    K = torch.arange(9.0, dtype=torch.float64).reshape(1, 3, 3) / 7
+    return Predicted(DepthPrediction(depth[None], a[None], e[None]), K)
 
 
 class Counted(PredictionCache):
@@ -49,16 +51,17 @@ class Counted(PredictionCache):
         return known
 
 
-@pytest.mark.parametrize("left_out", [(), ("aleatoric",), ("aleatoric", "epistemic")])
+@pytest.mark.parametrize("left_out", [(), ("aleatoric_variance",), ("aleatoric_variance", "epistemic_variance")])
 def test_what_is_stored_is_read_bit_for_bit(tmp_path, left_out):
-    cache, written = Counted(tmp_path / "new" / "cache"), replace(maps(), **dict.fromkeys(left_out))
+    cache, whole = Counted(tmp_path / "new" / "cache"), maps()
+    written = whole._replace(maps=replace(whole.maps, **dict.fromkeys(left_out)))
     assert cache.load(KEY, CPU) is None
     cache.store(KEY, written)
     read = cache.load(KEY, CPU)
     assert (cache.hits, cache.misses) == (1, 1)
-    assert read.maps().keys() == written.maps().keys()
-    for name, value in written.maps().items():
-        assert torch.equal(read.maps()[name].view(torch.int32), value.view(torch.int32))
+    for name in ("depth", "aleatoric_variance", "epistemic_variance"):
+        one, other = getattr(read.maps, name), getattr(written.maps, name)
+        assert one is other is None or torch.equal(one.view(torch.int32), other.view(torch.int32))
     assert torch.equal(read.intrinsics, written.intrinsics)
     assert read.ms is None
 

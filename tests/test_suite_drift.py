@@ -14,10 +14,9 @@ from tiny_suite import row
 
 from ufmstar_torch.eval.bench.measure import measure
 from ufmstar_torch.eval.engine.anchors import anchor_sources
-from ufmstar_torch.eval.engine.estimators import Estimate
 from ufmstar_torch.eval.engine.judge import references
 from ufmstar_torch.eval.engine.maps import own_depth
-from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting, default_of, setting_from
@@ -25,6 +24,7 @@ from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import setting_of
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.prediction import DepthPrediction
 
 NAME = "UfM*-DepthOnly"
 BOTH = Setting(rotation_drift=0.5, translation_drift=0.02, seed=3)
@@ -182,22 +182,21 @@ class Poses:
 
     def update(self, predicted, T_world_cam, anchors=None):
         self.given.append(T_world_cam.numpy())
-        return Estimate(predicted.depth, None, predicted.depth > 0)
+        depth = predicted.maps.depth
+        return {"depth": depth, "variance": None, "valid": depth > 0}
 
 
 def test_a_row_sees_drift_and_noise_on_top_of_it():
     setting = Setting(rotation_drift=0.5, translation_drift=0.02, translation_noise=0.1, seed=3)
     poses = Poses()
     runner = RowRunner("drift", own_depth(), poses, setting=setting)
-    one = Prediction(torch.ones(2, 2), None, None, torch.eye(3, dtype=torch.float64))
+    one = Predicted(DepthPrediction(torch.ones(1, 2, 2)), torch.eye(3, dtype=torch.float64)[None])
     for i in range(0, 20, 4):
         frame = Frame(i, str(i), None, None, WALK[i], np.eye(3))
-        given = runner.begin(frame, one, None)
-        given.answer = poses.update(*given.of_estimator())
-        runner.finish(given, frame.name)
+        result = runner.update(frame, one, None)
     expected = [perturbed(T, setting, i) for T, i in zip(drifted(BOTH, range(0, 20, 4)), range(0, 20, 4), strict=True)]
     np.testing.assert_allclose(np.stack(poses.given), np.stack(expected), atol=1e-12)
-    np.testing.assert_array_equal(given.T_world_cam, poses.given[-1])
+    np.testing.assert_array_equal(result.T_world_cam, poses.given[-1])
 
 
 def test_rows_of_one_drift_share_a_tracker_and_a_reference():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from layouts import truncate, write_generic, write_tum
-from tiny_suite import CPU, base_network, evaluate, row, same, write_networks
+from tiny_suite import CPU, base_network, evaluate, row, same, unbatched, write_networks
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.eval.engine.evaluate import SequenceError
@@ -173,13 +173,13 @@ def test_samples_depend_on_the_frame_and_their_number_alone(texts, networks, seq
     network = networks["mc_dropout"]
     frames = [sequence[i] for i in range(3)]
     requested = [(2, 1), (0, 0), (1, 2), (0, 1), (2, 0), (2, 1), (0, 0)]
-    first = {key: network.one(frames[key[0]], key[1]).depth for key in requested}
+    first = {key: network.one(frames[key[0]], key[1]).maps.depth for key in requested}
     other = base_network(texts["mc_dropout"], samples=3)
     for key in reversed(requested):
-        assert torch.equal(other.one(frames[key[0]], key[1]).depth, first[key])
+        assert torch.equal(other.one(frames[key[0]], key[1]).maps.depth, first[key])
     assert not torch.equal(first[0, 0], first[0, 1])
     same_image = replace(frames[0], index=1)
-    assert not torch.equal(network.one(same_image, 0).depth, first[0, 0]), "each frame has its own draw"
+    assert not torch.equal(network.one(same_image, 0).maps.depth, first[0, 0]), "each frame has its own draw"
 
 
 def test_mc_dropout_equals_seeded_passes_by_hand(texts, networks, sequence):
@@ -213,7 +213,7 @@ def test_a_network_that_samples_stops_doing_so_for_other_bases(texts, sequence):
     text = texts["mc_dropout"].replace("mc_dropout", "aleatoric", 1)
     network = base_network(text)
     assert not isinstance(network.networks[0], MonteCarloDropout)
-    assert torch.equal(network.one(sequence[0], 0).depth, network.one(sequence[0], 0).depth)
+    assert torch.equal(network.one(sequence[0], 0).maps.depth, network.one(sequence[0], 0).maps.depth)
 
 
 # ---- one pass ----
@@ -300,7 +300,7 @@ def test_the_nll_by_error_is_over_the_pixels_where_the_reference_is_confident(ne
     assert set(actual["Evidential"].sums) == {"metrics", "nll_by_error:Evidential"}
     network = networks["aleatoric"]
     for frame, *_ in frames_of(sequence):
-        p = network.one(frame, 0)
+        p = unbatched(network, frame)
         truth = torch.from_numpy(truth_at(frame, p.intrinsics.numpy(), p.size))
         judged_here = (truth > 0) & (p.depth > 0)
         order = p.aleatoric[judged_here].sort().values

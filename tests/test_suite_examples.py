@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from layouts import truncate, write_generic
-from tiny_suite import base_network, evaluate, row, write_networks
+from tiny_suite import base_network, evaluate, row, unbatched, write_networks
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.sequences import open_sequence
@@ -50,7 +50,7 @@ def test_a_few_evenly_spaced_frames(folder, sequence):
 def test_the_maps_are_the_frames(folder, networks, sequence):
     ufm = UfMStar()
     for frame in sequence:
-        p = networks["aleatoric"].one(frame, 0)
+        p = unbatched(networks["aleatoric"], frame)
         out = ufm(p.depth[None], torch.from_numpy(frame.T_world_cam), p.intrinsics, p.aleatoric[None])
         if frame.index == 1:
             break
@@ -84,7 +84,7 @@ def test_rooms_in_the_world(folder, networks, sequence):
     assert names == sorted(f"UfMstar-Aleatoric_{sequence.names[i]}.npz" for i in (1, 2, 5))
     ufm = UfMStar()
     for frame in sequence:
-        p = networks["aleatoric"].one(frame, 0)
+        p = unbatched(networks["aleatoric"], frame)
         ufm(p.depth[None], torch.from_numpy(frame.T_world_cam), p.intrinsics, p.aleatoric[None])
     stored = read(folder / "room" / f"UfMstar-Aleatoric_{sequence.names[5]}.npz")
     mixture, T = ufm.mixture, ufm.T_world_first[0]

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
-from tiny_suite import CPU, base_network, row, write_network, write_networks
+from tiny_suite import CPU, base_network, row, unbatched, write_network, write_networks
 from walks import SPGF, oracle_settings
 
 import oracle
@@ -20,11 +20,12 @@ import scenes
 from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import Gaussians, ufm_star_config
 from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.perturb import perturbed, rotation, selects
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.models import Preprocess
+from ufmstar_torch.prediction import DepthPrediction
 
 PICTURE = np.random.default_rng(3).integers(0, 256, (72, 96, 3), dtype=np.uint8)
 POSE = np.block([[Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix(), np.array([[1.0], [2], [3]])], [np.eye(4)[3:]]])
@@ -311,15 +312,15 @@ def test_a_in_h_agrees_with_the_oracle():
     depths, poses, K = scenes.sequence(3, 30, 40, 0.05)
     for i, (depth, T) in enumerate(zip(depths[:2], poses[:2], strict=True)):
         a = 0.01 * (1 + i) * depth**2
-        given = Prediction(torch.tensor(depth), torch.tensor(a), None, torch.tensor(K))
-        estimate = estimator.update(given, torch.tensor(T))
+        maps = DepthPrediction(torch.tensor(depth)[None], torch.tensor(a)[None])
+        answer = estimator.update(Predicted(maps, torch.tensor(K)[None]), torch.tensor(T))
         _, M = judge.step(depth, T, K, features=a[None])
         A = oracle.aleatoric_in_h(judge.mixture_cam, depth, depth > 0, K, a, prior_weight=1.0)
-        np.testing.assert_allclose(estimate.aleatoric.numpy(), A, rtol=1e-5)
-        np.testing.assert_allclose(estimate.variance.numpy(), M + A, rtol=1e-3, atol=1e-5)
+        np.testing.assert_allclose(answer["aleatoric"][0].numpy(), A, rtol=1e-5)
+        np.testing.assert_allclose(answer["variance"][0].numpy(), M + A, rtol=1e-3, atol=1e-5)
     assert np.nanmax(np.abs(A - a)) > 0.01, "the mixture's average is not the pixel's own"
     with pytest.raises(ValueError, match="needs a network that predicts an aleatoric variance"):
-        estimator.update(Prediction(given.depth, None, None, given.intrinsics), torch.tensor(T))
+        estimator.update(Predicted(DepthPrediction(maps.depth), torch.tensor(K)[None]), torch.tensor(T))
 
 
 def test_a_in_h_is_a_row_of_its_own():
@@ -352,7 +353,7 @@ def test_a_row_prepares_its_images_as_it_says(tmp_path):
         x, K_x = preprocess(image, K)
         with torch.no_grad():
             expected = source.networks[0](x)
-        made = one.one(frame, 0)
+        made = unbatched(one, frame)
         torch.testing.assert_close(made.depth, expected.depth[0], rtol=1e-5, atol=1e-6)
         assert torch.equal(made.intrinsics, K_x[0])
     assert Preprocess.nyu().of_whole_frame() == Preprocess(size=(224, 224))

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import torch
 
 from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
 from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
 from ufmstar_torch.eval.sequences.frame import Entry
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
+from ufmstar_torch.prediction import DepthPrediction
 
 CPU = torch.device("cpu")
 SPECS = {
@@ -81,6 +83,14 @@ def evaluate(sequence, rows, networks, store=None, *, sinks=(), progress=lambda 
     return {result.row.slug: result for result in results}
 
 
+def unbatched(source, frame, n=0):
+    """A source's prediction for a frame without the leading dimension."""
+    maps, K, _ = source.one(frame, n)
+    own = {"aleatoric": maps.aleatoric_variance, "epistemic": maps.epistemic_variance}
+    own = {name: None if value is None else value[0] for name, value in own.items()}
+    return SimpleNamespace(depth=maps.depth[0], intrinsics=K[0], size=tuple(maps.depth.shape[1:]), **own)
+
+
 def same(one, other):
     """Whether two results agree to the last bit, times left aside."""
     return (
@@ -110,7 +120,8 @@ class Biased:
 
     def one(self, frame, n):
         depth = np.where(frame.depth > 2, 1.4, 1.0) * frame.depth
-        return Prediction(torch.from_numpy(depth).float(), None, None, torch.from_numpy(frame.intrinsics))
+        maps = DepthPrediction(torch.from_numpy(depth).float()[None])
+        return Predicted(maps, torch.from_numpy(frame.intrinsics)[None])
 
 
 def in_memory(sequence, part):

@@ -106,13 +106,13 @@ class NetworksInTurn(nn.Module):
 
     def __init__(
         self,
-        networks: nn.Module | Sequence[nn.Module],
+        networks: nn.Module | Sequence[nn.Module] | None,
         *,
         samples: int | None = None,
         preprocess: Preprocess | None = None,
     ) -> None:
         super().__init__()
-        members = _modules(networks)
+        members = [] if networks is None else _modules(networks)
         if samples is not None and (samples < 1 or len(members) > 1):
             raise ValueError(f"samples must be at least 1 and goes with one network, got {samples} of {len(members)}")
         self.networks = nn.ModuleList(members).eval()
@@ -167,8 +167,9 @@ class UncertainDepth(NetworksInTurn):
 
     Args:
         networks: one network or a sequence of them (an ensemble's members; BatchEnsemble members as
-            separate callables). Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`; one with an
-            attribute ``takes_intrinsics = True`` is called as ``network(x, K)`` with K [B, 3, 3] [px] of ``x``.
+            separate callables); None: predictions are given to :meth:`update`. Each maps an image [B, 3, H, W] to a
+            :class:`DepthPrediction`; one with an attribute ``takes_intrinsics = True`` is called as
+            ``network(x, K)`` with K [B, 3, 3] [px] of ``x``.
         config: of UfM*; where ``segment.max_depth`` is None, it becomes the networks' (:attr:`max_depth`). With
             ``features=1`` the network's aleatoric variance is averaged per Gaussian and regressed
             as the second entry of H (``ufm.features``), unless other features are given.
@@ -208,7 +209,7 @@ class UncertainDepth(NetworksInTurn):
 
     def __init__(
         self,
-        networks: nn.Module | Sequence[nn.Module],
+        networks: nn.Module | Sequence[nn.Module] | None,
         config: UfMStarConfig | None = None,
         *,
         mode: str = "alternate",
@@ -219,7 +220,7 @@ class UncertainDepth(NetworksInTurn):
         recalibration: Recalibration | None = None,
         multiview_device: torch.device | str | None = None,
     ) -> None:
-        single = len(_modules(networks)) == 1
+        single = networks is not None and len(_modules(networks)) == 1
         if mode not in ("alternate", "full"):
             raise ValueError(f"mode must be 'alternate' or 'full', got {mode!r}")
         if samples is not None and (samples < 2 or not single or mode != "full"):
@@ -301,10 +302,39 @@ class UncertainDepth(NetworksInTurn):
     ) -> UncertainPrediction:
         K, prediction = given.intrinsics, given.arrived()
         with self._anchored(image, pose, intrinsics, K, anchors) as own:
-            a, e = prediction.aleatoric_variance, prediction.epistemic_variance
-            ufm = self.ufm(prediction.depth, pose, K, a, e, valid, anchors=own, features=given.features)
-        self._done(ufm.statistics)
+            ufm = self.update(prediction, pose, K, valid, features=given.features, anchors=own)
+        self._undo(ufm.statistics)
         return UncertainPrediction(prediction, ufm, K, given.member)
+
+    def update(
+        self,
+        prediction: DepthPrediction,
+        pose: Tensor,
+        intrinsics: Tensor,
+        valid: Tensor | None = None,
+        *,
+        features: Tensor | None = None,
+        anchors: Anchors | None = None,
+    ) -> UfMStarOutput:
+        """Process a prediction that is there already (cached, or from elsewhere), as :meth:`forward` does after its
+        networks.
+
+        Args:
+            prediction: [B, h, w].
+            pose: [B, 4, 4] or [4, 4] camera-to-world [m].
+            intrinsics: [B, 3, 3] or [3, 3] of the depth map [px].
+            valid, features: as in :meth:`forward`.
+            anchors: [B, N] in the pixels of the depth map; None = none, also with a source of anchors.
+
+        Raises:
+            ValueError, TypeError: as :meth:`UfMStar.forward`; the images are not counted then.
+        """
+        a, e = prediction.aleatoric_variance, prediction.epistemic_variance
+        out: UfMStarOutput = self.ufm(
+            prediction.depth, pose, intrinsics, a, e, valid, anchors=anchors, features=features
+        )
+        self._count(self._next + 1)
+        return out
 
     def mean_uncertainty(
         self,
@@ -338,7 +368,8 @@ class UncertainDepth(NetworksInTurn):
             mean = self.ufm.mean_uncertainty(
                 prediction.depth, pose, K, a, e, valid, anchors=own, features=given.features, **sample
             )
-        self._done(mean.statistics)
+        self._undo(mean.statistics)
+        self._count(self._next + 1)
         return mean
 
     @contextmanager
@@ -362,16 +393,17 @@ class UncertainDepth(NetworksInTurn):
                 self.landmarks.undo()
             raise
 
-    def _done(self, statistics: FrameStatistics) -> None:
-        """Count an image; of streams that skipped it, the landmarks forget it."""
+    def _undo(self, statistics: FrameStatistics) -> None:
+        """The landmarks of streams that skipped an image forget it."""
         if self.landmarks is not None:
             self.landmarks.undo(statistics.fault.nonzero().flatten().tolist())
-        self._count(self._next + 1)
 
     def _predicted(
         self, image: Tensor, intrinsics: Tensor, features: Tensor | None, *, ahead: bool = False
     ) -> _Predicted:
         """The prediction for the next image, or, with ``ahead``, for the one after that."""
+        if not self.networks:
+            raise ValueError("UncertainDepth(None) has no networks: give the predictions to update")
         if image.dim() != 4 or image.shape[1] != 3:
             raise ValueError(f"image must be [B, 3, H, W], got {tuple(image.shape)}")
         member = None if self.mode == "full" else self.turn(self._next + ahead)

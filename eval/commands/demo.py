@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ufmstar_torch.eval.commands.options import UsageError, as_dict, parse
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.engine.evaluate import RowResult
+    from ufmstar_torch.eval.engine.evaluate import RowFigures
     from ufmstar_torch.eval.engine.progress import Progress
 
 _WEIGHTS = ("weights", "demo.safetensors")
@@ -162,7 +162,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     return plain
 
 
-def _figures(result: RowResult, state_bytes: int) -> dict[str, Any]:
+def _figures(result: RowFigures, state_bytes: int) -> dict[str, Any]:
     """A row of the table: figures, median times [ms] and the bytes of its state."""
     ms = result.ms
     own = ms.get("anchors", 0.0) + ms["uncertainty"] if result.state else None
@@ -174,7 +174,7 @@ def _figures(result: RowResult, state_bytes: int) -> dict[str, Any]:
     }
 
 
-def _own_curves(result: RowResult) -> dict[str, Any]:
+def _own_curves(result: RowFigures) -> dict[str, Any]:
     """The curves of a row but for those that depend on other rows (``RowMetrics.curves``)."""
     return {name: values for name, values in result.curves.items() if ":" not in name}
 

@@ -10,6 +10,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.work_items import Shard
+from ufmstar_torch.prediction import DepthPrediction
 
 _FILE_BYTES = 2048  # of a cached file beside its maps, rounded up to what file systems allot
 
@@ -62,7 +63,11 @@ def _bytes_per_file(sequence: FrameSequence, networks: Mapping[str, DepthSource]
             made = {base: network.one(frame, 0) for base, network in networks.items() if network.cacheable}
         except FrameError:
             continue
-        # All members together have an epistemic variance, whatever a single one has.
-        counts = {base: max(len(one.maps()), 3 if networks[base].passes > 1 else 1) for base, one in made.items()}
-        return {base: _FILE_BYTES + 4 * counts[base] * one.depth.numel() for base, one in made.items()}
+        return {base: _FILE_BYTES + _maps(one.maps, networks[base].passes > 1) for base, one in made.items()}
     return None
+
+
+def _maps(maps: DepthPrediction, several: bool) -> int:
+    """Bytes of the maps in single precision; all of several members have an epistemic variance together."""
+    own = [value for value in (maps.aleatoric_variance, maps.epistemic_variance) if value is not None]
+    return 4 * maps.depth.numel() * (3 if several else 1 + len(own))

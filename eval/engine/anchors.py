@@ -16,11 +16,13 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, LandmarkSource, landmark_source
-from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker, TrackerConfig
-from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.anchors.streams import StreamLandmarks
+from ufmstar_torch.anchors.tracker import Landmarks, TrackerConfig
+from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED, TRUTH, Setting
 from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.sequences.options import resolve
 
 # Anchors of ground truth in a frame, about as many as a tracker finds, and their standard deviation as a share of the
@@ -43,20 +45,19 @@ class FrameAnchors:
 
 
 class Tracks:
-    """Landmarks of rows that see the same images at the same poses: each image is taken in once.
+    """Landmarks of rows that see the same images at the same poses: each image is processed once.
 
     Args:
         source: in its initial state; None = a tracker of corners.
     """
 
     def __init__(self, source: LandmarkSource | None = None) -> None:
-        self._tracker = LandmarkTracker() if source is None else source
-        self._before: Mapping[str, Tensor] = {}
+        self._streams = StreamLandmarks(CORNERS if source is None else source)
         self._last: tuple[Frame, Landmarks, float] | None = None
 
     def of(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:
-        """Landmarks of a frame, which follows those that were asked for before, at the pose [4, 4] with its noise [m],
-        and the time that they took [ms]. None without an image that the source needs; the source stays as it is.
+        """Landmarks of the next frame, at the pose [4, 4] with its noise [m], and the time that they took [ms]. None
+        without an image that the source needs; the source stays as it is.
 
         Raises:
             ModuleNotFoundError: OpenCV is not installed.
@@ -64,25 +65,25 @@ class Tracks:
         """
         if self._last is not None and self._last[0] is frame:
             return self._last[1:]
-        self._before = self._tracker.state()
-        if frame.image is None and self._tracker.needs_image:
+        if frame.image is None and self._streams.needs_image:
             return None
+        image = None if frame.image is None else image_tensor(frame)
         started = perf_counter()
-        landmarks = self._tracker.update(frame.image, T_world_cam, frame.intrinsics)
-        self._last = frame, landmarks, 1000 * (perf_counter() - started)
+        self._streams.update(image, torch.from_numpy(T_world_cam), torch.from_numpy(frame.intrinsics))
+        self._last = frame, self._streams.last[0], 1000 * (perf_counter() - started)
         return self._last[1:]
 
     def undo(self) -> None:
         """Forget the last frame: UfM* skipped it, and its pose is not to be trusted."""
-        self._tracker.load_state(self._before)
+        self._streams.undo()
 
     def state(self) -> dict[str, Tensor]:
         """All tensors on which the next frame's landmarks depend."""
-        return self._tracker.state()
+        return self._streams.state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Continue where ``state`` was taken. Raises ValueError: it is of a tracker of another size."""
-        self._tracker.load_state(state)
+        self._streams.load_state(state)
         self._last = None
 
 
@@ -103,20 +104,20 @@ class AnchorSource:
         self._setting, self.tracks = setting, tracks
 
     def of(
-        self, frame: Frame, T_world_cam: NDArray[np.float64], prediction: Prediction, truth: NDArray[np.float32] | None
+        self, frame: Frame, T_world_cam: NDArray[np.float64], predicted: Predicted, truth: NDArray[np.float32] | None
     ) -> FrameAnchors:
         """The anchors of the next frame, at the pose [4, 4] that the row sees [m], in the camera of the prediction;
         ``truth`` [h, w] is the ground truth at its pixels [m], 0 = none, or None."""
-        device = prediction.depth.device
+        device = predicted.maps.depth.device
         if self.tracks is None:
-            known = np.zeros(prediction.size, np.float32) if truth is None else truth
+            known = np.zeros(predicted.size, np.float32) if truth is None else truth
             sampled = self._sampled(known, frame.index).to(device)
             return FrameAnchors(sampled, triangulated=sampled.depth.shape[1], none="no ground truth")
         tracked = self.tracks.of(frame, T_world_cam)
         if tracked is None:
             return FrameAnchors(None, none="no image")
         landmarks, ms = self._thinned(self._disturbed(tracked[0], frame.index), frame.index), tracked[1]
-        anchors = landmarks.anchors(frame.intrinsics, prediction.intrinsics).to(device)
+        anchors = landmarks.anchors(frame.intrinsics, predicted.intrinsics[0]).to(device)
         return FrameAnchors(anchors, landmarks.tracked, len(landmarks.depth), ms, landmarks.none)
 
     def _sampled(self, truth: NDArray[np.float32], index: int) -> Anchors:

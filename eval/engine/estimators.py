@@ -12,48 +12,41 @@ from torch import Tensor, nn
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.method import ALONE, UFM
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.output import FrameStatistics
+from ufmstar_torch.pipeline import UncertainDepth
+from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
 
+# The maps of an answer [1, h, w] on the estimator's device, by the names of ``RowResult``; "statistics" of UfM*.
+Answer = dict[str, Any]
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """A row's answer for one frame: maps [h, w] on the CPU."""
 
-    depth: Tensor  # as predicted, or corrected by the anchors' bias, where the row is about that [m]
-    # total variance [m^2], NaN where not valid; None for a network that predicts depth alone.
-    variance: Tensor | None
-    # bool, True where there is a prediction: depth is positive and finite, and so is every variance used.
-    valid: Tensor
-    # aleatoric, epistemic: A and E as far as the row uses them [m^2], or None.
-    aleatoric: Tensor | None = None
-    epistemic: Tensor | None = None
-    disagreement: Tensor | None = None  # M of UfM* [m^2], or None
-    anchored: Tensor | None = None  # B of UfM* with anchors [m^2], or None
-    bias: Tensor | None = None  # r of UfM* with anchors, or None
-    posterior_depth: Tensor | None = None  # of UfM* with anchors and a posterior [m], or None
-    posterior_variance: Tensor | None = None  # likewise [m^2]
-    statistics: FrameStatistics | None = None  # of UfM*, [1] per count, or None
+_OF_OUTPUT = (
+    "depth", "variance", "valid", "aleatoric", "epistemic", "disagreement", "anchored", "bias", "posterior_depth",
+    "posterior_variance", "statistics",
+)  # fmt: skip
 
 
 class Estimator(ABC):
-    """Turns the predictions of a sequence, one after the other, into variances; this one remembers nothing."""
+    """Turns the predictions of a sequence, one after the other, into variances; this one keeps no state."""
 
     @abstractmethod
-    def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
+    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
         """Process the next frame.
 
         Args:
-            prediction: [h, w] maps on the estimator's device.
+            predicted: maps on the estimator's device.
             T_world_cam: [4, 4] float64 camera-to-world [m], on the CPU.
             anchors: [1, N] of the frame in the map's pixels; None = none.
+
+        Returns:
+            "depth", "variance", "valid" and others of ``RowResult``.
         """
 
     def memory(self) -> dict[str, float]:
@@ -121,14 +114,14 @@ class Alone(Estimator):
 
     uses_variances: bool = True  # False leaves A and E aside, so that there is no variance
 
-    def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
-        a, e = _variances(prediction, self.uses_variances)
+    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
+        depth, a, e = _maps(predicted, self.uses_variances)
         parts = [part for part in (a, e) if part is not None]
-        valid = (prediction.depth > 0) & prediction.depth.isfinite()
+        valid = (depth > 0) & depth.isfinite()
         for part in parts:
             valid = valid & part.isfinite() & (part >= 0)
         variance = torch.where(valid, sum(parts[1:], start=parts[0]), torch.nan) if parts else None
-        return _estimate(depth=prediction.depth, variance=variance, valid=valid, aleatoric=a, epistemic=e)
+        return {"depth": depth, "variance": variance, "valid": valid, "aleatoric": a, "epistemic": e}
 
 
 class Pointwise(Estimator):
@@ -138,10 +131,10 @@ class Pointwise(Estimator):
         self.ufm = UfM(config, device=device)
         self._uses_variances = uses_variances
 
-    def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
-        a, e = _variances(prediction, self._uses_variances)
-        out = self.ufm(prediction.depth[None], T_world_cam, prediction.intrinsics, _one(a), _one(e))
-        return _estimate(depth=prediction.depth, variance=out.variance[0], valid=out.valid[0], aleatoric=a, epistemic=e)
+    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
+        depth, a, e = _maps(predicted, self._uses_variances)
+        out = self.ufm(depth, T_world_cam, predicted.intrinsics, a, e)
+        return {"depth": depth, "variance": out.variance, "valid": out.valid, "aleatoric": a, "epistemic": e}
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points."""
@@ -182,48 +175,36 @@ class Gaussians(Estimator):
         recalibration: Recalibration | None = None,
         aleatoric_in_h: bool = False,
     ) -> None:
-        self.ufm = UfMStar(config, extensions=() if recalibration is None else (recalibration,), device=device)
+        self.model = UncertainDepth(None, config, recalibration=recalibration).to(device)
         self._uses_variances, self._corrected, self._in_h = uses_variances, corrected, aleatoric_in_h
         self._posterior = posterior
         self._anchors = 0
 
-    def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
+    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
         """See :meth:`Estimator.update`. Raises ValueError: ``aleatoric_in_h`` without an aleatoric variance."""
-        a, e = _variances(prediction, self._uses_variances)
+        depth, a, e = _maps(predicted, self._uses_variances)
         features = None
         if self._in_h:
             if a is None:
                 raise ValueError("aleatoric_in_h needs a network that predicts an aleatoric variance")
-            features = torch.stack([a, torch.ones_like(a)])[None]
-        out = self.ufm(
-            prediction.depth[None],
-            T_world_cam,
-            prediction.intrinsics,
-            _one(a),
-            _one(e),
-            features=features,
-            anchors=anchors,
-        )
-        used = out.statistics.anchors_used
-        self._anchors = 0 if used is None else int(used[0])
-        depth, variance = out.corrected() if self._corrected else (out.depth, out.variance)
-        if self._posterior:
-            depth, variance = out.posterior()
+            features = torch.stack([a, torch.ones_like(a)], dim=1)
+        used = DepthPrediction(depth, a, e)
+        out = self.model.update(used, T_world_cam, predicted.intrinsics, features=features, anchors=anchors)
+        anchors_used = out.statistics.anchors_used
+        self._anchors = 0 if anchors_used is None else int(anchors_used[0])
+        answer = {name: getattr(out, name) for name in _OF_OUTPUT}
+        if self._corrected or self._posterior:
+            answer["depth"], answer["variance"] = out.posterior() if self._posterior else out.corrected()
         if self._in_h and a is not None:
             mixed, explained = out.features.unbind(-1)
-            a = (mixed + (1 - explained) * a)[0]
-            variance = variance + a
-        optional = {name: getattr(out, name) for name in ("anchored", "bias", "posterior_depth", "posterior_variance")}
-        return _estimate(
-            depth=depth[0],
-            variance=variance[0],
-            valid=out.valid[0],
-            aleatoric=a,
-            epistemic=e,
-            disagreement=out.disagreement[0],
-            **{name: None if value is None else value[0] for name, value in optional.items()},
-            statistics=out.statistics,
-        )
+            a = mixed + (1 - explained) * a
+            answer |= {"aleatoric": a, "variance": answer["variance"] + a}
+        return answer
+
+    @property
+    def ufm(self) -> UfMStar:
+        """The module with the mixture."""
+        return self.model.ufm
 
     def mixture_world(self) -> GaussianMixture:
         """[1, K] M_i in the world's frame, float64; after a frame."""
@@ -254,19 +235,10 @@ class Gaussians(Estimator):
         _load(self.ufm, state)
 
 
-def _variances(prediction: Prediction, used: bool) -> tuple[Tensor | None, Tensor | None]:
-    return (prediction.aleatoric, prediction.epistemic) if used else (None, None)
-
-
-def _one(value: Tensor | None) -> Tensor | None:
-    """As a batch of one."""
-    return None if value is None else value[None]
-
-
-def _estimate(*, statistics: FrameStatistics | None = None, **maps: Tensor | None) -> Estimate:
-    """With all maps on the CPU."""
-    on_cpu: dict[str, Any] = {name: None if value is None else value.cpu() for name, value in maps.items()}
-    return Estimate(**on_cpu, statistics=statistics)
+def _maps(predicted: Predicted, uses_variances: bool) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """Depth, A and E as far as the row uses them."""
+    maps = predicted.maps
+    return (maps.depth, *((maps.aleatoric_variance, maps.epistemic_variance) if uses_variances else (None, None)))
 
 
 def _load(module: nn.Module, state: Mapping[str, Tensor]) -> None:

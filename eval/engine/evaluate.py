@@ -44,8 +44,8 @@ BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
 
 
 @dataclass(frozen=True)
-class RowResult:
-    """One row on one sequence."""
+class RowFigures:
+    """The figures of one row on one sequence."""
 
     row: Row  # which
     # frames, figures, curves, state, ms: as ``Record`` has them.
@@ -87,7 +87,7 @@ def evaluate_sequence(
     sinks: Sequence[FrameSink] = (),
     progress: Callable[[Progress], object] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
-) -> list[RowResult]:
+) -> list[RowFigures]:
     """Judge every row on the frames of a sequence.
 
     Args:
@@ -130,7 +130,7 @@ def evaluate_sequence(
     return [_result(row, metrics, accounts, left_out) for row in rows]
 
 
-def _result(row: Row, metrics: RowMetrics, accounts: _Accounts, left_out: Mapping[str, Any]) -> RowResult:
+def _result(row: Row, metrics: RowMetrics, accounts: _Accounts, left_out: Mapping[str, Any]) -> RowFigures:
     """Of one row after the last frame. Raises SequenceError: it has judged nothing."""
     key = row.slug
     frames = accounts.frames(key, metrics.judged[key])
@@ -138,7 +138,7 @@ def _result(row: Row, metrics: RowMetrics, accounts: _Accounts, left_out: Mappin
         reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
         none = "none of those that were read has ground truth"
         raise SequenceError(f"no frame could be judged: {reasons or none}")
-    return RowResult(
+    return RowFigures(
         row=row,
         frames={**frames, **left_out},
         figures=metrics.figures(key),

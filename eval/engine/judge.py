@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.estimators import Estimate
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, RowFrame
+from ufmstar_torch.eval.engine.rows import RowResult
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink
 from ufmstar_torch.eval.methods import method
 from ufmstar_torch.eval.methods.row import Row
 
@@ -68,13 +68,13 @@ class RunMetrics(FrameSink):
         row = result.rows.get(self._key)
         if row is None or row.truth is None:
             return
-        target, estimate, own = torch.from_numpy(row.truth), row.estimate, row.prediction.variance
-        maps: dict[str, tuple[Tensor, Tensor | None]] = {UFM: (estimate.depth, estimate.variance)}
-        maps |= {} if own is None else {ALONE: (estimate.depth, own.cpu())}
-        if estimate.posterior_depth is not None:
-            maps[POSTERIOR] = estimate.posterior_depth, estimate.posterior_variance
+        target = torch.from_numpy(row.truth)
+        maps: dict[str, tuple[Tensor, Tensor | None]] = {UFM: (row.depth, row.variance)}
+        maps |= {} if row.network_variance is None else {ALONE: (row.depth, row.network_variance)}
+        if row.posterior_depth is not None:
+            maps[POSTERIOR] = row.posterior_depth, row.posterior_variance
         for name, (depth, variance) in maps.items():
-            metrics_of(self._metrics, name).update(depth, variance, target, estimate.valid)
+            metrics_of(self._metrics, name).update(depth, variance, target, row.valid)
 
 
 class RowMetrics(FrameSink):
@@ -102,26 +102,23 @@ class RowMetrics(FrameSink):
         """Add a frame."""
         targets = {key: torch.from_numpy(row.truth) for key, row in result.rows.items() if row.truth is not None}
         expected = {other for key in targets for other in self._references[key]}
-        masks = {
-            other: confident_pixels(result.rows[other].estimate, targets[other], self._confident) for other in expected
-        }
+        masks = {other: confident_pixels(result.rows[other], targets[other], self._confident) for other in expected}
         for key, target in targets.items():
             self._judge(key, result.rows[key], target, masks)
 
-    def _judge(self, key: str, row: RowFrame, target: Tensor, masks: Mapping[str, Tensor]) -> None:
+    def _judge(self, key: str, row: RowResult, target: Tensor, masks: Mapping[str, Tensor]) -> None:
         from ufmstar_torch.eval.metrics import NLLByError
 
         self.judged[key] += 1
-        estimate = row.estimate
-        depth = torch.where(estimate.valid, estimate.depth, torch.nan)
-        metrics = metrics_of(self._metrics, key, with_variance=estimate.variance is not None, bins=self._bins)
-        metrics.update(depth, estimate.variance, target)
-        if estimate.variance is None:
+        depth = torch.where(row.valid, row.depth, torch.nan)
+        metrics = metrics_of(self._metrics, key, with_variance=row.variance is not None, bins=self._bins)
+        metrics.update(depth, row.variance, target)
+        if row.variance is None:
             return
         binned = self._by_error.setdefault(key, {})
         for other, name in self._references[key].items():
             by_error = binned.setdefault(name, NLLByError(sync_on_compute=False))
-            by_error.update(depth, estimate.variance, target, masks[other])
+            by_error.update(depth, row.variance, target, masks[other])
 
     def figures(self, key: str) -> dict[str, float]:
         """``SequenceMetrics.compute`` of a judged row."""
@@ -164,13 +161,13 @@ def references(row: Row, rows: Sequence[Row]) -> list[Row]:
     return chosen
 
 
-def confident_pixels(estimate: Estimate, truth: Tensor, share: float) -> Tensor:
+def confident_pixels(row: RowResult, truth: Tensor, share: float) -> Tensor:
     """[h, w] bool, of the pixels with ground truth [h, w] [m] (0 = none) those whose variance is at or below the
     frame's ``share`` quantile, in (0, 1]."""
-    assert estimate.variance is not None
-    judged = estimate.valid & (truth > 0)
-    values = estimate.variance[judged]
+    assert row.variance is not None
+    judged = row.valid & (truth > 0)
+    values = row.variance[judged]
     if not len(values):
         return judged
     threshold = values.kthvalue(max(1, math.ceil(share * len(values)))).values
-    return judged & (torch.where(judged, estimate.variance, torch.inf) <= threshold)
+    return judged & (torch.where(judged, row.variance, torch.inf) <= threshold)

@@ -12,13 +12,14 @@ import numpy as np
 import torch
 
 from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.eval.engine.predictions import DepthSource, Prediction
+from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
 from ufmstar_torch.eval.methods.setting import CROP
 from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.own_output import own_output
+from ufmstar_torch.prediction import DepthPrediction
 
 
 class PredictedMap(NamedTuple):
@@ -51,7 +52,7 @@ class MapSource(DepthSource):
             raise ValueError(f'preprocess = "{CROP}" goes with networks: maps exist already')
         return self
 
-    def one(self, frame: Frame, n: int) -> Prediction:
+    def one(self, frame: Frame, n: int) -> Predicted:
         """The frame's map, resized by taking the nearest pixel; no network runs. Raises FrameError: it has none, or it
         cannot be read."""
         depth, variance, K = self._read(frame)
@@ -60,8 +61,8 @@ class MapSource(DepthSource):
             K = resize_intrinsics(torch.from_numpy(K), (height, width), self._size).numpy()
             depth = resample_nearest(depth, before, K, self._size)
             variance = None if variance is None else resample_nearest(variance, before, K, self._size)
-        spread = None if variance is None else torch.from_numpy(variance)
-        return Prediction(torch.from_numpy(depth), spread, None, torch.from_numpy(K).double())
+        aleatoric = None if variance is None else torch.from_numpy(variance)[None]
+        return Predicted(DepthPrediction(torch.from_numpy(depth)[None], aleatoric), torch.from_numpy(K)[None].double())
 
 
 def folder_source(

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.eval.engine.clock import StageTimer
-from ufmstar_torch.eval.engine.predictions import DepthSource, Prediction
+from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
 from ufmstar_torch.eval.methods.setting import CROP, OF_NETWORK, RESIZE
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
@@ -95,7 +95,7 @@ class NetworkSource(DepthSource):
         """See :class:`DepthSource`."""
         return self._turns.turn(position)
 
-    def one(self, frame: Frame, n: int) -> Prediction:
+    def one(self, frame: Frame, n: int) -> Predicted:
         """One inference, of member (or sample) n. Raises FrameError: the frame has no image."""
         if self._seeding == "frame" and self._seeded is not frame:  # a frame seeds once for all members
             self._generator.manual_seed(frame.index)
@@ -106,8 +106,8 @@ class NetworkSource(DepthSource):
                 self._generator.manual_seed(frame.index + _SAMPLE_STRIDE * n)
             reduced = self._precision == BF16
             with self._timer.stage("network"), torch.autocast(self._device.type, torch.bfloat16, enabled=reduced):
-                prediction = self._turns.member(x, K, n)
-        made = Prediction.single(prediction, K, self._timer.take()["network"])
+                maps = self._turns.member(x, K, n)
+        made = Predicted(maps, K.cpu().double(), self._timer.take()["network"])
         return made.to(torch.float32) if reduced else made
 
     def prepare(self, frame: Frame) -> None:

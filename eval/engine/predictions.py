@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -22,61 +22,23 @@ _ALL = "all"  # the member's name of all predictions combined, in a store
 _SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """A depth map with the variances that come with it."""
+class Predicted(NamedTuple):
+    """The prediction for one frame, with the camera of its depth map."""
 
-    depth: Tensor  # [h, w] [m]
-    aleatoric: Tensor | None  # [h, w] A [m^2], or None
-    epistemic: Tensor | None  # [h, w] E [m^2], or None
-    intrinsics: Tensor  # [3, 3] float64 of the depth map [px], on the CPU
+    maps: DepthPrediction  # [1, h, w]
+    intrinsics: Tensor  # [1, 3, 3] float64 of the maps [px], on the CPU
     ms: float | None = None  # of the inference, or of all of them together [ms]; None where no network ran
 
     @property
     def size(self) -> tuple[int, int]:
         """(h, w)."""
-        return self.depth.shape[0], self.depth.shape[1]
+        return self.maps.depth.shape[1], self.maps.depth.shape[2]
 
-    @property
-    def variance(self) -> Tensor | None:
-        """[h, w] the network's own variance A + E [m^2], None if it states neither."""
-        a, e = self.aleatoric, self.epistemic
-        if a is None or e is None:
-            return e if a is None else a
-        return a + e
-
-    def to(self, to: torch.device | torch.dtype) -> Prediction:
+    def to(self, to: torch.device | torch.dtype) -> Predicted:
         """With its maps on a device, or of a type."""
-        maps: dict[str, Any] = {name: value.to(to) for name, value in self.maps().items()}
-        return replace(self, **maps)
-
-    def maps(self) -> dict[str, Tensor]:
-        """Those of depth, aleatoric and epistemic that are not None."""
-        named = {"depth": self.depth, "aleatoric": self.aleatoric, "epistemic": self.epistemic}
-        return {name: value for name, value in named.items() if value is not None}
-
-    @classmethod
-    def single(cls, prediction: DepthPrediction, intrinsics: Tensor, ms: float | None) -> Prediction:
-        """From what a network returned for one image, [1, h, w], and its intrinsics [1, 3, 3]."""
-
-        def map_of(value: Tensor | None) -> Tensor | None:
-            return None if value is None else value[0].detach()
-
-        a, e = map_of(prediction.aleatoric_variance), map_of(prediction.epistemic_variance)
-        return cls(prediction.depth[0].detach(), a, e, intrinsics[0].cpu().double(), ms)
-
-
-def combined(predictions: Sequence[Prediction]) -> Prediction:
-    """The mixture of all members' or samples' predictions (see ``pipeline.combine``); the times are added. Raises
-    ValueError: no prediction."""
-
-    def batch(value: Tensor | None) -> Tensor | None:
-        return None if value is None else value[None]
-
-    joint = combine([DepthPrediction(p.depth[None], batch(p.aleatoric), batch(p.epistemic)) for p in predictions])
-    times = [p.ms for p in predictions if p.ms is not None]
-    ms = sum(times) if len(times) == len(predictions) else None
-    return Prediction.single(joint, predictions[0].intrinsics[None], ms)
+        maps, a, e = self.maps, self.maps.aleatoric_variance, self.maps.epistemic_variance
+        own = (None if value is None else value.to(to) for value in (a, e))
+        return self._replace(maps=DepthPrediction(maps.depth.to(to), *own))
 
 
 class DepthSource(ABC):
@@ -124,7 +86,7 @@ class DepthSource(ABC):
         """Do ahead of :meth:`one`, in another thread, what can be done before a network runs."""
 
     @abstractmethod
-    def one(self, frame: Frame, n: int) -> Prediction:
+    def one(self, frame: Frame, n: int) -> Predicted:
         """One timed inference, of member (or sample) n. Raises FrameError: the frame has nothing to predict from."""
 
 
@@ -147,11 +109,11 @@ class PredictionKey:
 class PredictionStore(Protocol):
     """Keeps predictions, so that a network sees an image once, however often the rows on it change."""
 
-    def load(self, key: PredictionKey, device: torch.device) -> Prediction | None:
+    def load(self, key: PredictionKey, device: torch.device) -> Predicted | None:
         """The prediction bit for bit as it was stored, or None where it has to be computed."""
         ...
 
-    def store(self, key: PredictionKey, prediction: Prediction) -> None:
+    def store(self, key: PredictionKey, predicted: Predicted) -> None:
         """Keep a prediction."""
         ...
 
@@ -164,10 +126,10 @@ class FramePredictions:
         self.frame, self._device, self._store, self._sequence = frame, device, store, sequence
         self._content = "" if store is None else frame_digest(frame)
         # By source: what rows asked for, by member ("0", "1", ... or "all"), and single inferences.
-        self._known: dict[tuple[object, str], Prediction] = {}
-        self._inferences: dict[tuple[object, int], Prediction] = {}
+        self._known: dict[tuple[object, str], Predicted] = {}
+        self._inferences: dict[tuple[object, int], Predicted] = {}
 
-    def of(self, source: DepthSource, position: int, every: bool) -> Prediction:
+    def of(self, source: DepthSource, position: int, every: bool) -> Predicted:
         """What a row gets that has used ``position`` images before: of all members, or of the one in turn. Raises
         FrameError: the frame has nothing to predict from."""
         if every and source.passes > 1:
@@ -177,12 +139,12 @@ class FramePredictions:
         found = self._looked_up(source, member)
         if found is None:
             made = [self._inference(source, n) for n in passes]
-            found = self._known[source.digest or source, member] = combined(made) if member == _ALL else made[0]
+            found = self._known[source.digest or source, member] = _combined(made) if member == _ALL else made[0]
             if self._store is not None and source.cacheable:
                 self._store.store(self._stored_as(source, member), found)
         return found
 
-    def _inference(self, source: DepthSource, n: int) -> Prediction:
+    def _inference(self, source: DepthSource, n: int) -> Predicted:
         """Of member (or sample) n, made once whichever rows use it; the store keeps only what a row asked for."""
         key = (source.digest or source, n)
         if key not in self._inferences:
@@ -190,7 +152,7 @@ class FramePredictions:
             self._inferences[key] = made.to(torch.float32) if source.cacheable else made
         return self._inferences[key]
 
-    def _looked_up(self, source: DepthSource, member: str) -> Prediction | None:
+    def _looked_up(self, source: DepthSource, member: str) -> Predicted | None:
         """In memory, then in the store."""
         key = (source.digest or source, member)
         if key not in self._known and self._store is not None and source.cacheable:
@@ -201,6 +163,13 @@ class FramePredictions:
 
     def _stored_as(self, source: DepthSource, member: str) -> PredictionKey:
         return PredictionKey(source.digest, self._sequence, self.frame.name, member, self._content)
+
+
+def _combined(made: Sequence[Predicted]) -> Predicted:
+    """The mixture of all members' or samples' predictions (see ``pipeline.combine``); the times are added."""
+    times = [one.ms for one in made if one.ms is not None]
+    ms = sum(times) if len(times) == len(made) else None
+    return Predicted(combine([one.maps for one in made]), made[0].intrinsics, ms)
 
 
 def sequence_digest(sequence: FrameSequence) -> str:

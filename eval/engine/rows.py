@@ -12,29 +12,49 @@ from torch import Tensor
 
 from ufmstar_torch.eval.engine.anchors import AnchorSource, FrameAnchors
 from ufmstar_torch.eval.engine.clock import StageTimer
-from ufmstar_torch.eval.engine.estimators import Estimate, Estimator
-from ufmstar_torch.eval.engine.predictions import DepthSource, Prediction
+from ufmstar_torch.eval.engine.estimators import Estimator
+from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.frame import FRAME_FAULTS
+from ufmstar_torch.output import FrameStatistics
 
 # Prefixes of the tensors of a row's state, as files of ``ufmstar run`` have them since its first version.
 _IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drift."
 
 
-@dataclass(frozen=True, eq=False)
-class RowFrame:
-    """A frame as a row sees it, and its estimate."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RowResult:
+    """What a row makes of a frame: maps [h, w] on the CPU, and what they were made from."""
 
-    prediction: Prediction  # the depth map, on the estimator's device
-    # [h, w] ground truth at the prediction's pixels [m], 0 = none; None without a depth map.
+    depth: Tensor  # as predicted, or corrected by the anchors, where the row is about that [m]
+    # total variance [m^2], NaN where not valid; None for a network that predicts depth alone.
+    variance: Tensor | None
+    # bool, True where there is a prediction: depth is positive and finite, and so is every variance used.
+    valid: Tensor
+    # aleatoric, epistemic: A and E as far as the row uses them [m^2], or None.
+    aleatoric: Tensor | None = None
+    epistemic: Tensor | None = None
+    disagreement: Tensor | None = None  # M of UfM* [m^2], or None
+    anchored: Tensor | None = None  # B of UfM* with anchors [m^2], or None
+    bias: Tensor | None = None  # r of UfM* with anchors, or None
+    posterior_depth: Tensor | None = None  # of UfM* with anchors and a posterior [m], or None
+    posterior_variance: Tensor | None = None  # likewise [m^2]
+    statistics: FrameStatistics | None = None  # of UfM*, [1] per count, or None
+    network_variance: Tensor | None  # A + E of the prediction, whatever the row uses [m^2]; None if it states neither
+    intrinsics: NDArray[np.float64]  # [3, 3] of the maps [px]
+    # [h, w] ground truth at the maps' pixels [m], 0 = none; None without a depth map.
     truth: NDArray[np.float32] | None
     T_world_cam: NDArray[np.float64]  # [4, 4] the pose as the row sees it [m]
     member: int | None  # which network predicted; None where all did, and of maps
     anchors: FrameAnchors | None  # of the frame; None of a row without anchors
     ms: dict[str, float]  # "network" where one ran, "anchors" where some were tracked, and "uncertainty" [ms]
-    estimate: Estimate  # what the row makes of the frame, on the CPU
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(h, w)."""
+        return self.depth.shape[0], self.depth.shape[1]
 
 
 class RowRunner:
@@ -74,7 +94,7 @@ class RowRunner:
         self._timer = StageTimer(device or torch.device("cpu"))
         self._drift = Drift(setting)
 
-    def update(self, frame: Frame, prediction: Prediction, truth: NDArray[np.float32] | None) -> RowFrame:
+    def update(self, frame: Frame, predicted: Predicted, truth: NDArray[np.float32] | None) -> RowResult:
         """Process the next frame. Its ground truth [h, w] is only for anchors that are drawn from it.
 
         Raises:
@@ -82,20 +102,29 @@ class RowRunner:
             RuntimeError, ValueError: as the estimator.
         """
         T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
-        anchors = None if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
+        anchors = None if self.anchors is None else self.anchors.of(frame, T, predicted, truth)
         member = self.source.turn(self.images) if self.source.networks and not self.every else None
         with self._timer.stage("uncertainty"):
-            found = None if anchors is None else anchors.anchors
-            estimate = self.estimator.update(prediction, torch.from_numpy(T), found)
-        times = {"network": prediction.ms, "anchors": None if anchors is None else anchors.ms, **self._timer.take()}
-        ms = {stage: time for stage, time in times.items() if time is not None}
+            given = None if anchors is None else anchors.anchors
+            answer = self.estimator.update(predicted, torch.from_numpy(T), given)
+            answer = {name: value[0].cpu() if isinstance(value, Tensor) else value for name, value in answer.items()}
+        times = {"network": predicted.ms, "anchors": None if anchors is None else anchors.ms, **self._timer.take()}
         self.images += 1
-        fault = 0 if estimate.statistics is None else int(estimate.statistics.fault[0])
-        if self._skips_faults and fault:
+        statistics, network_variance = answer.get("statistics"), predicted.maps.variance
+        if self._skips_faults and statistics is not None and int(statistics.fault[0]):
             if self._tracks is not None:
                 self._tracks.undo()
-            raise FrameError(frame.name, FRAME_FAULTS[fault])
-        return RowFrame(prediction, truth, T, member, anchors, ms, estimate)
+            raise FrameError(frame.name, FRAME_FAULTS[int(statistics.fault[0])])
+        return RowResult(
+            **answer,
+            network_variance=None if network_variance is None else network_variance[0].cpu(),
+            intrinsics=predicted.intrinsics[0].numpy(),
+            truth=truth,
+            T_world_cam=T,
+            member=member,
+            anchors=anchors,
+            ms={stage: time for stage, time in times.items() if time is not None},
+        )
 
     def state(self) -> dict[str, Tensor]:
         """All tensors on which the next frame depends, networks left aside: they remember nothing."""

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.clock import StageTimer
-from ufmstar_torch.eval.engine.predictions import FramePredictions, Prediction, PredictionStore, sequence_digest
+from ufmstar_torch.eval.engine.predictions import FramePredictions, Predicted, PredictionStore, sequence_digest
 from ufmstar_torch.eval.engine.prefetch import Prefetch
-from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
+from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
 from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
@@ -36,7 +36,7 @@ class FrameResult:
     index: int  # of the frame in its sequence
     name: str  # of the frame
     frame: Frame | None = None  # as it was read; None where no row selects it, or it cannot be used
-    rows: Mapping[str, RowFrame] = field(default_factory=dict)  # by key, of the rows that used it
+    rows: Mapping[str, RowResult] = field(default_factory=dict)  # by key, of the rows that used it
     skipped: Mapping[str, str] = field(default_factory=dict)  # by key, why a row that selects the frame cannot use it
     # "read" (time spent waiting: frames are read ahead), "predict" and "truth", and the stages of earlier sinks [ms].
     ms: dict[str, float] = field(default_factory=dict)
@@ -150,7 +150,7 @@ class FrameStream:
                 raise
             return FrameResult(number, index, name, skipped={row.key: error.reason for row in active})
         ms = self.timer.take()
-        results: dict[str, RowFrame] = {}
+        results: dict[str, RowResult] = {}
         skipped: dict[str, str] = {}
         for row in active:
             try:
@@ -186,15 +186,15 @@ def hand_over(result: FrameResult, sinks: Sequence[FrameSink], timer: StageTimer
         result.ms.update(timer.take())
 
 
-def _truths(frame: Frame, predictions: Mapping[str, Prediction]) -> dict[str, NDArray[np.float32] | None]:
+def _truths(frame: Frame, predictions: Mapping[str, Predicted]) -> dict[str, NDArray[np.float32] | None]:
     """Ground truth at the pixels of every row's maps, [h, w] [m], 0 = none; once for every camera. Raises FrameError:
     the depth map has no camera."""
     computed: dict[tuple[object, ...], NDArray[np.float32] | None] = {}
     truths = {}
-    for key, prediction in predictions.items():
-        K = prediction.intrinsics.numpy()
-        camera = (prediction.size, K.tobytes())
+    for key, predicted in predictions.items():
+        K = predicted.intrinsics[0].numpy()
+        camera = (predicted.size, K.tobytes())
         if camera not in computed:
-            computed[camera] = truth_at(frame, K, prediction.size)
+            computed[camera] = truth_at(frame, K, predicted.size)
         truths[key] = computed[camera]
     return truths

@@ -264,7 +264,7 @@ def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Merge
 
 
 def read_sums(path: Path) -> Sums:
-    """``RowResult.sums`` of one row on one sequence."""
+    """``RowFigures.sums`` of one row on one sequence."""
     try:
         sums = torch.load(path, map_location="cpu", weights_only=True)
     except (EOFError, KeyError, RuntimeError, ValueError, pickle.UnpicklingError) as error:

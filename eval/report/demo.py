@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.camera import unproject
 from ufmstar_torch.eval.engine.estimators import Gaussians
-from ufmstar_torch.eval.engine.rows import RowFrame
+from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.report.figures_curves import write_curves
@@ -64,17 +64,16 @@ class DemoFrames(FrameSink):
             note = list(KINDS.values())[self._unfamiliar[result.index]]
             self._panels[result.index] = panel(f"frame {result.index}", note, result.frame, rows)
 
-    def _add(self, name: str, row: RowFrame, result: FrameResult) -> None:
-        estimate = row.estimate
-        assert estimate.variance is not None
+    def _add(self, name: str, row: RowResult, result: FrameResult) -> None:
+        assert row.variance is not None
         assert result.frame is not None
         assert row.truth is not None
-        K, size = row.prediction.intrinsics.numpy(), row.prediction.size
+        K, size = row.intrinsics, row.size
         kinds = resample_nearest(self._kinds[result.index], result.frame.intrinsics, K, size)
-        error = np.square(estimate.depth.double().numpy() - row.truth)
-        maps = np.stack([error, estimate.variance.double().numpy(), np.ones(size)])
+        error = np.square(row.depth.double().numpy() - row.truth)
+        maps = np.stack([error, row.variance.double().numpy(), np.ones(size)])
         for number, kind in enumerate(KINDS.values()):
-            use = (kinds == number) & (row.truth > 0) & estimate.valid.numpy()
+            use = (kinds == number) & (row.truth > 0) & row.valid.numpy()
             self._sums[kind, name] += maps[:, use].sum(1)
 
     @property
@@ -136,11 +135,11 @@ def panel(name: str, note: str, frame: Any, rows: Mapping[str, Any]) -> FramePan
     """One row of the sheet: depth, sigma and true error, of UfM* and of the posterior, for a frame (with an image and
     ground truth) and the results of the demo's rows; ``note`` is the kind of room."""
     star = rows[UFM_STAR]
-    valid, maps = star.estimate.valid.numpy(), {}
+    valid, maps = star.valid.numpy(), {}
     for prefix, row in (("", star), ("posterior_", rows[POSTERIOR])):
-        depth = row.estimate.depth.float().numpy()
+        depth = row.depth.float().numpy()
         maps[prefix.rstrip("_") or "depth"] = depth
-        maps[f"{prefix}sigma"] = row.estimate.variance.float().sqrt().numpy()
+        maps[f"{prefix}sigma"] = row.variance.float().sqrt().numpy()
         maps[f"{prefix}error"] = absolute_error(depth, star.truth)
     return FramePanel(name, frame.image, {key: known_where(valid, values) for key, values in maps.items()}, note)
 

@@ -8,9 +8,8 @@ from typing import Any
 
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.estimators import Estimate
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
-from ufmstar_torch.eval.engine.rows import RowFrame
+from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.run_folder import Checkpoint, RunFolder
@@ -64,35 +63,34 @@ class FrameRecorder(FrameSink):
         if UFM not in result.rows:
             return {**about, "state": "skipped", "reason": result.skipped[UFM]}
         row, before = result.rows[UFM], perf_counter()
-        maps = {name: getattr(row.estimate, name) for name in _MAPS}
-        saturated = {"saturated": self._folder.writer.write(result.name, valid=row.estimate.valid, **maps)}
+        maps = {name: getattr(row, name) for name in _MAPS}
+        saturated = {"saturated": self._folder.writer.write(result.name, valid=row.valid, **maps)}
         times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
         return {**about, "state": "done", **_figures(row), **saturated, **times, **_anchor_figures(row)}
 
 
-def _figures(row: RowFrame) -> dict[str, Any]:
+def _figures(row: RowResult) -> dict[str, Any]:
     """Counts and means of a frame."""
-    estimate, prediction = row.estimate, row.prediction
-    statistics, network_variance, K = estimate.statistics, prediction.variance, prediction.intrinsics.tolist()
+    statistics, network_variance, K = row.statistics, row.network_variance, row.intrinsics.tolist()
     assert statistics is not None
-    assert estimate.variance is not None
-    assert estimate.disagreement is not None
-    std, valid = estimate.variance.sqrt(), estimate.valid
+    assert row.variance is not None
+    assert row.disagreement is not None
+    std, valid = row.variance.sqrt(), row.valid
     return {
-        "size": list(prediction.size),
+        "size": list(row.size),
         "intrinsics": [K[0][0], K[1][1], K[0][2], K[1][2]],
         "member": row.member,
         **{count: int(getattr(statistics, count)[0]) for count in _COUNTS},
         "rotation_deviation": float(statistics.rotation_deviation[0]),
-        "mean_disagreement": _mean(estimate.disagreement, valid),
+        "mean_disagreement": _mean(row.disagreement, valid),
         "mean_sigma": _mean(std, valid),
-        "mean_network_sigma": None if network_variance is None else _mean(network_variance.cpu().sqrt(), valid),
+        "mean_network_sigma": None if network_variance is None else _mean(network_variance.sqrt(), valid),
         "near_zero": int(((std > 0) & (std < NEAR_ZERO)).sum()),
         "ground_truth": row.truth is not None,
     }
 
 
-def _times(result: FrameResult, row: RowFrame, writing: float, saving: float) -> dict[str, float]:
+def _times(result: FrameResult, row: RowResult, writing: float, saving: float) -> dict[str, float]:
     """By stage [ms]. "prepare" is the rest of the prediction beside the network. "save" is the frame before's: this
     frame's is not known yet. "cycle" is the time since the frame before; stages overlap."""
     ms = result.ms
@@ -108,34 +106,34 @@ def _times(result: FrameResult, row: RowFrame, writing: float, saving: float) ->
     }
 
 
-def _anchor_figures(row: RowFrame) -> dict[str, Any]:
+def _anchor_figures(row: RowResult) -> dict[str, Any]:
     """With anchors: the frame's counts, and the means of B [m^2] and of r.
 
     ``tracked`` corners were followed from the frame before, ``found`` of them triangulated; ``usable`` lie on a pixel
     with a depth, and ``used`` agree with others. ``without`` is the reason where none is used. Of a map of landmarks,
     ``tracked`` counts all, and ``found`` those in view.
     """
-    anchors, estimate, statistics = row.anchors, row.estimate, row.estimate.statistics
-    if anchors is None or statistics is None or estimate.anchored is None or estimate.bias is None:
+    anchors, statistics = row.anchors, row.statistics
+    if anchors is None or statistics is None or row.anchored is None or row.bias is None:
         return {}
     used, usable = int(statistics.anchors_used[0]), int(statistics.anchors[0])
     counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
     return {
         "anchors": {**counts, "without": None if used else why_none(anchors.triangulated, usable, anchors.none)},
-        "mean_anchored": _mean(estimate.anchored, estimate.valid),
-        "mean_bias": _mean(estimate.bias, estimate.valid),
-        **_posterior_figures(estimate),
+        "mean_anchored": _mean(row.anchored, row.valid),
+        "mean_bias": _mean(row.bias, row.valid),
+        **_posterior_figures(row),
     }
 
 
-def _posterior_figures(estimate: Estimate) -> dict[str, Any]:
+def _posterior_figures(row: RowResult) -> dict[str, Any]:
     """With a posterior: its mean sigma [m], and the figures of held-out anchors (``FrameStatistics``)."""
-    variance, statistics = estimate.posterior_variance, estimate.statistics
+    variance, statistics = row.posterior_variance, row.statistics
     if variance is None or statistics is None or statistics.calibration is None or statistics.unseen is None:
         return {}
     calibration = float(statistics.calibration[0])
     figures = {
-        "mean_sigma": _mean(variance.sqrt(), estimate.valid),
+        "mean_sigma": _mean(variance.sqrt(), row.valid),
         "calibration": calibration if math.isfinite(calibration) else None,
         "unseen": float(statistics.unseen[0]),
     }

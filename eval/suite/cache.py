@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ufmstar_torch.eval.engine.predictions import Prediction, PredictionKey
+from ufmstar_torch.eval.engine.predictions import Predicted, PredictionKey
 from ufmstar_torch.eval.run.files import write_atomic
+from ufmstar_torch.prediction import DepthPrediction
 
 _DIGEST = 32  # bytes of a SHA-256
 
@@ -44,7 +45,7 @@ class PredictionCache:
         except OSError as error:
             raise CacheError(_cannot(folder, error)) from error
 
-    def load(self, key: PredictionKey, device: torch.device) -> Prediction | None:
+    def load(self, key: PredictionKey, device: torch.device) -> Predicted | None:
         """The prediction, or None where it has to be made: there is no file, it belongs to another image of that name,
         was cut off or changed, or cannot be read."""
         try:
@@ -58,13 +59,15 @@ class PredictionCache:
         if bytes(arrays.pop("content")).decode() != key.content:
             return None
         K = torch.from_numpy(arrays.pop("intrinsics"))
-        maps = {name: torch.from_numpy(value).to(device) for name, value in arrays.items()}
-        return Prediction(maps["depth"], maps.get("aleatoric"), maps.get("epistemic"), K)
+        maps = {name: torch.from_numpy(value)[None].to(device) for name, value in arrays.items()}
+        return Predicted(DepthPrediction(maps["depth"], maps.get("aleatoric"), maps.get("epistemic")), K[None])
 
-    def store(self, key: PredictionKey, prediction: Prediction) -> None:
+    def store(self, key: PredictionKey, predicted: Predicted) -> None:
         """Keep a prediction. Raises CacheError: it cannot be written."""
-        arrays = {name: value.cpu().numpy() for name, value in prediction.maps().items()}
-        arrays["intrinsics"] = prediction.intrinsics.numpy()
+        maps = predicted.maps
+        named = {"depth": maps.depth, "aleatoric": maps.aleatoric_variance, "epistemic": maps.epistemic_variance}
+        arrays = {name: value[0].cpu().numpy() for name, value in named.items() if value is not None}
+        arrays["intrinsics"] = predicted.intrinsics[0].numpy()
         arrays["content"] = np.frombuffer(key.content.encode(), np.uint8)
         packed = io.BytesIO()
         np.savez(packed, allow_pickle=False, **arrays)

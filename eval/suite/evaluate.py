@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from ufmstar_torch.eval.engine.anchors import landmark_digests
-from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, RowResult, evaluate_sequence
+from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, RowFigures, evaluate_sequence
 from ufmstar_torch.eval.engine.judge import references
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.methods.method import ALONE
@@ -23,7 +23,7 @@ from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.work_items import WorkItem, content_digest
 from ufmstar_torch.recalibrate import Recalibration
 
-Evaluate = Callable[..., list[RowResult]]
+Evaluate = Callable[..., list[RowFigures]]
 _NO_POSES = "its images have no poses: the rows of networks alone are finished, {} that compare views cannot be had"
 _FITTED = "{} recalibrated rows were fitted to this sequence and are not judged on it"
 
@@ -99,7 +99,7 @@ def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if row in needed]
 
 
-def _record(job: EvalJob, item: WorkItem, judge: Judge, result: RowResult, made_of: Mapping[str, Any]) -> Record:
+def _record(job: EvalJob, item: WorkItem, judge: Judge, result: RowFigures, made_of: Mapping[str, Any]) -> Record:
     """A row's figures with what they were computed from and with."""
     row, network = result.row, judge.networks[result.row.method.base]
     computed_with = {"versions": versions(), "machine": hardware(), "threads": torch.get_num_threads()}

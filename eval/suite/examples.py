@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.engine.estimators import Gaussians
-from ufmstar_torch.eval.engine.rows import RowFrame
+from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.eval.sequences.frame import Frame, Size
@@ -77,7 +77,7 @@ class ExampleWriter(FrameSink):
         first = next(iter(scenes.values()))
         _write(folder / f"{frame.name}.npz", {**first, "index": np.array(frame.index)})
         for key, row in result.rows.items():
-            maps = {part: getattr(row.estimate, part) for part in _MAPS}
+            maps = {part: getattr(row, part) for part in _MAPS}
             arrays = {part: value.float().numpy() for part, value in maps.items() if value is not None}
             scene = scenes[key]
             alike = scene["truth"].shape == first["truth"].shape and np.array_equal(scene["K"], first["K"])
@@ -114,9 +114,9 @@ def _room(estimator: Gaussians) -> dict[str, NDArray]:
     return {name: value[0][world.valid[0]].cpu().numpy() for name, value in named.items()}
 
 
-def _scene(frame: Frame, row: RowFrame) -> dict[str, NDArray]:
+def _scene(frame: Frame, row: RowResult) -> dict[str, NDArray]:
     """The image and the ground truth at the pixels of a row's maps."""
-    size, K = row.prediction.size, row.prediction.intrinsics.numpy()
+    size, K = row.size, row.intrinsics
     truth = np.zeros(size, np.float32) if row.truth is None else row.truth
     image = np.zeros((*size, 3), np.uint8) if frame.image is None else _seen(frame.image, frame.intrinsics, K, size)
     return {"image": image, "truth": truth, "K": K}

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import RowResult
+from ufmstar_torch.eval.engine.evaluate import RowFigures
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.metrics.packed_sums import pack
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 FAILED, CACHE = "failed.json", "cache"
 # What a report leaves; removed by --overwrite.
-_REPORT: tuple[str, ...] = ("efficiency.json", "results.json", "results.csv", "table.csv", "report.html")
+_REPORT: tuple[str, ...] = ("efficiency.json", "results.json", "results.csv", "report.html")
 _REPORT += ("tables/*.md", "tables/*.tex", "figures/*.png", "figures/*.svg", "figures/*.json")
 _OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz", "room/*.npz")
 
@@ -107,7 +107,7 @@ class EvalFolder:
                     f"computed there (digest was {str(then)[:16]}, now {digest[:16]}); --overwrite starts again"
                 )
 
-    def write(self, item: WorkItem, record: Record, result: RowResult) -> None:
+    def write(self, item: WorkItem, record: Record, result: RowFigures) -> None:
         """Store a row, completely or not at all. Raises OSError: it cannot be written."""
         path = self.place(item) / f"{result.row.slug}.json"
         sums = {name: {key: pack(value) for key, value in states.items()} for name, states in result.sums.items()}

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.landmarks import LandmarkSource, landmark_source
+from ufmstar_torch.anchors.tracker import Landmarks
 
 Given = str | Path | LandmarkSource
 _PARTS = ("pixel", "depth", "variance", "valid")
@@ -21,6 +22,10 @@ class StreamLandmarks:
     Args:
         sources: what :func:`landmark_source` takes; a sequence of them, one for each stream.
 
+    Attributes:
+        needs_image: whether a source looks at the images.
+        last: the landmarks of the last image of every stream.
+
     Raises:
         FileNotFoundError, ValueError: as :func:`landmark_source`.
     """
@@ -29,12 +34,14 @@ class StreamLandmarks:
         given = sources if isinstance(sources, list | tuple) else [sources]
         self._sources = [landmark_source(one) for one in given]
         self._before = self._states()
+        self.needs_image = any(source.needs_image for source in self._sources)
+        self.last: list[Landmarks] = []
 
-    def update(self, image: Tensor, pose: Tensor, intrinsics: Tensor) -> Anchors:
+    def update(self, image: Tensor | None, pose: Tensor, intrinsics: Tensor) -> Anchors:
         """Anchors of the next image of every stream, in its pixels. Where it raises, no source has changed.
 
         Args:
-            image: [B, 3, H, W] RGB, uint8, or floating-point in [0, 1].
+            image: [B, 3, H, W] RGB, uint8, or floating-point in [0, 1]; None: the sources need none.
             pose: [B, 4, 4] or [4, 4] camera-to-world [m].
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px].
 
@@ -45,23 +52,26 @@ class StreamLandmarks:
             ValueError: another number of streams than sources, an image of another kind, or as
                 :meth:`LandmarkSource.update`.
         """
-        b = len(image)
+        b = len(self._sources) if image is None else len(image)
         if b != len(self._sources):
             raise ValueError(f"anchors must name a source for each of the {b} streams, got {len(self._sources)}")
-        pictures = _bytes(image).permute(0, 2, 3, 1).contiguous().cpu().numpy()
+        pictures = None if image is None else _bytes(image).permute(0, 2, 3, 1).contiguous().cpu().numpy()
         T = pose.detach().double().expand(b, 4, 4).cpu().numpy()
         K = intrinsics.detach().double().expand(b, 3, 3).cpu()
         before = self._states()
         try:
-            result = [s.update(pictures[i], T[i], K[i].numpy()) for i, s in enumerate(self._sources)]
+            result = [
+                source.update(None if pictures is None else pictures[i], T[i], K[i].numpy())
+                for i, source in enumerate(self._sources)
+            ]
         except BaseException:
             self._restore(before, range(b))
             raise
-        self._before = before
+        self._before, self.last = before, result
         room = max(len(landmarks.depth) for landmarks in result)
         each = [landmarks.anchors(K[i].numpy(), K[i], room) for i, landmarks in enumerate(result)]
         parts = (torch.cat([getattr(one, name) for one in each]) for name in _PARTS)
-        return Anchors(*parts).to(image.device)
+        return Anchors(*parts).to(pose.device if image is None else image.device)
 
     def undo(self, streams: Sequence[int] | None = None) -> None:
         """Forget the last image of these streams (None: of all): it was not used."""
