@@ -89,7 +89,7 @@ def test_depth_ten_times_too_large(tour, capsys):
     assert code == 1
     assert "depth looks too large: times 0.1 fits" in out or "depth looks too large: times 0.0" in out
     assert re.findall(r"remedy +(.*)", out) == ["--truth-scale 0.1"]
-    assert command(capsys, tour, "--pairs", 2, "--depth-scale", 0.1)[0] == 0
+    assert command(capsys, tour, "--pairs", 2, "--truth-scale", 0.1)[0] == 0
 
 
 def test_depth_in_smaller_units_than_metres_can_say(tour):
@@ -171,7 +171,7 @@ def test_wrong_usage(tmp_path, exported, capsys):
     for words, message in (
         ((tmp_path / "absent",), "no such file or folder"),
         ((tmp_path,), "has no known layout, and nothing below it has"),
-        ((exported, "--depth-scale", 1000), "depth_scale is in metres per unit"),
+        ((exported, "--truth-scale", 1000), "depth_scale is in metres per unit"),
         ((exported, "--poses", "upside-down"), "choose from 'camera-to-world'"),
         ((exported, "--layout", "kitti"), "choose from 'auto'"),
         ((exported, "--pairs", 0), "pairs must be at least 1"),
@@ -239,7 +239,7 @@ def test_every_command_and_piece_of_code_on_the_page_runs(tmp_path, monkeypatch,
         code = main(words.split())
         printed[words] = capsys.readouterr().out
         assert code == (1 if "world-to-camera" in words else 0), printed[words]
-    assert re.findall(r"remedy +(.*)", printed["data check walk --depth-scale 0.01 --poses world-to-camera"]) == [
+    assert re.findall(r"remedy +(.*)", printed["data check walk --truth-scale 0.01 --poses world-to-camera"]) == [
         "leave --poses world-to-camera out",
         "--truth-scale 0.001",
     ]

@@ -46,14 +46,14 @@ def pairs_of(previous, current, config, stream: int):
     """The compiled list of one stream's pairs: c, k and beta."""
     fields = [value for m in (previous, current) for value in (by_field(m, stream), m.capacity)]
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, gaussian.PIXEL_VARIANCE)
-    return map(torch.from_numpy, compiled(correspond_cpu.matches)(*fields, K.numpy(), *SIZE, *thresholds))
+    return map(torch.from_numpy, compiled(correspond_cpu.matches)(*fields, K.numpy(), *SIZE, thresholds))
 
 
 def by_field(m: GaussianMixture, stream: int):
     """All slots of a stream by field (``rigid_cpu``)."""
     fields = np.empty((rigid_cpu.FIELDS, rigid_cpu.padded(m.capacity)))
     moments = (v[stream].numpy() for v in (m.mean, m.covariance, m.weight))
-    rigid_cpu.gather(np.arange(m.capacity), m.capacity, *moments, fields)
+    rigid_cpu.gather(np.arange(m.capacity), 0, m.capacity, *moments, fields)
     return fields
 
 
@@ -91,8 +91,8 @@ def fused(previous, current, pairs, config):
         new = (v[b].numpy() for v in (current.mean, current.covariance, current.weight, current.features))
         compiled(fuse_cpu.fuse_pairs)(
             *(value[b].numpy() for value in out.tensors().values()), *new,
-            *(value.numpy() for value in (c, k, pairs.overlap[b, c, k], distance)),
-            config.overlap_weighted, epsilon,
+            c.numpy(), k.numpy(), np.arange(previous.capacity), pairs.overlap[b, c, k].numpy(), distance.numpy(),
+            config.overlap_weighted, epsilon, np.empty(fuse_cpu.WORK),
         )  # fmt: skip
     return out
 
@@ -115,10 +115,9 @@ def test_fuse_agrees_with_the_reference(weighted, seed):
 def floored(cov, floor):
     out, mean = torch.zeros_like(cov), torch.zeros(*cov.shape[:-2], 3, dtype=cov.dtype)
     mean[..., 2] = floor.sqrt()  # a camera whose pixel is 1 wide at depth 1
-    given = (
-        value.reshape(-1, *value.shape[cov.dim() - 2 :]).numpy() for value in (mean, cov, torch.ones_like(mean[..., 0]))
-    )
-    compiled(fuse_cpu.floored)(*given, 0.0, 1.0, 1.0, 0.0, out.view(-1, 3, 3).numpy())
+    given = mean.view(-1, 3).numpy(), cov.reshape(-1, 3, 3).numpy()
+    work = np.empty(fuse_cpu.WORK)
+    compiled(fuse_cpu.floored)(len(given[0]), *given, 0.0, 1.0, 1.0, 0.0, out.view(-1, 3, 3).numpy(), work)
     return out
 
 

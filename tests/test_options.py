@@ -54,7 +54,7 @@ class _Options:
     sizes: tuple[int, ...] = option((224, 518))
     kind: str = option("numba", choices=("numba", "torch"))
     long: int | None = option(None, const=1000)
-    truth_scale: float | None = option(None, also=("--depth-scale",))
+    truth_scale: float | None = None
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
     changes: dict[str, Any] = fields_of(UfMStarConfig, "change.", without=("segment", "backend"), unset=True)
 
@@ -79,7 +79,7 @@ def test_defaults_and_required_ones():
 def test_every_form():
     line = "seq --out o --resume --no-video --fps 25 --names a b --networks c --networks d e --sizes 48 --kind torch"
     options = _parse(
-        f"{line} --long --depth-scale .001 --ufm.segment.prune none --ufm.add_aleatoric false --change.eta .2"
+        f"{line} --long --truth-scale .001 --ufm.segment.prune none --ufm.add_aleatoric false --change.eta .2"
     )
     assert options.output == _Output(Path("o"), resume=True, video=False)
     assert (options.fps, options.names, options.networks, options.sizes) == (25.0, ("a", "b"), ("c", "d", "e"), (48,))

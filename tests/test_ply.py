@@ -92,6 +92,11 @@ class TestSplats:
         mix, stream = mixture(), 0
         assert write_mixture_ply(tmp_path / "m.ply", mix, T_world_first=world() if moved else None) == 5
         table = parse(tmp_path / "m.ply")[0]["vertex"]
+        assert table.dtype.names == (
+            *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+            *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+            *("weight", "disagreement", "count"),
+        )  # the order of splat viewers
         used = mix.valid[stream]
         R = world()[:3, :3] if moved else torch.eye(3, dtype=torch.float64)
         t = world()[:3, 3] if moved else torch.zeros(3, dtype=torch.float64)
@@ -133,6 +138,10 @@ class TestSplats:
         np.testing.assert_allclose(sigma[1], [SIGMA_FLOOR] * 3, rtol=1e-6)
         vertices = parse(tmp_path / "e.ply")[0]["vertex"]
         assert all(np.isfinite(vertices[name]).all() for name in vertices.dtype.names or ())
+
+    def test_a_pose_of_another_shape_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(ValueError, match="T_world_first must have shape"):
+            write_mixture_ply(tmp_path / "m.ply", mixture(), T_world_first=torch.eye(3))
 
     def test_empty_mixture(self, tmp_path: Path) -> None:
         empty = GaussianMixture.empty(1, 4, dtype=torch.float32, device="cpu")

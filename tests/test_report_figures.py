@@ -17,7 +17,6 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Merged, Results
 from ufmstar_torch.eval.report.figures_cost import STAGES, draw_latency, draw_stages, draw_tradeoff
 from ufmstar_torch.eval.report.figures_curves import (
-    MOST_SEQUENCES,
     chosen_sequences,
     density,
     draw_calibration,
@@ -97,14 +96,6 @@ class TestCalibration:
         np.testing.assert_array_equal(line.get_ydata(), first.curves["ece_q_observed"])
         assert figure.axes[0].get_title(loc="left").startswith(f"{by_error[0]}\nECE_δ ")
         assert figure.axes[0].get_title(loc="left").endswith(f"→ {first.figures['ece_delta']:.3f}")
-
-    def test_at_most_a_dozen_evenly_chosen(self):
-        curve = {"ece_q_observed": [0.5]}
-        many = in_memory({(UFM_STAR, ("d", f"{i:03d}")): {"ece_delta": i / 100} for i in range(45)})
-        many = replace(many, records=tuple(replace(r, curves=curve) for r in many.records))
-        names = chosen_sequences(many, "d", "ensemble")
-        assert len(names) == MOST_SEQUENCES
-        assert (names[0], names[-1], names) == ("000", "044", sorted(names))
 
 
 class TestError:

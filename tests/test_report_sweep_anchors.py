@@ -13,7 +13,7 @@ from ufmstar_torch.anchors.tracker import TrackerConfig
 from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import Setting, setting_from
+from ufmstar_torch.eval.methods.setting import setting_from
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.figures_sweep import default_value, draw_sweep, sweep_lines, sweeps
@@ -148,17 +148,6 @@ def test_settings_beside_the_anchors_are_lines_of_their_own():
     assert words == ["", "disagreement overlap", "anchored", "anchored, depth corrected on"]
     axes = draw_sweep(result, "depth_only", "rotation_drift").axes[0]
     assert len({line.get_color() for line in drawn(axes).values()}) == 4
-
-
-def test_seeds_of_a_noise_are_one_point():
-    seeds = [Row(STAR, Setting(rotation_drift=0.1, anchors="tracked", seed=seed)) for seed in (0, 1, 2)]
-    result = results_of([row(anchors="tracked"), row(anchors="tracked", rotation_drift=0.5), *seeds])
-    (line,) = sweep_lines(result, "depth_only", "rotation_drift")
-    assert [(point.value, len(point.rows)) for point in line.points] == [(0.0, 1), (0.1, 3), (0.5, 1)]
-    # Without plain UfM*, the difference is to the line's own default.
-    below = draw_sweep(result, "depth_only", "rotation_drift").axes[4]
-    assert below.get_title(loc="left") == "difference to the default in NLL, in pairs"
-    assert drawn(below)["anchored"].get_ydata()[0] == 0
 
 
 def test_words_and_switches_are_no_values():

@@ -145,13 +145,17 @@ def test_what_is_out_of_reach_neither_matches_nor_is_summed(dtype):
     far = (m.mean[0] - torch.tensor([0.0, 0.0, 3.0])) * 10
     T = torch.tensor(scenes.look((0.3, -0.2, 0.1), 0.7, 0.4)).numpy()
     slots = [v.numpy().astype(dtype) for v in (far, m.covariance[0] * scale, m.weight[0])]
-    motion, camera = compiled(rigid_cpu.relative)(np.eye(4), T), K.numpy()
+    motion, camera = np.empty((3, 4)), K.numpy()
+    rigid_cpu.relative(np.eye(4), T, motion)
     everyone, here = np.arange(400), np.zeros((rigid_cpu.FIELDS, 400))
-    rigid_cpu.gather(everyone, 400, *slots, here)
+    rigid_cpu.gather(everyone, 0, 400, *slots, here)
     mean, covariance, weight = here[:3].T, here[3:12].T.reshape(-1, 3, 3), here[12]
     mean, covariance = mean @ motion[:, :3].T + motion[:, 3], motion[:, :3] @ covariance @ motion[:, :3].T
     here[:12] = np.concatenate([mean, covariance.reshape(-1, 9)], 1).T
-    near, occupied = compiled(reach_cpu.reached)(motion, *slots, camera, SIZE, 1.0, 1e-6, 0)
+    index, group = np.empty(400, np.int64), np.empty((rigid_cpu.FIELDS, reach_cpu.GROUP))
+    work = group, np.empty(reach_cpu.GROUP), np.empty((6, 4))
+    n, occupied = compiled(reach_cpu.reached)(motion, *slots, camera, SIZE, 1.0, 1e-6, 0, index, *work)
+    near = index[:n]
     u, v = (camera[i, i] * mean[:, i] / mean[:, 2] + camera[i, 2] for i in range(2))
     inside = (u >= -0.5) & (u < SIZE[1] - 0.5) & (v >= -0.5) & (v < SIZE[0] - 0.5) & (mean[:, 2] > 0.05)
     args = (400, camera, np.full(SIZE, 1e4), 1.0, 0.0, 1e-6)

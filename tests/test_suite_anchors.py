@@ -11,7 +11,7 @@ import torch
 from tiny_suite import Biased, base_network, evaluate, in_memory, row, unbatched, write_network
 
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.engine.anchors import TRUTH_SIGMA, AnchorSource, Tracks, anchor_sources
 from ufmstar_torch.eval.engine.estimators import ufm_star_config

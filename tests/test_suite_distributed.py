@@ -122,7 +122,7 @@ def test_devices_go_round(monkeypatch):
 
 def test_a_job_is_the_same_in_another_process(rooms, tmp_path):
     words = ["--suite", "ablation-anchors", "--network", TRUTH, "--root", f"rooms={rooms}", "--out", str(tmp_path)]
-    words += ["--frames", "1::2", "--cache", str(tmp_path / "cache"), "--depth-scale", "0.5", "--samples", "3"]
+    words += ["--frames", "1::2", "--cache", str(tmp_path / "cache"), "--truth-scale", "0.5", "--samples", "3"]
     job = job_from(read(words))
     again = pickle.loads(pickle.dumps(job))
     assert again == job

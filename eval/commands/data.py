@@ -16,14 +16,6 @@ _OF_ONE = ("trajectory", "images", "drive")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckedSequenceOptions(SequenceOptions):
-    """How the sequence is opened."""
-
-    truth: str | None = option(None, also=("--depth",))
-    truth_scale: float | None = option(None, also=("--depth-scale",))
-
-
-@dataclass(frozen=True, kw_only=True)
 class CheckOptions:
     """Report a sequence's content, and check whether its poses, depth and images fit together.
 
@@ -44,7 +36,7 @@ class CheckOptions:
     path: str = positional()
     pairs: int = 8
     json: bool = False
-    opening: CheckedSequenceOptions
+    opening: SequenceOptions
 
 
 def read(words: Sequence[str]) -> CheckOptions:

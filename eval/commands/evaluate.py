@@ -75,10 +75,10 @@ class EvalOpeningOptions(OpeningOptions):
     """How the sequences are opened, all of them alike.
 
     Attributes:
-        depth_scale: metres per unit of the sequences' own depth maps, instead of the layout's
+        truth_scale: metres per unit of the sequences' own depth maps, instead of the layout's
     """
 
-    depth_scale: float | None = option(None, also=("--truth-scale",))
+    truth_scale: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -61,8 +61,7 @@ def option(default: Any = MISSING, **how: Any) -> Any:
     Args:
         default: without one, the option must be given.
         **how: ``choices``: the values that are allowed; ``const``: the value of the option without a word behind it;
-            ``repeat``: whether words of further occurrences are added (else they replace the earlier ones);
-            ``also``: older names, ``("--depth-scale",)``.
+            ``repeat``: whether words of further occurrences are added (else they replace the earlier ones).
     """
     return field(default=default, metadata=how)
 
@@ -183,7 +182,7 @@ def _form(f: Field[Any], hint: Any) -> tuple[list[str], dict[str, Any]]:
     how |= {"choices": f.metadata["choices"]} if "choices" in f.metadata else {"type": str if kind is Path else kind}
     if f.metadata.get("positional"):
         return [f.name], how
-    return [name, *f.metadata.get("also", ())], how | ({"required": True} if default is MISSING else {})
+    return [name], how | ({"required": True} if default is MISSING else {})
 
 
 def _add_fields(group: Any, wanted: _Fields) -> None:

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, LandmarkSource, landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import Landmarks, TrackerConfig

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.method import ALONE, UFM

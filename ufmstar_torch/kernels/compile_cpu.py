@@ -38,27 +38,28 @@ _PASSES = (
 )
 
 
+# Settings of a caller that change nothing in what it calls.
+_OF_THE_CALLER = ("release_gil", "no_cpython_wrapper", "no_cfunc_wrapper")
+
+
 class _Flags(compiler.Flags):
-    """Settings of a compilation, which do not change any more: their hash, which numba takes for every operator."""
+    """Settings of a compilation. numba compares them for every operator, to look up what it has compiled: equal where
+    what is called is the same."""
 
-    __slots__ = ("_all", "_hash")
-
-    def values(self) -> dict[str, Any]:
-        try:
-            return self._all
-        except AttributeError:
-            self._all = super().values()
-            return self._all
+    __slots__ = ("_compared",)
 
     def __hash__(self) -> int:
-        try:
-            return self._hash
-        except AttributeError:
-            self._hash = super().__hash__()
-            return self._hash
+        return hash(_Flags)
 
     def __eq__(self, other: object) -> bool:
-        return self is other or super().__eq__(other)
+        if not isinstance(other, _Flags):
+            return NotImplemented
+        return self is other or self._values_of_interest() == other._values_of_interest()
+
+    def _values_of_interest(self) -> list[Any]:
+        if not hasattr(self, "_compared"):  # nothing changes any more
+            self._compared = [value for name, value in self.values().items() if name not in _OF_THE_CALLER]
+        return self._compared
 
 
 class _Library(codegen.JITCodeLibrary):

@@ -15,7 +15,7 @@ from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, WEIGHT
 
 
 @part
-def matches(fields, n, fields_c, n_c, K, height, width, eta, eta_occl, near, widening):
+def matches(fields, n, fields_c, n_c, K, height, width, thresholds):
     """The matched pairs of one stream, as :func:`ufmstar_torch.correspond.correspond` states them.
 
     The n components k and the n_c components c are in the camera frame, by field [13, n and more] (``rigid_cpu``).
@@ -23,6 +23,7 @@ def matches(fields, n, fields_c, n_c, K, height, width, eta, eta_occl, near, wid
     Returns:
         c [P], k [P] and the overlap beta_ck [P] of every pair, in increasing c and then k.
     """
+    eta, eta_occl, near, widening = thresholds
     image, image_c = empty((6, n), np.float64), empty((6, n_c), np.float64)
     index, index_c = empty(n, np.int64), empty(n_c, np.int64)
     count = _project(fields, n, K, height, width, near, widening, index, image)

@@ -10,17 +10,20 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import empty, part
+from ufmstar_torch.kernels.compile_cpu import leaf
 
 _SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
+WORK = (8, 3, 3)  # shape of the scratch memory (float64) of what follows
 
 
-@part
+@leaf
 def cholesky3(S, L):
     """Lower Cholesky factor of positive semidefinite S, written to L (upper part zero)."""
     negligible = _NEGLIGIBLE * max(S[0, 0], S[1, 1], S[2, 2])
-    L[:] = 0.0
+    for j in range(3):
+        for r in range(3):
+            L[r, j] = 0.0
     for j in range(3):
         pivot = S[j, j]
         for i in range(j):
@@ -36,7 +39,7 @@ def cholesky3(S, L):
             L[r, j] = value / root
 
 
-@part
+@leaf
 def _angle(alpha, beta, gamma):
     """Cosine and sine of the smaller rotation that annihilates gamma in [[alpha, gamma], [gamma, beta]]."""
     zeta = (beta - alpha) / (2 * gamma)
@@ -45,12 +48,12 @@ def _angle(alpha, beta, gamma):
     return c, c * t
 
 
-@part
+@leaf
 def right_singular(M, V, s):
     """Singular values s and right singular vectors V of M by one-sided Jacobi; M is overwritten with U diag(s)."""
-    V[:] = 0.0
     for i in range(3):
-        V[i, i] = 1.0
+        for j in range(3):
+            V[i, j] = 1.0 if i == j else 0.0
     for _ in range(_SWEEPS):
         rotated = False
         for p in range(2):
@@ -71,19 +74,18 @@ def right_singular(M, V, s):
         s[j] = math.sqrt(M[0, j] ** 2 + M[1, j] ** 2 + M[2, j] ** 2)
 
 
-@part
+@leaf
 def geodesic(mean_a, cov_a, mean_b, cov_b, lam, work):
     """Move (mean_a, cov_a) by ``lam`` towards b in place; return W2^2 between the two as they were.
 
-    work: [6, 3, 3] scratch.
+    ``work`` is scratch.
     """
-    L_a, L_b, M, V, half, T = work[0], work[1], work[2], work[3], work[4], work[5]
+    L_a, L_b, M, V, half, T, s = work[0], work[1], work[2], work[3], work[4], work[5], work[6, 0]
     cholesky3(cov_a, L_a)
     cholesky3(cov_b, L_b)
     for i in range(3):
         for j in range(3):
             M[i, j] = L_b[0, i] * L_a[0, j] + L_b[1, i] * L_a[1, j] + L_b[2, i] * L_a[2, j]
-    s = empty(3, np.float64)
     right_singular(M, V, s)
     distance, shift = -2 * (s[0] + s[1] + s[2]), 0.0
     for i in range(3):
@@ -112,7 +114,7 @@ def geodesic(mean_a, cov_a, mean_b, cov_b, lam, work):
     return distance
 
 
-@part
+@leaf
 def _exceeds(S, floor):
     """Whether every eigenvalue of S is certainly above ``floor``: S - floor I has a Cholesky factor.
 
@@ -130,60 +132,53 @@ def _exceeds(S, floor):
     return S[2, 2] - floor - least - l20 * S[2, 0] - c * c / b > least
 
 
-@part
-def floor_covariance(covariance, floor):
-    """Lift the eigenvalues of every positive semidefinite covariance [N, 3, 3] to floor [N], in place."""
-    M, V, s = empty((3, 3), np.float64), empty((3, 3), np.float64), empty(3, np.float64)
-    for n in range(covariance.shape[0]):
-        S = covariance[n]
-        if _exceeds(S, floor[n]):
-            continue
-        for i in range(3):  # a slice assignment would compile for seconds, for the sake of its error message
-            for j in range(3):
-                M[i, j] = S[i, j]
-        right_singular(M, V, s)  # of a positive semidefinite matrix: its eigenvalues and eigenvectors
-        if min(s[0], s[1], s[2]) >= floor[n]:
-            continue
-        for i in range(3):
-            for j in range(i + 1):
-                value = 0.0
-                for k in range(3):
-                    value += V[i, k] * max(s[k], floor[n]) * V[j, k]
-                S[i, j] = value
-                S[j, i] = value
+@leaf
+def floor_covariance(S, floor, work):
+    """Lift the eigenvalues of a positive semidefinite covariance [3, 3] to ``floor``, in place."""
+    if _exceeds(S, floor):
+        return
+    M, V, s = work[0], work[1], work[2, 0]
+    for i in range(3):  # a slice assignment would compile for seconds, for the sake of its error message
+        for j in range(3):
+            M[i, j] = S[i, j]
+    right_singular(M, V, s)  # of a positive semidefinite matrix: its eigenvalues and eigenvectors
+    if s[0] >= floor and s[1] >= floor and s[2] >= floor:
+        return
+    for i in range(3):
+        for j in range(i + 1):
+            value = 0.0
+            for k in range(3):
+                value += V[i, k] * max(s[k], floor) * V[j, k]
+            S[i, j] = value
+            S[j, i] = value
 
 
-@part
-def floored(mean, covariance, weight, near, focal, widening, epsilon, covariance_out):
-    """Write the covariances of occupied slots with the floor that a segment needs (``step``): the variance across one
+@leaf
+def floored(count, mean, covariance, near, focal, widening, epsilon, covariance_out, work):
+    """Write the covariances of the first slots with the floor that a segment needs (``step``): the variance across one
     pixel, and ``epsilon`` times the trace for storage."""
-    least = empty(1, np.float64)
-    for n in range(weight.size):
-        if not weight[n] > 0:
-            continue
+    for n in range(count):
         S = covariance_out[n]
         for i in range(3):
             for j in range(3):
                 S[i, j] = covariance[n, i, j]
         across = max(np.float64(mean[n, 2]), near) / focal
-        least[0] = max(across * across * widening, epsilon * (S[0, 0] + S[1, 1] + S[2, 2]))
-        floor_covariance(covariance_out[n : n + 1], least)
+        floor_covariance(S, max(across * across * widening, epsilon * (S[0, 0] + S[1, 1] + S[2, 2])), work)
 
 
-@part
+@leaf
 def fuse_pairs(
     mean, covariance, weight, disagreement, count, features,
-    mean_c, cov_c, weight_c, features_c, pair_c, pair_k, overlap, distance, weighted, epsilon,
+    mean_c, cov_c, weight_c, features_c, pair_c, pair_k, slots, overlap, distance, weighted, epsilon, work,
 ):  # fmt: skip
-    """Fuse the pairs [P] of one stream in their order, in place.
+    """Fuse the pairs [P] of one stream in their order, in place; ``slots`` are those to which ``pair_k`` refers.
 
     After each pair the values take the precision they are stored in. ``distance`` [P] takes the place of W2^2 where it
     is not empty; with ``weighted``, pi_c is multiplied by the overlap [P].
     """
-    work = empty((6, 3, 3), np.float64)
-    mean_k, cov_k, least = empty(3, np.float64), empty((3, 3), np.float64), empty(1, np.float64)
+    mean_k, cov_k = work[6, 1], work[7]
     for p in range(pair_c.size):
-        c, k = pair_c[p], pair_k[p]
+        c, k = pair_c[p], slots[pair_k[p]]
         pi_k = np.float64(weight[k])
         pi_c = weight_c[c] * (overlap[p] if weighted else 1.0)
         lam = pi_c / (pi_k + pi_c)
@@ -194,8 +189,7 @@ def fuse_pairs(
         squared = geodesic(mean_k, cov_k, mean_c[c], cov_c[c], lam, work)
         if distance.size > 0:
             squared = distance[p]
-        least[0] = 8 * epsilon * (cov_k[0, 0] + cov_k[1, 1] + cov_k[2, 2])
-        floor_covariance(cov_k[None], least)
+        floor_covariance(cov_k, 8 * epsilon * (cov_k[0, 0] + cov_k[1, 1] + cov_k[2, 2]), work)
         for i in range(3):
             mean[k, i] = mean_k[i]
             for j in range(3):
@@ -207,7 +201,7 @@ def fuse_pairs(
         count[k] += 1
 
 
-@part
+@leaf
 def append(mean, covariance, weight, disagreement, count, features, mean_c, cov_c, weight_c, features_c, new, occupied):
     """Add the components c where ``new`` [C] from slot ``occupied`` on, in place, as far as there are free ones; return
     how many slots are in use."""

@@ -16,23 +16,22 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
+from ufmstar_torch.kernels.compile_cpu import leaf
 from ufmstar_torch.kernels.regress_cull_cpu import negligible
-from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, gather, padded
+from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, WEIGHT, gather, padded
 from ufmstar_torch.kernels.vectors_cpu import vectors
 
-_GROUP = 64  # slots at a time, a multiple of LANES
+GROUP = 64  # slots at a time, a multiple of LANES
 _LOG2_PEAK = -1.5 * math.log2(2 * math.pi)
 _FLAT = 1e-13  # share of tr^3 below which a determinant may be rounding: such a component is kept
 _ROUNDING = 1e-9  # of a spread
 _WIDER = 1.01  # [px] beyond the first and the last pixel
 
 
-@part
-def reached(motion, mean, covariance, weight, K, size, prior_weight, epsilon, more):
-    """Slots [n] in increasing order that a frame can reach, and how many are occupied.
+@leaf
+def reached(motion, mean, covariance, weight, K, size, prior_weight, epsilon, more, index, group, kept, planes):
+    """Write the slots that a frame can reach to ``index`` [K] in increasing order; return how many these are, and how
+    many are occupied.
 
     Args:
         motion: [3, 4] from the mixture's frame into the camera's.
@@ -40,29 +39,30 @@ def reached(motion, mean, covariance, weight, K, size, prior_weight, epsilon, mo
         size: H, W.
         prior_weight, epsilon: of the regression; epsilon = 0 takes every occupied slot.
         more: how many components the frame may add.
+        group, kept, planes: [13, 64], [64] and [6, 4], scratch.
     """
-    index, occupied = empty(weight.size, np.int64), 0
+    occupied = 0
     for k in range(weight.size):
         index[occupied] = k
         occupied += weight[k] > 0
     if epsilon == 0:
-        return index[:occupied], occupied
-    planes = empty((6, 4), np.float64)  # outside: n . x > 0; and log2 of the least density that counts
+        return occupied, occupied
+    # Outside: n . x > 0; and log2 of the least density that counts.
     _plane(planes, 0, motion, -K[0, 0], 0.0, -(K[0, 2] + _WIDER))
     _plane(planes, 1, motion, K[0, 0], 0.0, K[0, 2] + 1 - size[1] - _WIDER)
     _plane(planes, 2, motion, 0.0, -K[1, 1], -(K[1, 2] + _WIDER))
     _plane(planes, 3, motion, 0.0, K[1, 1], K[1, 2] + 1 - size[0] - _WIDER)
     _plane(planes, 4, motion, 0.0, 0.0, -1.0)
     planes[5, 0] = negligible(prior_weight, epsilon, occupied + more)
-    n, group, kept = 0, empty((FIELDS, _GROUP), np.float64), empty(_GROUP, np.float64)
-    for first in range(0, occupied, _GROUP):
-        slots = index[first : min(first + _GROUP, occupied)]
-        gather(slots, slots.size, mean, covariance, weight, group)
-        _within(planes, padded(slots.size), group, kept)
-        for i in range(slots.size):
-            index[n] = slots[i]
+    n = 0
+    for first in range(0, occupied, GROUP):
+        count = min(GROUP, occupied - first)
+        gather(index, first, count, mean, covariance, weight, group)
+        _within(planes, padded(count), group, kept)
+        for i in range(count):
+            index[n] = index[first + i]
             n += kept[i] > 0
-    return index[:n], occupied
+    return n, occupied
 
 
 @leaf
@@ -85,9 +85,9 @@ def _within(code, planes, n, group, kept):
     normals = [[planes.one(4 * i + j) for j in range(4)] for i in range(5)]
     least = planes.one(20)
     with code.loop(n, code.lanes) as at:
-        mean = [group.load(at, i * _GROUP) for i in range(3)]
-        xx, xy, xz, _, yy, yz, _, _, zz = (group.load(at, (COVARIANCE + i) * _GROUP) for i in range(9))
-        trace, weight = xx + yy + zz, group.load(at, WEIGHT * _GROUP)
+        mean = [group.load(at, i * GROUP) for i in range(3)]
+        xx, xy, xz, _, yy, yz, _, _, zz = (group.load(at, (COVARIANCE + i) * GROUP) for i in range(9))
+        trace, weight = xx + yy + zz, group.load(at, WEIGHT * GROUP)
         det = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
         peak = (weight * weight).over(det).log2_above() * 0.5 + (_LOG2_PEAK + 0.05)
         square = ((peak - least) * (2 * math.log(2.0))).at_least(0.0) * 1.001

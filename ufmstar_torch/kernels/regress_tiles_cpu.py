@@ -42,7 +42,7 @@ def exact(depth, K, view, features, shift, out, out_f, first, shares):
     depth [H, W], K [3, 3], what is in view (:func:`in_view`) and features [K, F] into out [H, W] and out_f [F, H, W];
     NaN where the depth is not positive. ``shift`` [2] is added to the two features before the last, of three or more.
     """
-    tiles, lists, sums = _scratch(view, out_f, shift)
+    tiles, lists, sums = _scratch(view, out_f.shape[0], shift)
     grid = tiles[0]
     for i in range(PIXELS):
         grid[0, i] = (i % TILE - 0.5 * (TILE - 1)) / K[0, 0]
@@ -57,12 +57,12 @@ def exact_at(depth, K, pixels, view, features, shift, out, out_f):
     columns, rows = (width + _BLOCK - 1) // _BLOCK, (height + _BLOCK - 1) // _BLOCK
     begin, sorted_pixels = zeros(rows * columns + 1, np.int64), empty((4, pixels.size), np.int64)
     _by_block(pixels, width, columns, begin, sorted_pixels)
-    tiles, lists, sums = _scratch(view, out_f, shift)
+    tiles, lists, sums = _scratch(view, out_f.shape[0], shift)
     _at_pixels(depth, K, begin, sorted_pixels, view, features, tiles, lists, sums, out, out_f)
 
 
 @part
-def _scratch(view, out_f, shift):
+def _scratch(view, features, shift):
     """Memory for the work on one block, of the n components in view, in the dtype of the maps.
 
     Returns:
@@ -72,7 +72,7 @@ def _scratch(view, out_f, shift):
         at a tile: what they start with [6], offsets and densities of components, the sums [5, 64], averages of the
         other features, and the values of one of them.
     """
-    n, dtype, more = view[2].shape[1], view[2].dtype, out_f.shape[0] - _mixed(out_f.shape[0])  # n is padded
+    n, dtype, more = view[2].shape[1], view[2].dtype, features - _mixed(features)  # n is padded
     tiles = (
         empty((2, PIXELS), dtype), empty(PIXELS, dtype), empty((_TILES, 3 * PIXELS), dtype),
         empty((_TILES, 9), np.float64), empty(_TILES, np.bool_), empty((_TILES, PIXELS), dtype), empty(10, dtype),

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import functools
 
-import numpy as np
-
-from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
+from ufmstar_torch.kernels.compile_cpu import leaf
 from ufmstar_torch.kernels.vectors_cpu import LANES, vectors
 
 FIELDS = 13  # of a component: mean (3), covariance (9), weight
@@ -24,23 +22,21 @@ def padded(n):
     return (n + LANES - 1) // LANES * LANES
 
 
-@part
-def relative(T_a, T_b):
-    """[3, 4] the motion (R, t) that takes points of camera a into camera b (``camera.relative_pose``)."""
-    motion = empty((3, 4), np.float64)
+@leaf
+def relative(T_a, T_b, motion):
+    """Write the motion (R, t) [3, 4] that takes points of camera a into camera b (``camera.relative_pose``)."""
     x, y, z = T_a[0, 3] - T_b[0, 3], T_a[1, 3] - T_b[1, 3], T_a[2, 3] - T_b[2, 3]
     for i in range(3):
         for j in range(3):
             motion[i, j] = T_b[0, i] * T_a[0, j] + T_b[1, i] * T_a[1, j] + T_b[2, i] * T_a[2, j]
         motion[i, 3] = T_b[0, i] * x + T_b[1, i] * y + T_b[2, i] * z
-    return motion
 
 
 @leaf
-def gather(slots, n, mean, covariance, weight, fields):
-    """Write the first n of some slots by field, as they are; behind them zeros up to the padded number."""
+def gather(slots, first, n, mean, covariance, weight, fields):
+    """Write n slots from ``slots[first]`` on by field, as they are; behind them zeros up to the padded number."""
     for j in range(n):
-        k = slots[j]
+        k = slots[first + j]
         for i in range(3):
             fields[i, j] = mean[k, i]
             for axis in range(3):
@@ -65,14 +61,14 @@ def turn(code, motion, n, stride, fields):
                 fields.store(half[i][0] * d + half[i][1] * e + half[i][2] * f, at[COVARIANCE + 3 * i + j])
 
 
-@part
-def move(motion, mean, covariance, weight, mean_out, covariance_out):
-    """Write the moved mean [K, 3] and covariance [K, 3, 3] of occupied slots. What is not written stays as it is."""
-    half = empty((3, 3), np.float64)
+@leaf
+def move(motion, mean, covariance, weight, mean_out, covariance_out, half):
+    """Write the moved mean [K, 3] and covariance [K, 3, 3] of occupied slots. What is not written stays as it is;
+    ``half`` [3, 3] is scratch."""
     for k in range(weight.size):
         if not weight[k] > 0:
             continue
-        x, y, z = mean[k]
+        x, y, z = mean[k, 0], mean[k, 1], mean[k, 2]
         S = covariance[k]
         for i in range(3):
             a, b, c = motion[i, 0], motion[i, 1], motion[i, 2]

@@ -159,15 +159,25 @@ def _match(
 ) -> tuple[tuple[NDArray[Any], ...], list[_Pairs]]:
     """Step 3: of the state after the frame, camera-to-world of the first camera, started, frames and skipped; and what
     each stream matches."""
-    camera = array(frame.fault), array(frame.T_world_cam), array(frame.intrinsics)
-    before = tuple(array(value) for value in (state.T_world_first, state.started, state.frames, state.skipped))
-    after = tuple(map(np.empty_like, before))
+    fine, poses, cameras = array(frame.fault) == 0, array(frame.T_world_cam), array(frame.intrinsics)
+    first_before, started, frames, skipped = map(
+        array, (state.T_world_first, state.started, state.frames, state.skipped)
+    )
+    first = np.empty_like(first_before)
     mixture = tuple(array(value) for value in (state.mean, state.covariance, state.weight))
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
     least = min(EPSILON[frame.depth.dtype], EPSILON[state.covariance.dtype] if columns else 1.0)
     reach = config.prior_weight, least if config.regression == "exact" else 0.0
-    given = (camera, before, after, mixture, segments[:3], frame.size, thresholds, reach)
-    return after, [_Pairs(*found) for found in each(match, [(b, *given) for b in range(len(frame.depth))])]
+    calls = [
+        (
+            (bool(fine[b]), poses[b], cameras[b]), bool(started[b]), first_before[b], first[b],
+            tuple(value[b] for value in mixture), tuple(value[b] for value in segments[:3]),
+            frame.size, thresholds, reach,
+        )
+        for b in range(len(fine))
+    ]  # fmt: skip
+    after = first, started | fine, frames + fine, skipped + ~fine
+    return after, [_Pairs(*found) for found in each(match, calls)]
 
 
 def _join(
@@ -186,12 +196,13 @@ def _join(
     capacity = slots[0].shape[1]
     while capacity < needed:
         capacity *= 2
-    updated = tuple(np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype) for value in slots)
+    updated = tuple(_extended(value, capacity) for value in slots)
     settings = config.overlap_weighted, float(np.finfo(slots[1].dtype).eps)
-    fused = array(frame.T_world_cam), first, slots, updated, (*segments[:3], segments[5])
+    poses, given = array(frame.T_world_cam), (*segments[:3], segments[5])
     calls = [
         (
-            b, *fused, pair[:3], _distance(b, pair, segments, config), pair.new, pair.occupied, pair.near, pair.here,
+            poses[b], first[b], tuple(value[b] for value in updated), tuple(value[b] for value in given), pair[:3],
+            _distance(b, pair, segments, config), pair.new, pair.occupied, pair.near, pair.here,
             settings, columns + 1,
         )
         for b, pair in enumerate(pairs)
@@ -206,6 +217,14 @@ def _join(
         return all_of_them
     position = relative_pose(frame.T_world_cam, torch.from_numpy(first))[1]
     return _within_limit(all_of_them, [pair.occupied for pair in pairs], position, limit)
+
+
+def _extended(value: NDArray[Any], capacity: int) -> NDArray[Any]:
+    """A copy of slots [B, K, ...] with empty ones behind them up to the capacity."""
+    out = np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype)
+    present = value.shape[1]
+    out[:, :present], out[:, present:] = value, 0
+    return out
 
 
 def _within_limit(joined: _Joined, old: Sequence[int], position: Tensor, limit: int) -> _Joined:
@@ -237,7 +256,7 @@ def _within_limit(joined: _Joined, old: Sequence[int], position: Tensor, limit: 
 
 def _columns(
     state: UfMStarState, joined: _Joined, frame: FrameInput, extensions: FrameExtensions, config: UfMStarConfig
-) -> tuple[dict[str, Tensor], list[View] | None, Floats | None]:
+) -> tuple[dict[str, Tensor], list[View] | None, NDArray[np.float64] | None]:
     """Write the columns of extensions to the features before the last. Returns the tensors of the state that change;
     what is in view, and what the regression is to add to the columns, where an extension works on what is in view."""
     capacity, tensors = joined.mixture["weight"].shape[1], {**state.by_stream, **joined.sums}
