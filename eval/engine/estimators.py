@@ -216,7 +216,7 @@ class Gaussians(Estimator):
         average beside them."""
         mixture = self.ufm.mixture
         count = int(mixture.components.sum())
-        kept: dict[str, float] = {
+        memory: dict[str, float] = {
             "bytes": count * mixture.bytes_per_component(),
             "count": count,
             "smoothing_bytes": self.ufm.smoothed.nbytes,
@@ -224,9 +224,9 @@ class Gaussians(Estimator):
         if self.ufm.config.anchors is not None:
             state = self.ufm.state
             sums = sum(value[:, :1].nbytes for value in state.by_component.values())
-            kept["bytes"] += count * sums + sum(value.nbytes for value in state.by_stream.values())
-            kept["anchors"] = self._anchors
-        return kept
+            memory["bytes"] += count * sums + sum(value.nbytes for value in state.by_stream.values())
+            memory["anchors"] = self._anchors
+        return memory
 
     def state(self) -> dict[str, Tensor]:
         return dict(self.ufm.state_dict())
