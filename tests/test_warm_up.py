@@ -177,7 +177,7 @@ def test_a_damaged_file_is_replaced_and_said_once(hits, tmp_path, caplog, ending
     file.write_bytes(content[:length])
     assert [hits(), hits()] == [0, 1]
     assert [record.name for record in caplog.records] == ["ufmstar_torch"]
-    assert f"{file} is damaged and is replaced" in caplog.text
+    assert f"{file.parent} is damaged and is replaced" in caplog.text
 
 
 def test_a_full_disk_leaves_kernels_in_memory_and_is_said_once(hits, monkeypatch, caplog):

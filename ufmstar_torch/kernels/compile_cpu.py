@@ -177,7 +177,7 @@ class _KeptFiles(caching.IndexDataCacheFile):
             return _report(f"{Path(path).parent} cannot be read ({error.strerror})")
         checksum, data = data[:32], data[32:]
         if hashlib.sha256(data).digest() != checksum:
-            return _report(f"{path} is damaged and is replaced")
+            return _report(f"a file in {Path(path).parent} is damaged and is replaced")
         stamp, content = pickle.loads(data)
         return pickle.loads(content) if stamp == self._source_stamp else None
 
@@ -207,7 +207,7 @@ def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             return njit(**settings)(function)
         cache = compiled._cache  # no public way to widen what a cached kernel depends on
         stamp = numba.__version__, cache._cache_file._source_stamp, _SOURCES
-        cache._cache_file = _KeptFiles(cache._cache_path, cache._impl.filename_base, stamp)
+        cache._cache_file = _KeptFiles(cache._cache_path, f"{cache._impl.filename_base}.kept", stamp)
         return compiled
 
     return decorated
