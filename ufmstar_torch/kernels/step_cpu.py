@@ -256,7 +256,7 @@ def _within_limit(joined: _Joined, old: Sequence[int], position: Tensor, limit: 
 
 def _columns(
     state: UfMStarState, joined: _Joined, frame: FrameInput, extensions: FrameExtensions, config: UfMStarConfig
-) -> tuple[dict[str, Tensor], list[View] | None, Floats | None]:
+) -> tuple[dict[str, Tensor], list[View] | None, NDArray[np.float64] | None]:
     """Write the columns of extensions to the features before the last. Returns the tensors of the state that change;
     what is in view, and what the regression is to add to the columns, where an extension works on what is in view."""
     capacity, tensors = joined.mixture["weight"].shape[1], {**state.by_stream, **joined.sums}
