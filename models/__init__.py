@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.checkpoints import load_weights as load_weights
     from ufmstar_torch.models.checkpoints import save_checkpoint as save_checkpoint
     from ufmstar_torch.models.depth_anything import DepthAnything as DepthAnything
-    from ufmstar_torch.models.depth_anything import depth_anything_name as depth_anything_name
     from ufmstar_torch.models.distribution import EvidentialDepth as EvidentialDepth
     from ufmstar_torch.models.distribution import GaussianDepth as GaussianDepth
     from ufmstar_torch.models.distribution import PointDepth as PointDepth
