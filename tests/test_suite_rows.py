@@ -105,10 +105,6 @@ def test_rodrigues_formula(w):
     np.testing.assert_allclose(rotation(np.array(w)), expected, atol=1e-14)
 
 
-def test_without_noise_a_pose_stays_itself():
-    assert perturbed(POSE, Setting(seed=5, skip=2), 3) is POSE
-
-
 def noise(setting, indices):
     """Rotation vectors [rad] about the camera's axes, and translations [m], of the noise on some frames."""
     poses = [perturbed(POSE, setting, index) for index in indices]
