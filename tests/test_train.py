@@ -16,6 +16,7 @@ from trainings import RECIPE, SPEC, logged, scenes, tiny_job, with_network, writ
 from ufmstar_torch import cli
 from ufmstar_torch.models import (
     CheckpointError,
+    MonodepthResNet,
     NetworkSpec,
     build_network,
     load_trained,
@@ -279,6 +280,26 @@ def test_a_batch_ensemble_starts_from_weights_and_near_them(tmp_path, architectu
     factors = torch.cat([factor.detach().flatten() for factor in network.factors()])
     assert factors.mean().item() == pytest.approx(1, abs=0.02)
     assert 0.05 < factors.std().item() < 0.15
+
+
+@pytest.mark.parametrize(("held", "wanted"), [(18, 34), (34, 18)])
+def test_a_monodepth2_of_another_resnet_is_refused(tmp_path, held, wanted):
+    """Many of its tensors have the same names and shapes."""
+    network = MonodepthResNet(held)
+    torch.save(
+        {f"encoder.{key}": value for key, value in network.encoder.state_dict().items()}, tmp_path / "encoder.pth"
+    )
+    decoder = {
+        f"decoder.{2 * (4 - i) + n}.conv.conv.{kind}": getattr(getattr(level, part), kind)
+        for i, level in enumerate(network.levels)
+        for n, part in enumerate(("before", "after"))
+        for kind in ("weight", "bias")
+    }
+    torch.save(decoder, tmp_path / "depth.pth")
+    started = starting_network(NetworkSpec("monodepth2", layers=held), tmp_path)
+    assert torch.equal(started.backbone.levels[4].before.weight, network.levels[4].before.weight)
+    with pytest.raises(ValueError, match=rf"does not hold a ResNet{wanted}: .* another --network\.layers may"):
+        starting_network(NetworkSpec("monodepth2", layers=wanted), tmp_path)
 
 
 def test_a_start_that_does_not_fit_is_refused(tmp_path):

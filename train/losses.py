@@ -35,6 +35,7 @@ def loss_of(
     valid: Tensor,
     *,
     evidence_weight: float = EVIDENCE_WEIGHT,
+    beta_nll: float = 0.0,
 ) -> Tensor:
     """The distribution's loss, averaged over the pixels that have ground truth.
 
@@ -47,6 +48,7 @@ def loss_of(
         valid: [B, H, W] bool, True = use; pixels whose target is not finite and positive are left out as
             well.
         evidence_weight: lambda of :func:`evidential_loss`.
+        beta_nll: exponent of :func:`gaussian_nll`'s weight; 0 = the likelihood itself.
 
     Returns:
         A scalar. Without any valid pixel it is 0 and its gradient is 0 everywhere (and not absent: a
@@ -55,7 +57,7 @@ def loss_of(
     Raises:
         ValueError: shapes differ, ``valid`` is not bool, a weight is out of range.
     """
-    total, count = loss_sums(distribution, target, valid, evidence_weight=evidence_weight)
+    total, count = loss_sums(distribution, target, valid, evidence_weight=evidence_weight, beta_nll=beta_nll)
     return total / count.clamp(min=1)
 
 
@@ -65,6 +67,7 @@ def loss_sums(
     valid: Tensor,
     *,
     evidence_weight: float = EVIDENCE_WEIGHT,
+    beta_nll: float = 0.0,
 ) -> tuple[Tensor, Tensor]:
     """The sum of the loss over valid pixels and their number (int64); arguments as :func:`loss_of`.
 
@@ -73,7 +76,7 @@ def loss_sums(
     gradients averaged over processes (as DistributedDataParallel does), ``sum * world / total`` as each process's
     loss gives the gradient of one process that sees the whole batch.
     """
-    _check(distribution, target, valid, evidence_weight)
+    _check(distribution, target, valid, evidence_weight, beta_nll)
     usable = valid & target.isfinite() & (target > 0)
 
     def at_valid(values: Tensor, elsewhere: float = 1.0) -> Tensor:
@@ -84,7 +87,7 @@ def loss_sums(
     goal = at_valid(target)
     depth = at_valid(distribution.depth)
     if isinstance(distribution, GaussianDepth):
-        loss = gaussian_nll(depth, at_valid(distribution.log_variance, 0.0), goal)
+        loss = gaussian_nll(depth, at_valid(distribution.log_variance, 0.0), goal, beta=beta_nll)
     elif isinstance(distribution, EvidentialDepth):
         nu, beta = at_valid(distribution.nu), at_valid(distribution.beta)
         loss = evidential_loss(depth, nu, at_valid(distribution.alpha, 2.0), beta, goal, evidence_weight)
@@ -98,16 +101,20 @@ def depth_l1(depth: Tensor, target: Tensor) -> Tensor:
     return (target - depth).abs()
 
 
-def gaussian_nll(depth: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
+def gaussian_nll(depth: Tensor, log_variance: Tensor, target: Tensor, *, beta: float = 0.0) -> Tensor:
     """-log N(target; depth, exp(s)) = ((target - depth)^2 exp(-s) + s + log 2 pi) / 2 per pixel [nat].
 
     Args:
         depth: [...] mean [m].
         log_variance: [...] s, of the variance in m^2. Beyond +-40 value and gradient are those at +-40.
         target: [...] [m].
+        beta: weighs each pixel with variance^beta, which gets no gradient (Seitzer et al. 2022, who
+            suggest 0.5): pixels with a large variance then no longer learn their depth more slowly. The result is
+            then no likelihood.
     """
     s = log_variance + (log_variance.clamp(-_LOG_VARIANCE_LIMIT, _LOG_VARIANCE_LIMIT) - log_variance).detach()
-    return 0.5 * ((target - depth).square() * (-s).exp() + s + math.log(2 * math.pi))
+    nll = 0.5 * ((target - depth).square() * (-s).exp() + s + math.log(2 * math.pi))
+    return nll * (beta * s.detach()).exp() if beta else nll
 
 
 def evidential_nll(depth: Tensor, nu: Tensor, alpha: Tensor, beta: Tensor, target: Tensor) -> Tensor:
@@ -151,7 +158,7 @@ def _log_gamma_half_step(a: Tensor) -> Tensor:
     return torch.where(large, series, torch.lgamma(small + 0.5) - torch.lgamma(small))
 
 
-def _check(distribution: DepthDistribution, target: Tensor, valid: Tensor, evidence: float) -> None:
+def _check(distribution: DepthDistribution, target: Tensor, valid: Tensor, evidence: float, beta: float) -> None:
     if not isinstance(distribution, PointDepth | GaussianDepth | EvidentialDepth):
         raise ValueError(f"distribution must be a DepthDistribution, got {type(distribution).__name__}")
     if valid.dtype != torch.bool:
@@ -162,5 +169,5 @@ def _check(distribution: DepthDistribution, target: Tensor, valid: Tensor, evide
             f"target and valid must have the depth's shape {tuple(shape)}, got {tuple(target.shape)} and "
             f"{tuple(valid.shape)}"
         )
-    if not evidence >= 0:
-        raise ValueError(f"evidence_weight must be >= 0, got {evidence}")
+    if not evidence >= 0 or not 0 <= beta <= 1:
+        raise ValueError(f"evidence_weight must be >= 0 and beta_nll in [0, 1], got {evidence} and {beta}")

@@ -18,8 +18,8 @@ class FitSettings(Checked):
     Attributes:
         out: output folder.
         seed: of the training; member n has the seed 1000 seed + n, so that trainings with different seeds share none.
-        init: weights to start from: a trained .safetensors, FastDepth's .onnx, a ResNet's .pth or the word
-            imagenet; see ``train.start.starting_network``.
+        init: weights to start from: a trained .safetensors, FastDepth's .onnx, a ResNet's .pth, Monodepth2's folder or
+            the word imagenet; see ``train.start.starting_network``.
         trainable: train only parameters whose names begin with one of these; empty = all of them.
         accelerator: cpu, gpu or auto.
         devices: number of processes or GPUs, as Lightning takes it.
