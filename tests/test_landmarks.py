@@ -96,7 +96,7 @@ def test_other_files_are_refused(tmp_path):
     for name, message in (
         ("a", "expected the arrays points, sigma, got xyz"),
         ("cut", r"cut\.npz"),
-        ("negative", r"negative\.npz.*\[-3, 3\]"),
+        ("negative", r"negative\.npz"),
         ("pickled", "allow_pickle"),
         ("flat", r"\[P, 3\]"),
         ("bytes", "landmarks"),
