@@ -1,4 +1,4 @@
-"""What the scripts of docs/results/analysis.md share: predictions of a sequence, variances, their figures."""
+"""What the scripts of docs/results/disagreement.md share: predictions of a sequence, variances, their figures."""
 
 from __future__ import annotations
 

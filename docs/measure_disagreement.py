@@ -4,7 +4,7 @@
     python docs/measure_disagreement.py regions --root ../shared
     python docs/measure_disagreement.py floors --root ../shared
 
-print the tables of docs/results/analysis.md for FastDepth on the shared sequences; ``--tours 200:206`` instead of
+print the tables of docs/results/disagreement.md for FastDepth on the shared sequences; ``--tours 200:206`` instead of
 ``--root`` takes rendered tours and the networks of the demo.
 """
 

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from ufmstar_torch import PosteriorConfig, UfMStar
 from ufmstar_torch.anchors import landmark_source
-from ufmstar_torch.anchors.given import AnchorInput, check_anchors
+from ufmstar_torch.anchors.anchors import AnchorInput, check_anchors
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.sequences.frame import Frame

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.alignment import AlignedNetwork as AlignedNetwork
     from ufmstar_torch.models.alignment import Alignment as Alignment
     from ufmstar_torch.models.alignment import AlignmentFit as AlignmentFit
-    from ufmstar_torch.models.alignment import AlignmentSums as AlignmentSums
     from ufmstar_torch.models.alignment import fit_affine_depth as fit_affine_depth
     from ufmstar_torch.models.alignment import fit_inverse_depth as fit_inverse_depth
     from ufmstar_torch.models.any_network import WrappedNetwork as WrappedNetwork
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.checkpoints import load_weights as load_weights
     from ufmstar_torch.models.checkpoints import save_checkpoint as save_checkpoint
     from ufmstar_torch.models.depth_anything import DepthAnything as DepthAnything
-    from ufmstar_torch.models.depth_anything import depth_anything_name as depth_anything_name
     from ufmstar_torch.models.distribution import EvidentialDepth as EvidentialDepth
     from ufmstar_torch.models.distribution import GaussianDepth as GaussianDepth
     from ufmstar_torch.models.distribution import PointDepth as PointDepth
@@ -45,7 +43,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.hugging_face import from_hugging_face as from_hugging_face
     from ufmstar_torch.models.load import load_network as load_network
     from ufmstar_torch.models.monodepth2 import MonodepthResNet as MonodepthResNet
-    from ufmstar_torch.models.monodepth2_import import load_monodepth2 as load_monodepth2
     from ufmstar_torch.models.network import Backbone as Backbone
     from ufmstar_torch.models.network import DepthNetwork as DepthNetwork
     from ufmstar_torch.models.onnx_network import OnnxNetwork as OnnxNetwork

@@ -1,6 +1,7 @@
 """Depth Anything V2 (Yang et al., NeurIPS 2024): a DINOv2 encoder with a DPT decoder, by ``transformers``.
 
-The metric checkpoints (indoor up to 20 m, outdoor up to 80 m) are depth networks at once. The relative ones
+The checkpoints are depth-anything/Depth-Anything-V2-[Metric-Indoor-|Metric-Outdoor-]{Small,Base,Large}-hf on the hub.
+The metric ones (indoor up to 20 m, outdoor up to 80 m) are depth networks at once. The relative ones
 predict inverse depth up to scale and shift and need an alignment. Small is Apache-2.0, Base and Large are
 CC BY-NC 4.0: not for commercial use.
 """
@@ -20,26 +21,8 @@ from ufmstar_torch.models.checkpoints import CheckpointError
 from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
 from ufmstar_torch.models.network import DepthNetwork
 
-SIZES = ("small", "base", "large")
-VARIANTS = ("indoor", "outdoor", "relative")
 # The published checkpoints' image processors, for directories without preprocessor_config.json.
 _PROCESSOR = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225], "resample": 3}
-
-
-def depth_anything_name(size: str = "small", variant: str = "indoor") -> str:
-    """The published checkpoint's name on the Hugging Face hub.
-
-    Args:
-        size: "small" (25 million weights, Apache-2.0), "base" (97) or "large" (335), both CC BY-NC 4.0.
-        variant: "indoor" (metric, trained on Hypersim), "outdoor" (metric, Virtual KITTI) or "relative".
-
-    Raises:
-        ValueError: no such size or variant.
-    """
-    if size not in SIZES or variant not in VARIANTS:
-        raise ValueError(f"size must be one of {SIZES} and variant one of {VARIANTS}, got {size!r} and {variant!r}")
-    metric = "" if variant == "relative" else f"Metric-{variant.capitalize()}-"
-    return f"depth-anything/Depth-Anything-V2-{metric}{size.capitalize()}-hf"
 
 
 class DepthAnything(HuggingFaceDepth):

@@ -99,7 +99,7 @@ class MonodepthResNet(Backbone):
 
     ``preprocess`` makes its input: NYU's crop, 224 x 224, normalised by ImageNet's colour statistics. The
     weights are those of a start from scratch (depth about :data:`INITIAL_DEPTH` everywhere);
-    :meth:`imagenet`, ``load_monodepth2`` and ``checkpoints.load_weights`` fill in trained ones.
+    :meth:`imagenet` and ``checkpoints.load_weights`` fill in trained ones.
 
     Args:
         layers: of the encoder, 18, 34 or 50.

@@ -119,12 +119,6 @@ def test_a_score_over_all_pixels_is_the_mean_of_the_dense_map(place):
     assert score == pytest.approx(float(dense.variance.mean()), rel=1e-5)
 
 
-def test_a_network_without_a_variance_is_refused(place):
-    spec = NetworkSpec(method="depth", widths=0.1, positive="softplus", size=(64, 96), preprocess="resize")
-    with pytest.raises(ValueError, match="aleatoric or evidential head"):
-        example.score_pool([build_network(spec).eval()], place[0], 10)
-
-
 # --- fine-tuning -------------------------------------------------------------------------------------
 
 
@@ -152,18 +146,6 @@ def test_fine_tuning_learns_the_labels_and_leaves_the_start_alone(kind):
         assert not [name for name in moved if "running" in name or "num_batches" in name]
     if kind == "batch_ensemble":
         assert tuned[0].ensemble is tuned[1].ensemble is not start[0].ensemble
-
-
-def test_fine_tuning_repeats_from_its_seed():
-    start, views = networks(1), [view(1.0 + i, seed=i) for i in range(3)]
-    settings = options(steps=2, rounds=1)
-
-    def tuned(seed: int) -> torch.Tensor:
-        (network,) = example.fine_tune(start, views, settings, np.random.default_rng(seed))
-        return torch.cat([p.detach().flatten() for p in network.parameters()])
-
-    assert torch.equal(tuned(0), tuned(0))
-    assert not torch.equal(tuned(0), tuned(1))
 
 
 # --- the held-back part ------------------------------------------------------------------------------

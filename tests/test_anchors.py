@@ -13,9 +13,9 @@ from oracle_anchors import weight
 
 import scenes
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
+from ufmstar_torch.anchors.anchors import AnchorInput, Anchors
 from ufmstar_torch.anchors.evidence import Evidence, inliers, means, observe
 from ufmstar_torch.anchors.extension import anchored_term
-from ufmstar_torch.anchors.given import AnchorInput, Anchors
 
 HEIGHT, WIDTH = 48, 64
 ON = UfMStarConfig(anchors=AnchorConfig())
@@ -240,6 +240,7 @@ def test_anchors_that_make_no_sense_are_left_out_and_counted():
         ({"variance": torch.zeros(4)}, ValueError, "anchors.variance must have shape"),
         ({"valid": torch.ones(1, 4)}, TypeError, "anchors.valid must be a torch.bool"),
         ({"pixel": None}, TypeError, "anchors.pixel must be a torch.Tensor, got NoneType"),
+        ({"valid": torch.ones(1, 4, device="meta") > 0}, ValueError, "anchors.valid must lie on the depth's device"),
     ],
 )
 def test_wrong_anchors_are_refused_before_anything_changes(change, error, told):

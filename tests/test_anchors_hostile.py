@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 import scenes
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
+from ufmstar_torch.anchors.anchors import AnchorInput, Anchors
 from ufmstar_torch.anchors.evidence import Evidence, inliers, observe
-from ufmstar_torch.anchors.given import AnchorInput, Anchors
 
 H, W = 48, 64
 ON = UfMStarConfig(anchors=AnchorConfig())
@@ -112,11 +112,3 @@ def test_padding_does_not_decide_which_neighbours_are_asked():
         alone = inliers(stream(pixel, ratio, n))
         for padded in (n + 1, n + 40, 200):
             assert torch.equal(inliers(stream(pixel, ratio, padded))[:, :n], alone)
-
-
-def test_a_mask_on_another_device_is_named():
-    pixel, one = torch.zeros(1, 4, 2), torch.ones(1, 4)
-    K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
-    mask = torch.ones(1, 4, dtype=torch.bool, device="meta")
-    with pytest.raises(ValueError, match=r"anchors\.valid must lie on the depth\'s device cpu, got meta"):
-        UfMStar(ON)(torch.full((1, H, W), 2.0), torch.eye(4), K, anchors=Anchors(pixel, one, 0 * one, mask))

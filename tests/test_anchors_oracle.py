@@ -10,9 +10,9 @@ from walks import HEIGHT, SPGF, WIDTH, oracle_settings
 
 import scenes
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
+from ufmstar_torch.anchors.anchors import AnchorInput, Anchors, check_anchors, check_values
 from ufmstar_torch.anchors.evidence import Evidence, inliers
-from ufmstar_torch.anchors.extension import anchored_term, learn
-from ufmstar_torch.anchors.given import AnchorInput, Anchors, check_anchors, check_values
+from ufmstar_torch.anchors.extension import learn
 from ufmstar_torch.frame import check_frame
 from ufmstar_torch.kernels import anchors_cpu
 from ufmstar_torch.kernels.regress_cpu import all_seen, regress_maps
@@ -142,15 +142,6 @@ def test_compiled_checks_are_the_references_own():
             torch.testing.assert_close(getattr(fast, name), getattr(slow, name), rtol=5e-7, atol=0, msg=name)
         assert torch.equal(fast.index[slow.valid], slow.index[slow.valid])
         assert 0 <= int(fast.index.min()) <= int(fast.index.max()) < size[0] * size[1]
-
-
-def test_the_compiled_term_is_the_references_own():
-    generator = torch.Generator().manual_seed(0)
-    depth, excess, disagreement = torch.rand(3, 2, 30, 40, generator=generator)
-    disagreement[0, :5], excess[1, 5:9] = torch.nan, -1.0
-    given = depth, 0.2 * excess, 0.1 * disagreement
-    for mine, value in zip(anchors_cpu.anchored_term(*given), anchored_term(*given), strict=True):
-        torch.testing.assert_close(mine, value, rtol=5e-7, atol=5e-8, equal_nan=True)  # float32
 
 
 @pytest.mark.parametrize("some", [False, True])

@@ -112,14 +112,6 @@ def test_closed_forms_of_the_intrinsics():
     torch.testing.assert_close(longer.diagonal(), centred.diagonal() * torch.tensor([1.5, 1.5, 1.0]))
 
 
-def test_the_flip_is_exact():
-    rng = torch.Generator().manual_seed(0)
-    image, depth = torch.rand(3, *SIZE, generator=rng), torch.rand(SIZE, generator=rng)
-    new_image, new_depth, _ = apply_geometry(image, depth, K, Change(flip=True))
-    torch.testing.assert_close(new_image, image.flip(-1), rtol=0, atol=1e-4)
-    assert torch.equal(new_depth, depth.flip(-1))
-
-
 def test_depth_is_copied_and_never_mixed():
     depth = torch.where(torch.arange(SIZE[1]) % 7 < 3, 1.0, 4.0).expand(SIZE)
     change = Change(scale=1.37, angle=0.08)

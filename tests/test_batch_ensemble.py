@@ -155,21 +155,6 @@ def test_autocast_does_not_widen_what_follows():
 # ---- how factors begin ----
 
 
-def test_a_seed_decides_the_factors_and_nothing_else_does():
-    torch.manual_seed(1)
-    first = convert(nn.Linear(4, 5), N, generator=seeded(7))
-    state = torch.get_rng_state()
-    second = convert(nn.Linear(4, 5).double(), N, generator=seeded(7))
-    assert torch.equal(first.r.double(), second.r)
-    assert torch.equal(first.s.double(), second.s)
-    torch.set_rng_state(state)
-    nn.Linear(4, 5)
-    after = torch.get_rng_state()
-    torch.set_rng_state(state)
-    convert(nn.Linear(4, 5), N, generator=seeded())
-    assert torch.equal(torch.get_rng_state(), after)
-
-
 # ---- conversion ----
 
 

@@ -15,7 +15,7 @@ from walks import SPGF, oracle_settings
 
 import oracle
 from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.methods.method import Method

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from shared_data import require_shared
 from torch import Tensor, nn
 
 from ufmstar_torch.models import CheckpointError, atomic, load_state_dict_file, load_weights, save_checkpoint
@@ -29,14 +27,6 @@ class Small(nn.Module):
         super().__init__()
         self.conv = nn.Conv2d(3, 2, 3)
         self.norm = nn.BatchNorm2d(2)
-
-
-class Nested(nn.Module):
-    """A network with a part of the name that is usually a wrapper's."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.model = Small()
 
 
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
@@ -86,13 +76,6 @@ def test_what_wrappers_add_is_taken_off(tmp_path: Path, wrap: Callable[[dict[str
     source, target = Small(), Small()
     torch.save(wrap(dict(source.state_dict())), tmp_path / "w.pth", _use_new_zipfile_serialization=new)
     assert same(load_state_dict_file(tmp_path / "w.pth"), source.state_dict())
-    load_weights(target, tmp_path / "w.pth")
-    assert same(target.state_dict(), source.state_dict())
-
-
-def test_a_part_called_model_keeps_its_name(tmp_path: Path) -> None:
-    source, target = Nested(), Nested()
-    torch.save({f"module.{k}": v for k, v in source.state_dict().items()}, tmp_path / "w.pth")
     load_weights(target, tmp_path / "w.pth")
     assert same(target.state_dict(), source.state_dict())
 
@@ -220,13 +203,6 @@ def test_missing_files_and_unknown_suffixes(tmp_path: Path) -> None:
     assert not (tmp_path / "w.npz").exists()
 
 
-def test_missing_safetensors_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    save_checkpoint(tmp_path / "w.safetensors", Small())
-    monkeypatch.setitem(sys.modules, "safetensors", None)
-    with pytest.raises(ModuleNotFoundError, match="needs the package safetensors"):
-        load_state_dict_file(tmp_path / "w.safetensors")
-
-
 # --- writing -----------------------------------------------------------------------------------------
 
 
@@ -244,11 +220,3 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, name: str, monkeypat
         save_checkpoint(tmp_path / name, Small())
     assert [p.name for p in tmp_path.iterdir()] == [name]
     assert same(load_state_dict_file(tmp_path / name), old.state_dict())
-
-
-def test_weights_that_others_trained() -> None:
-    """ResNet50 in half precision, with torchvision's names, without its classifier."""
-    state = load_state_dict_file(require_shared("weights/resnet50_v1_imagenet_fp16_nofc.pth"))
-    assert state["conv1.weight"].shape == (64, 3, 7, 7)
-    assert state["layer4.2.conv3.weight"].shape == (2048, 512, 1, 1)
-    assert not any(key.startswith("fc.") for key in state)

@@ -20,7 +20,6 @@ from ufmstar_torch.models import (
     CheckpointError,
     DepthAnything,
     Preprocess,
-    depth_anything_name,
     fit_inverse_depth,
     from_hugging_face,
     load_network,
@@ -253,7 +252,7 @@ def test_missing_directories_are_named(broken, tmp_path):
 def test_a_hub_name_without_a_connection_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     with pytest.raises(OSError, match=r"(?s)Small-hf is no directory and cannot be had.*--local-dir DIR") as caught:
-        DepthAnything.from_pretrained(depth_anything_name("small", "relative"), local_files_only=True)
+        DepthAnything.from_pretrained("depth-anything/Depth-Anything-V2-Small-hf", local_files_only=True)
     assert isinstance(caught.value.__cause__, OSError)
 
 

@@ -20,7 +20,6 @@ from ufmstar_torch.models import (
     DepthOnlyNetwork,
     EvidentialNetwork,
     FastDepth,
-    MonodepthResNet,
     MonteCarloDropout,
     set_sampling,
 )
@@ -186,28 +185,3 @@ def test_multi_inference_form_is_ten_passes() -> None:
     assert full.prediction.epistemic_variance is not None
     torch.testing.assert_close(full.prediction.epistemic_variance, baseline.epistemic_variance)
     assert float(full.prediction.epistemic_variance.mean()) > 0
-
-
-@pytest.mark.parametrize("kind", ["fastdepth", "monodepth2"])
-def test_dropout_after_both_convolutions_of_a_level(kind: str) -> None:
-    """Twice the layers, more variance between samples, the same weights, and the same depth without sampling."""
-
-    def built(both: bool) -> Backbone:
-        if kind == "fastdepth":
-            return FastDepth(small_network().widths, dropout=P, dropout_both=both, positive="softplus").eval()
-        return MonodepthResNet(18, dropout=P, dropout_both=both, decoder=(4, 4, 4, 4, 4), size=(64, 64)).eval()
-
-    torch.manual_seed(0)
-    once, both = built(False), built(True)
-    both.load_state_dict(once.state_dict(), strict=True)
-    x = torch.rand(1, 3, 64, 64, generator=seeded())
-    with torch.inference_mode():
-        assert torch.equal(once(x).depth, both(x).depth)
-        assert (set_sampling(once, True, seeded()), set_sampling(both, True, seeded())) == (5, 10)
-        assert not torch.equal(once(x).depth, both(x).depth)
-        first = [module for module in both.modules() if isinstance(module, DecoderDropout)]
-        seen: list[int] = []
-        for n, module in enumerate(first):
-            module.register_forward_hook(lambda *_, n=n: seen.append(n))
-        both(x)
-    assert sorted(seen) == list(range(10)), "each of them acts once per pass"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import pickle
 import threading
-from dataclasses import replace
 
 import pytest
 import torch
@@ -115,20 +114,6 @@ def test_an_offloaded_member_keeps_nothing_on_the_device():
     assert torch.equal(members[1].network()(image()).depth, Gain(1.1)(image()).depth)
 
 
-def test_weights_of_a_lazy_member_are_no_part_of_a_state_dict():
-    members, _ = lazy(1.0, 1.1)
-    pipeline = UncertainDepth(members)
-    before = set(pipeline.state_dict())
-    pipeline(image(1), POSE, K)
-    state = pipeline.state_dict()
-    assert set(state) == before
-    assert not any(key.startswith("networks.") for key in state)
-    others, _ = lazy(1.0, 1.1)
-    other = UncertainDepth(others)
-    other.load_state_dict(state)
-    assert torch.equal(other(image(1), POSE, K).variance, pipeline(image(1), POSE, K).variance)
-
-
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
 def test_a_copy_loads_anew(copied):
     (member,), _ = lazy(1.2)
@@ -182,10 +167,3 @@ def test_a_member_that_cannot_be_loaded_is_named(error):
         pipeline(image(1), POSE, K)
     fail.clear()  # the alternation has not advanced, and the next attempt loads it
     assert pipeline(image(1), POSE, K).member == 1
-
-
-def test_a_loader_must_return_what_was_declared():
-    with pytest.raises(CheckpointError, match="must be a DepthNetwork, got Linear"):
-        LazyMember(lambda: nn.Linear(1, 1), INPUT)(image())
-    with pytest.raises(CheckpointError, match="has the preprocessing"):
-        LazyMember(Loader(1.0), replace(INPUT, size=(8, 12)))(image())

@@ -25,7 +25,6 @@ from ufmstar_torch.models import (
     FastDepth,
     FastDepthWidths,
     MonodepthResNet,
-    OnnxNetwork,
     save_trained,
     with_head,
 )
@@ -97,13 +96,6 @@ def test_a_graph_of_another_size_runs_in_torch(tmp_path: Path) -> None:
     assert (about["name"], depth.shape) == ("torch", (224, 224))
     with pytest.raises(ValueError, match="runtime onnx needs weights in an ONNX file, of the input's size"):
         predicted("fastdepth", small, Inference("onnx"))
-
-
-def test_dropout_needs_torch(weights: Path) -> None:
-    sampling = FastDepth.from_onnx(weights, dropout=0.2)
-    assert not isinstance(Inference().ready(sampling, weights, CPU), OnnxNetwork)
-    with pytest.raises(ValueError, match=r"needs weights in an ONNX file, .* without dropout"):
-        Inference("onnx").ready(sampling, weights, CPU)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig, UncertainDepth, 
 from ufmstar_torch.anchors import Anchors, LandmarkMap, LandmarkTracker, landmark_source
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.eval.engine.anchors import landmark_digests, landmarks_of
-from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
+from ufmstar_torch.eval.engine.maps import MapSource
 from ufmstar_torch.eval.methods.setting import setting_from
 from ufmstar_torch.eval.report.text import run_table
 from ufmstar_torch.eval.run.run import run
@@ -169,7 +169,7 @@ def test_a_large_map_is_thinned_evenly(tour):
 
 
 def too_far(frame):
-    return PredictedMap(1.3 * frame.depth, None, frame.intrinsics)
+    return 1.3 * frame.depth, None, frame.intrinsics
 
 
 def test_a_run_with_a_file_equals_a_loop_by_hand_and_resumes(tour, file, tmp_path):

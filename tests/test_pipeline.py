@@ -112,17 +112,6 @@ def test_combine():
         combine([])
 
 
-def test_preprocess_carries_the_intrinsics():
-    from ufmstar_torch.camera import resize_intrinsics
-
-    def half(x, K):
-        return nn.functional.interpolate(x, scale_factor=0.5), resize_intrinsics(K, (H, W), (H // 2, W // 2))
-
-    out = UncertainDepth(Scaled(1.0), CONFIG, preprocess=half)(image(0), POSES[0], K)
-    assert out.depth.shape == (1, H // 2, W // 2)
-    torch.testing.assert_close(out.intrinsics[0], resize_intrinsics(K, (H, W), (H // 2, W // 2)))
-
-
 class ByFocal(nn.Module):
     """Depth = the image times fx [px] of the network's own input / 16."""
 

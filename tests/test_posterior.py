@@ -12,7 +12,7 @@ import torch
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.anchors.given import check_anchors
+from ufmstar_torch.anchors.anchors import check_anchors
 from ufmstar_torch.frame import check_frame
 from ufmstar_torch.kernels import field_cpu, posterior_cpu
 from ufmstar_torch.posterior.distance import distance

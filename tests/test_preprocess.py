@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from PIL import Image
 from torch import Tensor
@@ -137,21 +137,6 @@ def test_depth_pixels_are_the_ones_seen() -> None:
     error = (points @ n - offset).abs().max()
     assert 0 < error < bound
     assert set(carried.flatten().tolist()) <= set(depth.flatten().tolist())  # copied, never mixed
-
-
-@given(size=st.sampled_from(SIZES), preset=st.sampled_from(PRESETS))
-@settings(max_examples=35)
-def test_nearest_source_pixel_is_within_half_a_pixel(size: tuple[int, int], preset: Preprocess) -> None:
-    """Maps of row and column numbers tell which pixel was taken; the intrinsics tell which it should be."""
-    u = torch.arange(size[1], dtype=torch.float64).expand(1, *size)
-    v = torch.arange(size[0], dtype=torch.float64)[:, None].expand(1, *size)
-    A = preset.apply_intrinsics(torch.eye(3, dtype=torch.float64)[None], *size)[0]  # pixel -> network pixel
-    taken_u, taken_v = preset.apply_depth(u), preset.apply_depth(v)
-    h, w = preset.geometry(*size).final
-    wanted_u = (torch.arange(w, dtype=torch.float64) - A[0, 2]) / A[0, 0]
-    wanted_v = (torch.arange(h, dtype=torch.float64) - A[1, 2]) / A[1, 1]
-    assert (taken_u - wanted_u).abs().max() <= 0.5 + 1e-6
-    assert (taken_v - wanted_v[:, None]).abs().max() <= 0.5 + 1e-6
 
 
 def test_bytes_and_floats_agree_and_are_scaled() -> None:

@@ -13,7 +13,7 @@ from runs import Brightness, job_of, networks, outputs, read_summary
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig, UncertainDepth, cli
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.commands.run import job_from, read
-from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
+from ufmstar_torch.eval.engine.maps import MapSource
 from ufmstar_torch.eval.report.text import run_table
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.panels import map_columns
@@ -49,7 +49,7 @@ def too_far(frame, stop_at=None):
     if frame.index == stop_at:
         raise KeyboardInterrupt
     depth = 1.3 * frame.depth[::2, ::2]
-    return PredictedMap(depth, np.full_like(depth, 1e-4), np.diag([0.5, 0.5, 1.0]) @ frame.intrinsics)
+    return depth, np.full_like(depth, 1e-4), np.diag([0.5, 0.5, 1.0]) @ frame.intrinsics
 
 
 def map_job(sequence, config=ON, read=too_far, **options):

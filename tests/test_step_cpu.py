@@ -14,7 +14,7 @@ import scenes
 from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.frame import FrameMaps, check_values
-from ufmstar_torch.kernels import check_cpu, reach_cpu, rigid_cpu, step_cpu, threads_cpu
+from ufmstar_torch.kernels import check_cpu, rigid_cpu, step_cpu, threads_cpu, visibility_cpu
 from ufmstar_torch.kernels.regress_cull_cpu import in_view
 
 pytestmark = pytest.mark.numerics
@@ -152,9 +152,9 @@ def test_what_is_out_of_reach_neither_matches_nor_is_summed(dtype):
     mean, covariance, weight = here[:3].T, here[3:12].T.reshape(-1, 3, 3), here[12]
     mean, covariance = mean @ motion[:, :3].T + motion[:, 3], motion[:, :3] @ covariance @ motion[:, :3].T
     here[:12] = np.concatenate([mean, covariance.reshape(-1, 9)], 1).T
-    index, group = np.empty(400, np.int64), np.empty((rigid_cpu.FIELDS, reach_cpu.GROUP))
-    work = group, np.empty(reach_cpu.GROUP), np.empty((6, 4))
-    n, occupied = compiled(reach_cpu.reached)(motion, *slots, camera, SIZE, 1.0, 1e-6, 0, index, *work)
+    index, group = np.empty(400, np.int64), np.empty((rigid_cpu.FIELDS, visibility_cpu.GROUP))
+    work = group, np.empty(visibility_cpu.GROUP), np.empty((6, 4))
+    n, occupied = compiled(visibility_cpu.reached)(motion, *slots, camera, SIZE, 1.0, 1e-6, 0, index, *work)
     near = index[:n]
     u, v = (camera[i, i] * mean[:, i] / mean[:, 2] + camera[i, 2] for i in range(2))
     inside = (u >= -0.5) & (u < SIZE[1] - 0.5) & (v >= -0.5) & (v < SIZE[0] - 0.5) & (mean[:, 2] > 0.05)

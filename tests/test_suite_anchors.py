@@ -11,17 +11,14 @@ import torch
 from tiny_suite import Biased, base_network, evaluate, in_memory, row, unbatched, write_network
 
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.engine.anchors import TRUTH_SIGMA, AnchorSource, Tracks, anchor_sources
 from ufmstar_torch.eval.engine.estimators import ufm_star_config
-from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
-from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.data import setting_of
-from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.sequence import open_tour
 
@@ -113,51 +110,6 @@ def test_the_seed_matters_only_where_something_is_drawn():
     assert Setting(anchors="truth", seed=4).slug != Setting(anchors="truth").slug
     assert Setting(anchors="tracked", anchor_count=0).slug != Setting(anchors="tracked").slug
     assert [default_of(n) for n in ("anchors", "anchor_count", "track_noise", "corrected")] == ["", None, 0.0, False]
-
-
-@pytest.mark.parametrize("name", ["DepthOnly", "UfM-DepthOnly-100K"])
-def test_anchors_go_with_ufm_star_only(name):
-    with pytest.raises(ValueError, match=r"only UfM\* has anchors"):
-        row(name, anchors="tracked")
-
-
-def test_suites_and_words(tmp_path):
-    suite = suite_named("anchors")
-    assert [row_label(r) for r in suite.rows] == [
-        "DepthOnly",
-        NAME,
-        f"{NAME}, disagreement overlap",
-        "UfM*-Anchored-DepthOnly",
-        "UfM*-Anchored-DepthOnly, disagreement overlap",
-        "UfM*-Anchored-DepthOnly, depth corrected on",
-        "UfM*-Posterior-DepthOnly",
-        f"{NAME}, anchored by dense evidence",
-        f"{NAME}, anchored by dense evidence, posterior",
-        f"{NAME}, anchored by ground truth",
-        f"{NAME}, anchored by ground truth, posterior",
-    ]
-    posterior = suite_named("posterior")
-    assert posterior.bases == ("depth_only", "ensemble")
-    assert {r.setting.anchors for r in posterior.rows if r.setting.posterior} == {"tracked", "dense", "truth"}
-    varied = [name for name in posterior.sweep if any(name in r.setting.to_dict() for r in posterior.rows)]
-    assert varied == list(posterior.sweep)
-    every = suite_named("all-anchored")
-    assert set(every.bases) == set(BASES)
-    assert [r.label for r in every.rows if r.method.base == "evidential"] == [
-        "Evidential",
-        "UfM*-Evidential",
-        "UfM*-Evidential (disagreement overlap)",
-        "UfM*-Anchored-Evidential",
-        "UfM*-Anchored-Evidential (disagreement overlap)",
-    ]
-    assert suite_named("anchors", "ensemble").bases == ("ensemble",)
-    counts = {r.setting.anchor_count for r in suite_named("ablation-anchors").rows if r.setting.anchors == "truth"}
-    assert counts == {0, 5, 20, 100, 300}
-    (tmp_path / "mine.toml").write_text(
-        f'[[rows]]\nmethods = ["{NAME}"]\nsetting = {{ anchors = "tracked" }}\neach = {{ anchor_count = [0, 5] }}\n'
-    )
-    rows = suite_named(str(tmp_path / "mine.toml")).rows
-    assert [r.setting for r in rows] == [Setting(anchors="tracked", anchor_count=n) for n in (0, 5)]
 
 
 # ---- against a loop by hand ----

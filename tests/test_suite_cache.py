@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -114,13 +113,6 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
         cache.store(KEY, maps())
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="the administrator may write everywhere")
-def test_a_folder_without_permission_is_named(tmp_path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(CacheError, match="cannot be written"):
-        PredictionCache(tmp_path)
-
-
 def test_from_the_cache_everything_is_as_from_the_networks(path, networks, tmp_path):
     sequence, cache = open_sequence(path), Counted(tmp_path)
     without = evaluate(sequence, ROWS, networks)
@@ -136,27 +128,6 @@ def test_from_the_cache_everything_is_as_from_the_networks(path, networks, tmp_p
         assert "network" in first[slug].ms
         assert "network" not in second[slug].ms, "nothing ran: there is no time to tell"
         assert "uncertainty" in second[slug].ms
-
-
-def test_without_the_networks_running(path, networks, tmp_path, monkeypatch):
-    sequence = open_sequence(path)
-    first = evaluate(sequence, ROWS, networks, PredictionCache(tmp_path))
-    for network in networks.values():
-        monkeypatch.setattr(network, "one", None)
-    second = evaluate(sequence, ROWS, networks, PredictionCache(tmp_path))
-    assert all(same(first[slug], second[slug]) for slug in first)
-
-
-def test_a_damaged_prediction_is_made_again(path, networks, tmp_path):
-    sequence = open_sequence(path)
-    first = evaluate(sequence, ROWS, networks, PredictionCache(tmp_path))
-    files = sorted(tmp_path.rglob("*.maps"))
-    for file in files[::5]:
-        truncate(file)
-    cache = Counted(tmp_path)
-    second = evaluate(sequence, ROWS, networks, cache)
-    assert cache.misses == len(files[::5])
-    assert all(same(first[slug], second[slug]) for slug in first)
 
 
 def test_another_image_under_the_same_name_is_predicted_anew(networks, tmp_path):

@@ -31,15 +31,6 @@ def words_for(rooms, out, *more, suite="depth-only"):
     return ["eval", "--suite", suite, "--network", TRUTH, "--root", f"rooms={rooms}", "--out", out, *more]
 
 
-def test_one_preset_for_all_rows(rooms, tmp_path):
-    words = [str(word) for word in words_for(rooms, tmp_path / "out")[1:]]
-    settings = {preset: job_from(read([*words, "--ufm-preset", preset])).suite.rows[3].setting.to_dict()
-                for preset in ("paper", "default")}  # fmt: skip
-    assert settings == {"paper": {"ufm_preset": "paper"}, "default": {}}
-    with pytest.raises(ValueError, match="ufm-preset"):
-        read([*words, "--ufm-preset", "papers"])
-
-
 def test_list_names_every_suite(ufmstar):
     code, out, _ = ufmstar("eval", "--list")
     assert code == 0
@@ -156,18 +147,6 @@ def test_a_signal_stops_in_good_order_and_resume_goes_on(ufmstar, rooms, tmp_pat
     assert "records; --resume continues" in err
     assert ufmstar(*words_for(rooms, tmp_path / "out", "--resume", "--no-report"))[0] == 0
     assert [name for name, _ in stubbed.asked] == ["ash", "birch", "birch", "cedar"]
-
-
-@pytest.mark.usefixtures("stubbed")
-def test_rows_without_a_network_are_named(ufmstar, rooms, tmp_path):
-    (tmp_path / "two.toml").write_text('[[rows]]\nmethods = ["Aleatoric", "DepthOnly", "UfM*-DepthOnly"]\n')
-    words = words_for(rooms, tmp_path / "out", "--no-report", suite=tmp_path / "two.toml")
-    code, text, _ = ufmstar(*words)
-    assert code == 0
-    assert "left out, without a --network: the rows of aleatoric" in text
-    about = json.loads((tmp_path / "out" / "eval.json").read_text())
-    assert about["missing_bases"] == ["aleatoric"]
-    assert [row["method"] for row in about["rows"]] == ["DepthOnly", "UfM*-DepthOnly"]
 
 
 def test_a_dry_run_counts_and_writes_nothing(ufmstar, rooms, tmp_path):

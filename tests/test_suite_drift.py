@@ -20,9 +20,7 @@ from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting, default_of, setting_from
-from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import setting_of
-from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -62,11 +60,6 @@ def noise(setting, indices=EVERY):
 
 
 # ---- the walk ----
-
-
-def test_without_drift_poses_stay_themselves():
-    drift = Drift(Setting(rotation_noise=1.0, seed=5))
-    assert all(drift.of(pose, i) is pose for i, pose in enumerate(WALK))
 
 
 @pytest.mark.parametrize("first", [0, 9])
@@ -169,11 +162,6 @@ def test_a_setting_of_drift(name):
         measure([row(NAME, **{name: 0.1})], {"depth_only": object()}, None)
 
 
-def test_words():
-    shown = row_label(row(NAME, rotation_drift=0.1, translation_drift=0.002))
-    assert shown == f"{NAME}, rotation drift 0.1 °/√frame, translation drift 0.002 m/√frame"
-
-
 class Poses:
     """An estimator that keeps the poses it is given."""
 
@@ -216,17 +204,3 @@ def test_rows_of_one_drift_share_a_tracker_and_a_reference():
     rows = [plain, drift, row("UfM*-Ensemble", rotation_drift=0.1), row("UfM*-Ensemble", anchors="truth", seed=7)]
     assert references(rows[2], rows) == [drift]
     assert references(rows[3], rows) == [plain]
-
-
-def test_the_suite_of_anchors_drifts_with_anchors_and_without():
-    suite = suite_named("ablation-anchors")
-    assert {"rotation_drift", "translation_drift", "anchor_count", "track_noise"} <= set(suite.sweep)
-    assert "anchors" not in suite.sweep
-    expected = {
-        "rotation_drift": (0.02, 0.05, 0.1, 0.2, 0.5),
-        "translation_drift": (0.001, 0.002, 0.005, 0.01, 0.02),
-    }
-    for name, values in expected.items():
-        for anchors in ("", "tracked"):
-            tried = [r.setting for r in suite.rows if r.setting.anchors == anchors and getattr(r.setting, name)]
-            assert tuple(getattr(setting, name) for setting in tried) == values

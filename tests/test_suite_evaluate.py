@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,17 +13,15 @@ from tiny_suite import CPU, base_network, evaluate, row, same, unbatched, write_
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.eval.engine.evaluate import SequenceError
-from ufmstar_torch.eval.engine.stream import Stopped
-from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.eval.tour.sequence import open_tour
 from ufmstar_torch.models import load_trained
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.pipeline import combine
+from ufmstar_torch.prediction import DepthPrediction
 
 SKIP = UfMStarConfig(on_bad_frame="skip")
 FRAMES = 5
@@ -268,27 +265,6 @@ def test_skip_and_limit_choose_frames_and_turns(texts, networks, sequence):
     assert agrees(result[two.slug].figures, every)
 
 
-def test_noise_reaches_the_estimator_and_nothing_else(texts, networks, sequence):
-    noisy = row("UfM*-Aleatoric", rotation_noise=3.0, translation_noise=0.1, seed=2)
-    result = evaluate(sequence, [noisy, row("UfM*-Aleatoric"), row("Aleatoric")], networks)
-    members = members_of(texts["aleatoric"])
-
-    def poses(frame):
-        return perturbed(frame.T_world_cam, noisy.setting, frame.index)
-
-    by_hand = judged(sequence, through(UfMStar(SKIP), members, sequence, poses=poses))
-    assert agrees(result[noisy.slug].figures, by_hand)
-    assert result[noisy.slug].figures["rmse"] == result["UfMstar-Aleatoric"].figures["rmse"]
-    assert result[noisy.slug].figures["nll"] != result["UfMstar-Aleatoric"].figures["nll"]
-
-
-def test_a_tour(networks):
-    tour = open_tour("tour:3?frames=3&size=32x48")
-    outcome = evaluate(tour, [row("UfM*-DepthOnly"), row("UfM-DepthOnly-100K")], networks)
-    assert all(result.frames["judged"] == 3 for result in outcome.values())
-    assert all(np.isfinite(result.figures["ece_delta"]) for result in outcome.values())
-
-
 # ---- confident pixels ----
 
 
@@ -372,10 +348,10 @@ def test_pixels_that_a_row_leaves_out_are_counted(sequence):
     whole = holes.one
 
     def with_holes(frame, n):
-        p = whole(frame, n)
-        depth = p.depth.clone()
-        depth[:12], depth[12:24] = torch.nan, 0.0
-        return replace(p, depth=depth)
+        predicted = whole(frame, n)
+        depth = predicted.maps.depth.clone()
+        depth[:, :12], depth[:, 12:24] = torch.nan, 0.0
+        return predicted._replace(maps=DepthPrediction(depth))
 
     holes.one = with_holes
     outcome = evaluate(sequence, [row("DepthOnly"), row("UfM*-DepthOnly")], {"depth_only": holes})
@@ -404,22 +380,6 @@ def test_a_sequence_that_cannot_be_used(networks, sequence, trouble):
     }
     with pytest.raises(SequenceError, match=message[trouble]):
         evaluate(replace(sequence, entries=entries), [row("Aleatoric")], networks, limit=limit)
-
-
-def test_asked_to_stop_it_stops_between_frames(networks, sequence):
-    seen = []
-    stop = SimpleNamespace(asked=0)
-
-    def asked():
-        stop.asked += 1
-        return stop.asked > 3
-
-    def progress(now):
-        seen.append((now.done, now.total))
-
-    with pytest.raises(Stopped):
-        evaluate(sequence, [row("Aleatoric")], networks, stop=asked, progress=progress)
-    assert seen == [(n, FRAMES) for n in range(4)]
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import Gaussians, ufm_star_config
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.predictions import Predicted
-from ufmstar_torch.eval.methods.perturb import perturbed, rotation, selects
+from ufmstar_torch.eval.methods.perturb import perturbed, rotation
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.models import Preprocess
@@ -46,10 +46,6 @@ def test_names_for_files_and_for_people():
 
 
 # ---- settings of UfM* ----
-
-
-def test_the_default_row_has_the_default_settings():
-    assert ufm_star_config(row("UfM*-MCD")) == UfMStarConfig(on_bad_frame="skip")
 
 
 def test_overrides_by_dotted_name():
@@ -109,10 +105,6 @@ def test_rodrigues_formula(w):
     np.testing.assert_allclose(rotation(np.array(w)), expected, atol=1e-14)
 
 
-def test_without_noise_a_pose_stays_itself():
-    assert perturbed(POSE, Setting(seed=5, skip=2), 3) is POSE
-
-
 def noise(setting, indices):
     """Rotation vectors [rad] about the camera's axes, and translations [m], of the noise on some frames."""
     poses = [perturbed(POSE, setting, index) for index in indices]
@@ -139,26 +131,12 @@ def test_noise_is_of_the_frame_and_the_seed_alone():
     assert not np.shares_memory(perturbed(POSE, setting, 0), POSE)
 
 
-def test_along_a_sweep_the_noise_only_grows():
-    weak, strong = noise(Setting(rotation_noise=0.5), range(5)), noise(Setting(rotation_noise=5.0), range(5))
-    np.testing.assert_allclose(strong[0], 10 * weak[0], rtol=1e-10)
-    assert not strong[1].any()
-    turned, moved = noise(Setting(rotation_noise=0.5, translation_noise=0.2), range(5))
-    np.testing.assert_allclose(turned, weak[0], atol=1e-14)
-    np.testing.assert_allclose(moved, 2 * noise(Setting(translation_noise=0.1), range(5))[1], rtol=1e-12)
-
-
 @given(st.floats(0, 30), st.floats(0, 2), st.integers(0, 2**31), st.integers(0, 10**6))
 def test_a_noisy_pose_is_a_pose(degrees, metres, seed, index):
     T = perturbed(POSE, Setting(rotation_noise=degrees, translation_noise=metres, seed=seed), index)
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-13)
     assert np.linalg.det(T[:3, :3]) > 0
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
-
-
-def test_skip_leaves_images_out_between_two():
-    assert [n for n in range(9) if selects(Setting(skip=2), n)] == [0, 3, 6]
-    assert all(selects(Setting(), n) for n in range(9))
 
 
 # ---- networks ----
@@ -205,18 +183,6 @@ def test_a_choice_that_is_none(text, told):
         NetworkChoice.parse(text)
 
 
-def test_networks_of_every_base(loaded):
-    passes = {base: network.passes for base, network in loaded.items()}
-    assert passes == {
-        "ensemble": 3,
-        "mc_dropout": 4,
-        "batch_ensemble": 3,
-        "evidential": 1,
-        "aleatoric": 1,
-        "depth_only": 1,
-    }
-
-
 def test_turns_of_members_and_of_samples(loaded):
     assert [loaded["ensemble"].turn(i) for i in range(5)] == [0, 1, 2, 0, 1]
     assert [loaded["batch_ensemble"].turn(i) for i in range(5)] == [0, 1, 2, 0, 1]
@@ -240,12 +206,6 @@ def test_turns_of_members_and_of_samples(loaded):
 def test_a_network_that_is_not_what_its_base_is_about(files, base, of, told):
     with pytest.raises(ValueError, match=told):
         base_network(files[of].replace(of, base, 1))
-
-
-def test_an_ensemble_needs_variances(tmp_path):
-    file = write_network(tmp_path / "two.safetensors", "depth", count=2)
-    with pytest.raises(ValueError, match="ensemble needs an aleatoric variance, got none"):
-        base_network(f"ensemble=trained:{file}")
 
 
 def test_members_one_by_one_and_from_several_files(files, loaded, tmp_path):
@@ -282,12 +242,6 @@ def test_digests_tell_networks_apart(files, loaded):
     assert base_network(files["evidential"]).digest == loaded["evidential"].digest
     as_depth = base_network(files["aleatoric"].replace("aleatoric", "depth_only", 1))
     assert as_depth.digest == loaded["aleatoric"].digest, "it is the same network"
-
-
-def test_labels(files, loaded):
-    assert loaded["ensemble"].label == "FastDepth"
-    assert base_network("depth_only=ground-truth").label == "ground truth"
-    assert NetworkChoice.parse(files["evidential"], "Mine").load(CPU).label == "Mine"
 
 
 def test_what_was_run_is_told_in_plain_values(loaded):

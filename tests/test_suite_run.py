@@ -24,7 +24,7 @@ from ufmstar_torch.eval.suite.cache import CacheError
 from ufmstar_torch.eval.suite.evaluate import with_references
 from ufmstar_torch.eval.suite.folder import EvalFolder
 from ufmstar_torch.eval.suite.record import Record
-from ufmstar_torch.eval.suite.work_items import Shard, content_digest
+from ufmstar_torch.eval.suite.work_items import content_digest
 
 
 def folder_of(job):
@@ -133,17 +133,6 @@ def test_what_the_judge_cannot_use_is_broken_and_what_it_cannot_write_ends_all(r
     assert go(job, resume=True)[0].complete
 
 
-def test_real_sequences_without_ground_truth_are_broken(rooms, tmp_path):
-    root = write_rooms(tmp_path / "own", ["ash", "birch"], frames=2)
-    for file in (root / "ash" / "depth").glob("*"):
-        file.unlink()
-    (root / "ash" / "depth").rmdir()
-    job = job_on(root, tmp_path / "out")
-    assert go(job, evaluate_sequence)[0].finished
-    assert folder_of(job).failures(job.items) == {"rooms/ash": "no frame has ground truth"}
-    assert len(kept(job.out)) == 4
-
-
 def test_images_without_poses_are_for_networks_alone(tmp_path):
     root, _ = write_nyu(tmp_path / "nyu")
     job = job_on(root, tmp_path / "out")
@@ -248,10 +237,3 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, mon
     assert [(name, len(rows)) for name, rows in stub.asked] == [("birch", 2), ("cedar", 4)]
     go(job_on(rooms, tmp_path / "whole"))
     assert kept(job.out) == kept(tmp_path / "whole")
-
-
-def test_a_shard_does_its_own(rooms, tmp_path):
-    for shard, expected in ((Shard(1, 2), ["ash", "cedar"]), (Shard(2, 2), ["birch"]), (Shard(4, 4), [])):
-        stub = Stub()
-        assert go(job_on(rooms, tmp_path / f"{shard.index}{shard.count}"), stub, shard=shard)[0].finished
-        assert [name for name, _ in stub.asked] == expected

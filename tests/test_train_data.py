@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from layouts import truth, write_generic
-from training_data import PLAIN, TINY, Numbered, loader, numbers, nyu_frame, truncated, write_nyu
+from training_data import PLAIN, Numbered, loader, numbers, nyu_frame, truncated, write_nyu
 
 from ufmstar_torch.train import (
     Augmentation,
@@ -19,7 +19,6 @@ from ufmstar_torch.train import (
     EpochBatches,
     SampleDataset,
     SampleError,
-    tour_frames,
 )
 from ufmstar_torch.train.samples import RawSample, SampleKey, make_sample
 
@@ -72,17 +71,6 @@ def test_skipping_takes_the_next_good_frame_whatever_came_before(order, caplog):
     assert dataset.bad_files() == ("frame-2", "frame-3", "frame-5")
     assert len(caplog.records) == 3  # each one once
     assert "frame-2: torn" in caplog.text
-
-
-def test_no_good_frame_at_all():
-    with pytest.raises(SampleError, match="all others of 3 files are broken"):
-        SampleDataset(Numbered(3, broken=(0, 1, 2)), PLAIN, on_bad_file="skip")[1]
-
-
-@pytest.fixture(scope="module")
-def tours(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("cache")
-    return folder, tour_frames([5, 6], TINY, folder)
 
 
 def module(tmp_path, preprocess=PLAIN, **config):

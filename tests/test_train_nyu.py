@@ -47,18 +47,6 @@ def test_nyu_validation_is_the_fields(tmp_path):
     assert sample["depth"][v, u] == depth[round(fy * y + cy), round(fx * x + cx)]
 
 
-def test_nyu_files_of_another_size(tmp_path):
-    write_h5(tmp_path / "train" / "a" / "1.h5", *nyu_frame(0, (240, 320)))
-    write_h5(tmp_path / "train" / "a" / "2.h5", *nyu_frame(0, (228, 304)))
-    write_h5(tmp_path / "train" / "a" / "3.h5", *nyu_frame(0, (224, 224)))
-    frames = NyuFrames(tmp_path, "train")
-    K = frames.load(0).intrinsics
-    expected = [INTRINSICS[0] / 2, (INTRINSICS[2] + 0.5) / 2 - 0.5]
-    np.testing.assert_allclose(K[0, ::2], expected)
-    with pytest.raises(SampleError, match=r"3\.h5: is 224 x 224.*intrinsics"):
-        frames.load(2)
-
-
 RGB, DEPTH = nyu_frame(0)
 BROKEN = {
     "empty": lambda p: p.write_bytes(b""),

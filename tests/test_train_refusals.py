@@ -75,14 +75,12 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: batches(rank=1), "rank"),
     (lambda: EpochBatches(5, 3, world=2), "a step takes"),
     (lambda: settings(strategy="ddp_spawn"), "strategy"),
-    (lambda: settings(member_processes=2, devices=2), "member_processes"),
     (lambda: settings(log_every=0), "log_every"),
     (lambda: settings(max_minutes=NAN), "max_minutes"),
     (lambda: loss_of(PointDepth(MAP), MAP, MAP), "valid"),
     (lambda: loss_of(PointDepth(MAP), MAP[:1], MAP > 0), "target"),
     (lambda: loss_of(MAP, MAP, MAP > 0), "distribution"),  # type: ignore[arg-type]
     (lambda: loss(evidence_weight=-1.0), "evidence_weight"),
-    (lambda: loss(beta_nll=2.0), "beta_nll"),
 ]
 
 

@@ -65,18 +65,6 @@ def test_depth_with_a_camera_of_its_own_is_seen_by_the_images(tmp_path):
     assert (error < 0.03).mean() > 0.9
 
 
-def test_frames_without_depth_are_left_out_and_counted_in_the_part(tmp_path):
-    path, _ = write_generic(tmp_path)
-    (path / "depth" / "8.png").unlink()
-    sequence = open_sequence(path)
-    frames = SequenceFrames([sequence], "0:50%")  # of six frames: 7, 8, 9
-    assert [frames.name(i) for i in range(len(frames))] == [f"{sequence.name}/7", f"{sequence.name}/9"]
-    with pytest.raises(ValueError, match="no frame of the part 1:2"):
-        SequenceFrames([sequence], "1:2")
-    with pytest.raises(ValueError, match="at least one sequence"):
-        SequenceFrames([])
-
-
 def test_a_broken_image_of_a_sequence_is_named_or_skipped(tmp_path):
     path, _ = write_generic(tmp_path)
     frames = SequenceFrames([open_sequence(path)])

@@ -109,24 +109,6 @@ def test_what_was_saved_is_loaded_bit_for_bit(tmp_path, image, method, lazy):
     assert stored.info == {"command": "ufmstar train", "nll": 0.25}
 
 
-def test_a_sampling_network_is_saved_as_what_it_wraps(tmp_path, image):
-    spec = spec_of("mc_dropout")
-    (network,) = trained(spec, 1)
-    expected = predict(network, image)
-    save_trained(tmp_path / "n.safetensors", MonteCarloDropout(network), spec)
-    assert torch.equal(predict(load_trained(tmp_path / "n.safetensors")[0], image), expected)
-
-
-def test_an_ensemble_of_several_files(tmp_path, image):
-    spec = spec_of()
-    networks = trained(spec, 3)
-    save_trained(tmp_path / "a.safetensors", networks[:2], spec)
-    save_trained(tmp_path / "b.safetensors", networks[2], spec)
-    loaded = load_trained([tmp_path / "a.safetensors", tmp_path / "b.safetensors"])
-    for restored, original in zip(loaded, networks, strict=True):
-        assert torch.equal(predict(restored, image), predict(original, image))
-
-
 def test_training_goes_on_from_a_file(tmp_path, image):
     spec = spec_of("batch_ensemble")
     networks = trained(spec)
@@ -232,16 +214,6 @@ def test_networks_that_do_not_fit_their_spec(tmp_path):
     with pytest.raises(ValueError, match=r"member\.1\.head\.weight has NaN"):
         save_trained(file, networks, spec_of())
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_save_that_fails_leaves_the_old_file(tmp_path, image):
-    networks = trained(spec_of())
-    save_trained(tmp_path / "n.safetensors", networks, spec_of())
-    before = (tmp_path / "n.safetensors").read_bytes()
-    with pytest.raises(TypeError):
-        save_trained(tmp_path / "n.safetensors", networks, spec_of(), info={"what": object()})
-    assert (tmp_path / "n.safetensors").read_bytes() == before
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 # ---- bad files ----

@@ -230,13 +230,6 @@ def test_more_depth_noise_more_disagreement(seed):
     assert dense[0] < 1e-12 < 1e-3 < dense[-1]
 
 
-def test_the_first_frame_knows_nothing():
-    depths, poses, K = scenes.sequence(1, HEIGHT, WIDTH, 0.04)
-    _, (out,) = run(UfMStarConfig(segment=SPGF, prior_mean=0.0), depths, poses, K)
-    assert (out.disagreement[out.valid] == 0).all()
-    assert out.statistics.new.item() == out.statistics.segments.item() > 0
-
-
 def test_a_place_never_seen_starts_afresh():
     depths, poses, K = scenes.sequence(4, HEIGHT, WIDTH, 0.04)
     elsewhere = [poses[0], poses[1], scenes.look((500.0, 0, 300.0), 2.0), poses[3]]

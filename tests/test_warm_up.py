@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import importlib.util
 import json
@@ -11,7 +12,7 @@ import sys
 
 import numpy as np
 import pytest
-from numba.core import codegen, compiler, event, typed_passes, untyped_passes
+from numba.core import caching, codegen, compiler, event, typed_passes, untyped_passes
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.engine import warm_up as commands
@@ -93,6 +94,7 @@ def test_a_part_becomes_machine_code_in_its_kernel_alone(monkeypatch):
         (untyped_passes, "TranslateByteCode FixupArgs IRProcessing GenericRewrites ReconstructSSA"),
         (typed_passes, "NopythonTypeInference PreLowerStripPhis IRLegalization NativeLowering NoPythonBackend"),
         (compiler.Flags, "values options copy"),
+        (caching.IndexDataCacheFile, "_load_index _save_index _load_data _save_data _data_path _open_for_write _dump"),
     ],
 )
 def test_numba_has_the_private_parts_that_are_used(owner, names):
@@ -103,7 +105,7 @@ def test_numba_has_the_private_parts_that_are_used(owner, names):
 def test_a_kept_kernel_says_in_its_stamp_what_it_depends_on():
     from ufmstar_torch.kernels.regress_tiles_cpu import exact
 
-    assert exact._cache._cache_file._source_stamp[-1] == compile_cpu._SOURCES, "numba's cache compares another stamp"
+    assert exact._cache._cache_file._source_stamp[-1] == compile_cpu._SOURCES
 
 
 def test_no_garbage_is_collected_while_kernels_are_compiled():
@@ -141,19 +143,48 @@ def test_a_cold_start_compiles_all_and_a_warm_one_nothing(tmp_path):
         assert result["steps"] == [[done, 23] for done in range(24)]
 
 
-def test_a_kernel_on_disk_is_outdated_when_another_file_of_the_kernels_changes(tmp_path, monkeypatch):
+@pytest.fixture
+def hits(tmp_path):
+    """Defines a kernel anew and calls it; returns how often it was found on disk."""
     path = tmp_path / "one_kernel.py"
     path.write_text(
         "from ufmstar_torch.kernels.compile_cpu import kernel\n\n\n@kernel\ndef plus_one(x):\n    return x + 1\n"
     )
 
-    def hits() -> int:
+    def call() -> int:
         spec = importlib.util.spec_from_file_location("one_kernel", path)
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
         assert module.plus_one(1) == 2
         return sum(module.plus_one.stats.cache_hits.values())
 
+    return call
+
+
+def test_a_kernel_on_disk_is_outdated_when_another_file_of_the_kernels_changes(hits, monkeypatch):
     assert [hits(), hits()] == [0, 1]
     monkeypatch.setattr(compile_cpu, "_SOURCES", "of other files")
     assert [hits(), hits()] == [0, 1]
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+@pytest.mark.parametrize("length", [0, 10, 50, None])
+def test_a_damaged_file_is_replaced_and_said_once(hits, tmp_path, caplog, ending, length):
+    assert [hits(), hits()] == [0, 1]
+    (file,) = tmp_path.rglob(f"*.{ending}")
+    content = bytearray(file.read_bytes())
+    content[-20] ^= 1
+    file.write_bytes(content[:length])
+    assert [hits(), hits()] == [0, 1]
+    assert [record.name for record in caplog.records] == ["ufmstar_torch"]
+    assert f"{file.parent} is damaged and is replaced" in caplog.text
+
+
+def test_a_full_disk_leaves_kernels_in_memory_and_is_said_once(hits, monkeypatch, caplog):
+    def full(self, path):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(compile_cpu._KeptFiles, "_open_for_write", full)
+    assert [hits(), hits()] == [0, 0]
+    assert [record.name for record in caplog.records] == ["ufmstar_torch"]
+    assert "cannot be written to (No space left on device)" in caplog.text

@@ -57,7 +57,7 @@ def tiny_job(frames, out, recipe=RECIPE, augment=True, **settings):
         validation_part="12:16",
         augmentation=AugmentationConfig() if augment else None,
     )
-    quiet = {"examples": 0, "tensorboard": False, "progress": False, "accelerator": "cpu", "log_every": 1}
+    quiet = {"tensorboard": False, "progress": False, "accelerator": "cpu", "log_every": 1}
     return Job(recipe, data, FitSettings(out=out, **{**quiet, **settings}))
 
 

@@ -9,7 +9,7 @@ import torch
 import oracle
 import scenes
 from ufmstar_torch import SPGFConfig, UfMStar
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 
 HEIGHT, WIDTH = 30, 40
 SPGF = SPGFConfig(

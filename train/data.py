@@ -91,7 +91,8 @@ class DepthDataModule(LightningDataModule):
             batches = EpochBatches(len(dataset), c.batch_size, **order)
         if shuffle and self.trainer is not None:
             # Workers load ahead before Lightning announces the epoch, which is not 0 in a resumed training.
-            batches.set_epoch(self.trainer.fit_loop.epoch_progress.current.processed)
+            progress: Any = self.trainer.fit_loop.epoch_progress.current
+            batches.set_epoch(progress.processed)
         return sample_loader(dataset, batches, c.workers)
 
 

@@ -3,7 +3,7 @@
 ```
 OUT/training.json         what the training was started with
 OUT/lock                  held while it is going on
-OUT/member_0/...          checkpoint, weights, version_N/metrics.csv of every session, examples/ of every member
+OUT/member_0/...          checkpoint, weights, version_N/metrics.csv of every session, of every member
 OUT/tensorboard/          logs
 OUT/trained.safetensors   all members
 OUT/summary.json          figures, command, versions, hardware, seconds
@@ -67,6 +67,6 @@ TRAINING = FolderKind(
     format=1,
     lock="lock",
     clear=_clear,
-    temporary=(".*.tmp", "member_*/.*.tmp", "member_*/examples/.*.tmp"),
+    temporary=(".*.tmp", "member_*/.*.tmp"),
     identity=_fixed,
 )

@@ -19,7 +19,6 @@ from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import save_trained
 from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, Checkpoints, Stops, require_checkpoint
 from ufmstar_torch.train.data import DepthDataModule
-from ufmstar_torch.train.examples import Examples
 from ufmstar_torch.train.module import TrainingModule, step_seed
 from ufmstar_torch.train.settings import Job
 from ufmstar_torch.train.start import starting_network, train_only
@@ -45,7 +44,7 @@ def train_member(
     until ``asked`` returns True. Returns None when it is finished, otherwise why it was stopped; in both cases its
     weights are on disk. Raises NonFiniteLossError: the training has diverged; ResumeError: the checkpoint cannot be
     read."""
-    s, folder = job.settings, job.folder(member)
+    folder = job.folder(member)
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / NAME
     stored = checkpoint if checkpoint.is_file() else None
@@ -54,11 +53,10 @@ def train_member(
     with quiet_lightning():
         trainer: Any = make_trainer(job, member)
         data = make_data(job, member, trainer.world_size)
-        total, epochs = training_length(job, data)
+        total = training_length(job, data)
         stops = Stops(total, deadline, asked)
-        examples = [Examples(folder, data, s.examples, epochs)] if s.examples else []
         timer = Timer()  # its checkpoint contains the time of earlier sessions
-        trainer.callbacks[:0] = [*examples, stops, timer, Checkpoints(checkpoint)]
+        trainer.callbacks[:0] = [stops, timer, Checkpoints(checkpoint)]
         module = TrainingModule(new_network(job, member), job.recipe, total, job.seed(member))
         trainer.fit(module, data, ckpt_path=stored, weights_only=True)
     # A stop that is asked for at the last step leaves a finished training.
@@ -82,16 +80,14 @@ def make_data(job: Job, member: int, world: int) -> DepthDataModule:
     return data
 
 
-def training_length(job: Job, data: DepthDataModule) -> tuple[int, int]:
-    """Optimizer steps of the whole training, and the number of epochs that they begin. Raises ValueError: an epoch has
-    no full batch."""
+def training_length(job: Job, data: DepthDataModule) -> int:
+    """Optimizer steps of the whole training. Raises ValueError: an epoch has no full batch."""
     images, batch = len(data.train_set or ()), job.recipe.batch_size
     if data.clips is not None:
         images = len(data.clips) * job.recipe.clip_frames
     if images < batch:
         raise ValueError(f"the training part has {images} images, fewer than batch_size {batch}")
-    steps = job.recipe.max_steps or job.recipe.epochs * (images // batch)
-    return steps, -(-steps // (images // batch))
+    return job.recipe.max_steps or job.recipe.epochs * (images // batch)
 
 
 def make_trainer(job: Job, member: int) -> pl.Trainer:

@@ -18,8 +18,8 @@ class FitSettings(Checked):
     Attributes:
         out: output folder.
         seed: of the training; member n has the seed 1000 seed + n, so that trainings with different seeds share none.
-        init: weights to start from: a trained .safetensors, FastDepth's .onnx, a ResNet's .pth, Monodepth2's folder or
-            the word imagenet; see ``train.start.starting_network``.
+        init: weights to start from: a trained .safetensors, FastDepth's .onnx, a ResNet's .pth or the word
+            imagenet; see ``train.start.starting_network``.
         trainable: train only parameters whose names begin with one of these; empty = all of them.
         accelerator: cpu, gpu or auto.
         devices: number of processes or GPUs, as Lightning takes it.
@@ -27,9 +27,7 @@ class FitSettings(Checked):
         strategy: Lightning's name of how processes work together: auto, ddp, ...; those that start processes as
             scripts ("ddp", not "ddp_spawn").
         precision: 32-true, bf16-mixed or 16-mixed; the loss is in float32 always.
-        member_processes: members that are trained at the same time, each in a process of its own.
         log_every: steps between rows of metrics.csv.
-        examples: validation images in each epoch's picture, 0 = no pictures.
         max_minutes: after which this session stops in good order, all members together; --resume goes on from the last
             whole epoch. 0 = never.
         sync_batchnorm: whether batch norm uses the batches of all processes (GPUs only).
@@ -49,9 +47,7 @@ class FitSettings(Checked):
     nodes: int = number(1, "N", "computers", 1)
     strategy: str = "auto"
     precision: str = "32-true"
-    member_processes: int = number(1, "N", "processes", 1)
     log_every: int = number(50, "N", "steps", 1)
-    examples: int = number(4, "N", "images", 0)
     max_minutes: float = number(0.0, "t", "min", 0)
     sync_batchnorm: bool = False
     tensorboard: bool = True
@@ -61,8 +57,6 @@ class FitSettings(Checked):
         super().__post_init__()
         if any(word in self.strategy for word in ("spawn", "fork", "notebook")):
             raise ValueError(f"FitSettings.strategy must start processes as scripts: 'ddp', not {self.strategy!r}")
-        if self.member_processes > 1 and (self.devices != 1 or self.nodes != 1):
-            raise ValueError("FitSettings.member_processes above 1 goes with devices = 1 and nodes = 1")
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ IMAGENET = "imagenet"
 # published network errs by 63 % of the depth instead of 28 % before the first step (HoloLens frames, batch
 # statistics), with .1 by 33 %; its members still differ by half a metre.
 PRETRAINED_STD = 0.1
-WAYS = f"trained .safetensors, FastDepth's .onnx, ResNet weights (.pth, or {IMAGENET!r}), or Monodepth2's folder"
+WAYS = f"trained .safetensors, FastDepth's .onnx, or ResNet weights (.pth, or {IMAGENET!r})"
 
 
 def starting_network(spec: NetworkSpec, init: Path | None, member: int = 0) -> DepthNetwork:
@@ -29,8 +29,7 @@ def starting_network(spec: NetworkSpec, init: Path | None, member: int = 0) -> D
         spec: what to build.
         init: None, or one of: a file that this program trained (the same method, or aleatoric and mc_dropout: all
             of it; another one: its encoder and decoder, below a new head); FastDepth's weights as .onnx; the
-            ImageNet weights of a ResNet in torchvision's keys, or "imagenet", which torchvision downloads; the
-            folder with Monodepth2's encoder.pth and depth.pth of the same ResNet.
+            ImageNet weights of a ResNet in torchvision's keys, or "imagenet", which torchvision downloads.
         member: number in an ensemble; of a trained ensemble it starts from the same member.
 
     Raises:
@@ -115,22 +114,10 @@ def _from_onnx(spec: NetworkSpec, path: Path) -> Backbone:
 
 def _from_resnet(spec: NetworkSpec, path: Path) -> Backbone:
     from ufmstar_torch.models.monodepth2 import MonodepthResNet
-    from ufmstar_torch.models.monodepth2_import import load_monodepth2
 
     backbone = build_backbone(spec)
     if not isinstance(backbone, MonodepthResNet):
         raise ValueError(f"init: {path} is no start for {spec.architecture}; expected {WAYS}")
-    if path.is_dir():
-        report = load_monodepth2(backbone, path / "encoder.pth", path / "depth.pth")
-        # Some tensors of another ResNet fit by chance; most weights would then stay random.
-        wrong = [key for key in report.kept if key.startswith("encoder.") and not key.endswith("num_batches_tracked")]
-        wrong += [key for key in report.skipped if key.startswith("encoder.") and not key.startswith("encoder.fc.")]
-        if wrong:
-            raise ValueError(
-                f"init: {path} does not hold a ResNet{spec.layers}: {len(wrong)} tensors of one do not fit the other, "
-                f"first {wrong[0]!r}; another --network.layers may"
-            )
-        return backbone
     weights = None if str(path) == IMAGENET else path
     source = MonodepthResNet.imagenet(weights, spec.layers, strides=spec.strides)
     backbone.encoder.load_state_dict(source.encoder.state_dict())

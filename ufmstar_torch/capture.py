@@ -43,9 +43,9 @@ class Captured:
         *,
         record: Callable[[Callable[[], None]], Callable[[], None]] | None = None,
     ) -> None:
+        _require_fixed(ufm)
         if record is None and depth.device.type != "cuda":
             raise ValueError(f"depth must lie on a CUDA device to be captured, got {depth.device}")
-        _require_fixed(ufm)
         given = (depth, pose, intrinsics, aleatoric, epistemic, valid)
         self._inputs = tuple(None if v is None else v.detach().to(depth.device, copy=True) for v in given)
         self._ufm = ufm

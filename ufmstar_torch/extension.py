@@ -235,7 +235,7 @@ class Extensions:
         )
 
     def of_frame(
-        self, frame: FrameInput, own: Sequence[Tensor], given: Mapping[str, Any], *, dense: bool
+        self, frame: FrameInput, own: Sequence[Tensor], inputs: Mapping[str, Any], *, dense: bool
     ) -> FrameExtensions:
         """All of them during a frame.
 
@@ -244,14 +244,14 @@ class Extensions:
             ValueError: an argument of an extension that is off, or as :meth:`Extension.of_frame`.
         """
         known = {one.argument for one in self.each}
-        for name in [name for name, value in given.items() if name not in known]:
+        for name in sorted(inputs.keys() - known):
             if name not in UfMStarConfig.__dataclass_fields__:
                 raise TypeError(f"UfM* takes no argument {name!r}")
-            if given[name] is not None:
-                raise ValueError(f"{name} are given, but UfMStarConfig.{name} is None: switch the extension on")
+            if inputs[name] is not None:
+                raise ValueError(f"{name} must be None where UfMStarConfig.{name} is None, which switches it off")
         each: list[FrameExtension] = []
         for one in self.each:
-            each.append(one.of_frame(frame, own, given.get(one.argument), each, dense=dense))
+            each.append(one.of_frame(frame, own, inputs.get(one.argument), each, dense=dense))
         return FrameExtensions(each) if each else NONE
 
     def map_variance(self, variance: Tensor) -> Tensor:

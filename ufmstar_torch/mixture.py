@@ -68,10 +68,6 @@ class GaussianMixture:
         """Memory of one slot [bytes]."""
         return sum(v[:1, :1].nelement() * v.element_size() for v in self.tensors().values())
 
-    def packed_bytes_per_component(self) -> int:
-        """The paper's 4 bytes for each of mu (3), Sigma (6, it is symmetric), pi, m and further features [bytes]."""
-        return 4 * (3 + 6 + 1 + 1 + self.features.shape[2])
-
     def tensors(self) -> dict[str, Tensor]:
         """The fields by name, without copying."""
         return dict(vars(self))

@@ -14,7 +14,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.anchors.given import Anchors, require_anchors
+from ufmstar_torch.anchors.anchors import Anchors, require_anchors
 from ufmstar_torch.anchors.streams import Given, StreamLandmarks
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty, UfMStarOutput

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -57,8 +58,9 @@ class UfMStarState:
         capacity = min(config.initial_capacity, config.max_components or config.initial_capacity)
         mixture = GaussianMixture.empty(streams, capacity, features=config.features, dtype=dtype, device=device)
         counter = torch.zeros(streams, dtype=torch.int64, device=device)
+        components: dict[str, Any] = mixture.tensors()
         return cls(
-            **mixture.tensors(),
+            **components,
             T_world_first=torch.eye(4, dtype=torch.float64, device=device).repeat(streams, 1, 1),
             started=counter.bool(),
             frames=counter,

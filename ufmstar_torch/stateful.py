@@ -7,25 +7,12 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
-
-class Config(Protocol):
-    """A frozen config with a form as plain values."""
-
-    def __hash__(self) -> int: ...
-
-    def to_dict(self) -> dict[str, Any]:
-        """Nested plain values."""
-        ...
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """The config of :meth:`to_dict`; an unknown name is a ValueError."""
-        ...
+from ufmstar_torch.checked import Checked
 
 
 class StatefulModule(nn.Module):
@@ -42,9 +29,9 @@ class StatefulModule(nn.Module):
     """
 
     STATE: tuple[str, ...]
-    CONFIG: ClassVar[type[Config]]
+    CONFIG: ClassVar[type[Checked]]
     ALWAYS_FLOAT64: tuple[str, ...] = ("T_world_first",)
-    config: Config
+    config: Checked
 
     if TYPE_CHECKING:
 
@@ -177,7 +164,7 @@ def _fitting(name: str, saved: object, own: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=16)
-def _bytes_of(config: Config) -> Tensor:
+def _bytes_of(config: Checked) -> Tensor:
     """Its plain values as the bytes of JSON."""
     return torch.tensor(list(json.dumps(config.to_dict()).encode()), dtype=torch.uint8)
 
@@ -199,7 +186,7 @@ def _config_of(state: object) -> dict[str, Any]:
     return config
 
 
-def plain(config: Config) -> dict[str, Any]:
+def plain(config: Checked) -> dict[str, Any]:
     """Its values as JSON returns them."""
     return _config_of(_bytes_of(config))
 

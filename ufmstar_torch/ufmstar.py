@@ -93,7 +93,7 @@ class UfMStar(StatefulModule):
         valid: Tensor | None = None,
         *,
         features: Tensor | None = None,
-        **given: Any,
+        **inputs: Any,
     ) -> UfMStarOutput:
         """Process one predicted depth map per stream and return its variance.
 
@@ -111,7 +111,7 @@ class UfMStar(StatefulModule):
             epistemic: likewise E [m^2].
             valid: like ``depth``, bool, True = use.
             features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed; of at most 1e12.
-            **given: what an extension takes per frame, by the name of its section in the config; None = nothing.
+            **inputs: what an extension takes per frame, by the name of its section in the config; None = nothing.
 
         Returns:
             The variance and its parts.
@@ -122,7 +122,7 @@ class UfMStar(StatefulModule):
                 is not rigid, bad intrinsics (counted with ``on_bad_frame="skip"``); input of an extension that is off.
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
-        out, variance, further = self._observe(frame, given)
+        out, variance, further = self._observe(frame, inputs)
 
         def shaped(value: Tensor) -> Tensor:
             return value if value.shape == depth.shape else value.reshape(depth.shape)
@@ -156,7 +156,7 @@ class UfMStar(StatefulModule):
         fraction: float | None = None,
         seed: int = 0,
         average: bool = False,
-        **given: Any,
+        **inputs: Any,
     ) -> MeanUncertainty:
         """An average per image for active learning (section "Compute- and memory efficiency"): :meth:`forward`, but
         only a sample of pixels is regressed. First views have nothing to be compared with: their mean is low
@@ -173,7 +173,7 @@ class UfMStar(StatefulModule):
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
-        out, variance, _ = self._observe(frame, given, index, average=average)
+        out, variance, _ = self._observe(frame, inputs, index, average=average)
         sample = sample_mean(variance, out.measured >= unmeasured.HALF, used, out.statistics.valid_pixels)
         return MeanUncertainty(sample.mean, sample.error, sample.count, sample.measured, out.statistics)
 
@@ -271,10 +271,10 @@ class UfMStar(StatefulModule):
         )  # fmt: skip
 
     def _observe(
-        self, frame: FrameInput, given: Mapping[str, Any], pixels: Tensor | None = None, *, average: bool = True
+        self, frame: FrameInput, inputs: Mapping[str, Any], pixels: Tensor | None = None, *, average: bool = True
     ) -> tuple[StepOutput, Tensor, dict[str, Tensor]]:
         """Run the step, and keep its state. Returns its output, V [m^2], and maps of extensions by name, at every pixel
-        [B, H, W], or at ``pixels`` [B, n] of the flattened image. ``given``: what a frame brings for extensions."""
+        [B, H, W], or at ``pixels`` [B, n] of the flattened image. ``inputs``: what a frame brings for extensions."""
         parts = (frame.aleatoric, self.config.add_aleatoric), (frame.epistemic, self.config.add_epistemic)
         own = [value for value, counts in parts if value is not None and counts]
 
@@ -290,7 +290,7 @@ class UfMStar(StatefulModule):
                 variance = variance.clamp_min(self.config.variance_floor)
             return self._extensions.map_variance(variance)
 
-        extensions = self._extensions.of_frame(frame, own, given, dense=pixels is None)
+        extensions = self._extensions.of_frame(frame, own, inputs, dense=pixels is None)
         # Normal tensors also under the caller's inference_mode: the state must outlive it.
         with outliving(), torch.no_grad(), full_precision(frame.depth.device):
             state = self._state_for(frame)

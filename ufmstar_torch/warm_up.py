@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import torch
 
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.select import compile_triangulation
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, LandmarkSource, landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import Landmarks, TrackerConfig
@@ -28,7 +28,7 @@ from ufmstar_torch.eval.sequences.options import resolve
 # Anchors of ground truth in a frame, about as many as a tracker finds, and their standard deviation as a share of the
 # depth: a range sensor's. Their depths are exact.
 TRUTH_COUNT, TRUTH_SIGMA = 100, 0.01
-# What is drawn of a frame: which anchors are taken, and noise. Poses have the seed without a third number.
+# Third number of the seeds for the choice of anchors and for noise. Poses have a seed of two numbers.
 _TAKEN, _NOISE = 1, 2
 
 
@@ -110,8 +110,8 @@ class AnchorSource:
         ``truth`` [h, w] is the ground truth at its pixels [m], 0 = none, or None."""
         device = predicted.maps.depth.device
         if self.tracks is None:
-            known = np.zeros(predicted.size, np.float32) if truth is None else truth
-            sampled = self._sampled(known, frame.index).to(device)
+            depth = np.zeros(predicted.size, np.float32) if truth is None else truth
+            sampled = self._sampled(depth, frame.index).to(device)
             return FrameAnchors(sampled, triangulated=sampled.depth.shape[1], none="no ground truth")
         tracked = self.tracks.of(frame, T_world_cam)
         if tracked is None:
@@ -123,9 +123,9 @@ class AnchorSource:
     def _sampled(self, truth: NDArray[np.float32], index: int) -> Anchors:
         v, u = np.nonzero(truth > 0)
         count = TRUTH_COUNT if self._setting.anchor_count is None else self._setting.anchor_count
-        taken = self._drawn(index, _TAKEN).permutation(len(v))[:count]
-        depth = truth[v[taken], u[taken]].astype(np.float64)
-        pixel = np.stack([u[taken], v[taken]], axis=-1).astype(np.float64)
+        chosen = self._drawn(index, _TAKEN).permutation(len(v))[:count]
+        depth = truth[v[chosen], u[chosen]].astype(np.float64)
+        pixel = np.stack([u[chosen], v[chosen]], axis=-1).astype(np.float64)
         values = (pixel, depth, np.square(TRUTH_SIGMA * depth))
         return Anchors(*(torch.from_numpy(array)[None] for array in values))
 
@@ -143,8 +143,8 @@ class AnchorSource:
         count = self._setting.anchor_count
         if count is None or len(landmarks.depth) <= count:
             return landmarks
-        taken = self._drawn(index, _TAKEN).permutation(len(landmarks.depth))[:count]
-        parts = {name: getattr(landmarks, name)[taken] for name in ("pixel", "depth", "variance")}
+        chosen = self._drawn(index, _TAKEN).permutation(len(landmarks.depth))[:count]
+        parts = {name: getattr(landmarks, name)[chosen] for name in ("pixel", "depth", "variance")}
         return replace(landmarks, **parts)
 
     def _drawn(self, index: int, what: int) -> np.random.Generator:
@@ -168,8 +168,8 @@ def landmark_digests(rows: Iterable[Row], folder: Path | None) -> dict[str, str]
     """Digests of the landmarks of those rows that have them from a file, by the rows' slugs. Raises FileNotFoundError,
     ValueError, as :func:`landmarks_of`."""
     files = {row.slug: row.setting.anchors for row in rows if row.setting.anchors not in ("", TRACKED, DENSE, TRUTH)}
-    known = {file: landmarks_of(file, folder).identity for file in set(files.values())}
-    return {slug: known[file]["landmarks"] for slug, file in files.items() if "landmarks" in known[file]}
+    identities = {file: landmarks_of(file, folder).identity for file in set(files.values())}
+    return {slug: identities[file]["landmarks"] for slug, file in files.items() if "landmarks" in identities[file]}
 
 
 def anchor_sources(rows: Iterable[Row], folder: Path | None = None) -> dict[Row, AnchorSource]:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.method import ALONE, UFM
@@ -216,7 +216,7 @@ class Gaussians(Estimator):
         average beside them."""
         mixture = self.ufm.mixture
         count = int(mixture.components.sum())
-        kept: dict[str, float] = {
+        memory: dict[str, float] = {
             "bytes": count * mixture.bytes_per_component(),
             "count": count,
             "smoothing_bytes": self.ufm.smoothed.nbytes,
@@ -224,9 +224,9 @@ class Gaussians(Estimator):
         if self.ufm.config.anchors is not None:
             state = self.ufm.state
             sums = sum(value[:, :1].nbytes for value in state.by_component.values())
-            kept["bytes"] += count * sums + sum(value.nbytes for value in state.by_stream.values())
-            kept["anchors"] = self._anchors
-        return kept
+            memory["bytes"] += count * sums + sum(value.nbytes for value in state.by_stream.values())
+            memory["anchors"] = self._anchors
+        return memory
 
     def state(self) -> dict[str, Tensor]:
         return dict(self.ufm.state_dict())

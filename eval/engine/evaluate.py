@@ -191,7 +191,7 @@ class _Accounts(FrameSink):
         """What the method kept over the sequence, as ``Record`` has it."""
         state: dict[str, float] = {}
         for name, end in (self._memory[key][-1] if self._memory[key] else {}).items():
-            values = [kept[name] for kept in self._memory[key]]
+            values = [memory[name] for memory in self._memory[key]]
             if name in ("bytes", "count"):
                 state |= {f"{name}_mean": sum(values) / len(values), f"{name}_max": max(values), f"{name}_end": end}
             else:

@@ -9,8 +9,8 @@ pixels.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -27,16 +27,15 @@ if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence with
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Of a row's sums.
 METRICS, BY_ERROR = "metrics", "nll_by_error"
-Key = TypeVar("Key", bound=Hashable)
 
 
-def metrics_of(known: dict[Key, SequenceMetrics], key: Key, **how: Any) -> SequenceMetrics:
+def metrics_of(metrics: dict[str, SequenceMetrics], key: str, **how: Any) -> SequenceMetrics:
     """The metrics of a key, made now (see ``SequenceMetrics``) if there are none."""
     from ufmstar_torch.eval.metrics import SequenceMetrics
 
-    if key not in known:
-        known[key] = SequenceMetrics(**how)
-    return known[key]
+    if key not in metrics:
+        metrics[key] = SequenceMetrics(**how)
+    return metrics[key]
 
 
 class RunMetrics(FrameSink):
@@ -48,8 +47,8 @@ class RunMetrics(FrameSink):
     def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]]) -> None:
         self._key = key
         self._metrics: dict[str, SequenceMetrics] = {}
-        for name, own in sums.items():
-            metrics_of(self._metrics, name).load_state_dict(dict(own))
+        for name, state in sums.items():
+            metrics_of(self._metrics, name).load_state_dict(dict(state))
 
     def sums(self) -> dict[str, dict[str, Tensor]]:
         """By name. They are exchanged by updates, never changed in place."""

@@ -58,8 +58,8 @@ class NetworkChoice:
                 raise ValueError(f"ground-truth:HxW needs a size in pixels, got {self.files[0]!r}") from error
             return
         if self.model not in network_names():
-            known = ", ".join((*network_names(), TRUTH))
-            raise ValueError(f"model must be one of {known}, got {self.model!r}; expected {_FORM}")
+            names = ", ".join((*network_names(), TRUTH))
+            raise ValueError(f"model must be one of {names}, got {self.model!r}; expected {_FORM}")
         if not self.weights:
             raise ValueError(f"{self.base}={self.model} needs the file of its weights: {_FORM}")
         if len(self.files) - len(self.weights) > 1:

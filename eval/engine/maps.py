@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,13 +21,8 @@ from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrins
 from ufmstar_torch.eval.sequences.own_output import own_output
 from ufmstar_torch.prediction import DepthPrediction
 
-
-class PredictedMap(NamedTuple):
-    """A depth map from elsewhere."""
-
-    depth: np.ndarray  # [H, W] float32 [m], 0 = no prediction
-    variance: np.ndarray | None  # [H, W] float32 [m^2]
-    intrinsics: np.ndarray  # [3, 3] float64 of the map [px]
+# Depth [H, W] float32 [m] (0 = no prediction), variance [H, W] float32 [m^2] or None, intrinsics [3, 3] float64 [px].
+Maps = tuple[np.ndarray, np.ndarray | None, np.ndarray]
 
 
 class MapSource(DepthSource):
@@ -35,7 +30,7 @@ class MapSource(DepthSource):
 
     def __init__(
         self,
-        read: Callable[[Frame], PredictedMap],
+        read: Callable[[Frame], Maps],
         identity: Mapping[str, Any],
         *,
         size: Size | None = None,
@@ -91,32 +86,32 @@ def folder_source(
         NotADirectoryError: no such folder.
         ValueError: no maps, maps that fit no frame, or (the first one) of another aspect ratio than the images.
     """
-    own = own_output(Path(folder))
+    run = own_output(Path(folder))
     chosen = range(len(sequence)) if indices is None else indices
-    selected = [name for index in chosen if (name := sequence.names[index]) not in (own.skipped if own else ())]
+    selected = [name for index in chosen if (name := sequence.names[index]) not in (run.skipped if run else ())]
     if not selected:
         raise ValueError(f"{folder}: none of the {len(chosen)} frames has a map")
-    place = DepthFolder(own.frames if own else folder, scale, variance)
+    place = DepthFolder(run.frames if run else folder, scale, variance)
     maps = place.for_frames(sequence.names, sequence.names_on_disk, selected)
     number = {name: i for i, name in enumerate(selected)}
     K_given = None if intrinsics is None else read_intrinsics(intrinsics)
 
-    def read(frame: Frame) -> PredictedMap:
+    def read(frame: Frame) -> Maps:
         if frame.name not in number:
-            raise FrameError(frame.name, f"skipped in {folder}: {own.skipped[frame.name]}" if own else "no map")
+            raise FrameError(frame.name, f"skipped in {folder}: {run.skipped[frame.name]}" if run else "no map")
         file = maps.depth_files[number[frame.name]]
         depth, spread = maps[number[frame.name]]
         if K_given is not None:
-            return PredictedMap(depth, spread, K_given)
-        if own is not None and file.stem in own.intrinsics:
-            return PredictedMap(depth, spread, own.intrinsics[file.stem])
+            return depth, spread, K_given
+        if run is not None and file.stem in run.intrinsics:
+            return depth, spread, run.intrinsics[file.stem]
         try:
             K = scale_intrinsics(frame.intrinsics, sequence.image_size, depth.shape[:2])
         except ValueError as error:
             raise FrameError(file, _cropped(sequence, depth)) from error
-        return PredictedMap(depth, spread, K)
+        return depth, spread, K
 
-    _check_first(sequence, maps, K_given is not None or own is not None)
+    _check_first(sequence, maps, K_given is not None or run is not None)
     files = (*maps.depth_files, *maps.variance_files)
     listing = "\n".join(f"{file.name} {file.stat().st_size}" for file in files)
     identity = {
@@ -159,10 +154,10 @@ def own_depth(
         identity: None = as ``ufmstar run`` writes it down.
     """
 
-    def read(frame: Frame) -> PredictedMap:
+    def read(frame: Frame) -> Maps:
         if frame.depth is None:
             raise FrameError(frame.name, "no depth map")
-        return PredictedMap(frame.depth, None, depth_camera(frame))
+        return frame.depth, None, depth_camera(frame)
 
     plain = {"maps": "the sequence's own depth", "size": size}
     return MapSource(read, identity or plain, size=size, is_truth=True, label=label, digest=digest)

@@ -76,13 +76,13 @@ class NetworkSource(DepthSource):
     def prepared(self, how: str) -> NetworkSource:
         """The same networks, which draw from the same generator, on images that are prepared otherwise. Raises
         ValueError: the networks do not declare their input by a ``Preprocess``."""
-        own = self._turns.preprocess
+        declared = self._turns.preprocess
         if how == OF_NETWORK:
             return self
-        if not isinstance(own, Preprocess):
+        if not isinstance(declared, Preprocess):
             raise ValueError(f'preprocess = "{how}" needs networks that declare their input by a Preprocess')
-        changed = prepared_as(own, how)
-        if changed == own:
+        changed = prepared_as(declared, how)
+        if changed == declared:
             return self
         other = copy.copy(self)
         other._turns = NetworksInTurn(self.networks, samples=self._turns.samples, preprocess=changed)
@@ -124,9 +124,9 @@ class NetworkSource(DepthSource):
         return self._inputs[frame]
 
 
-def prepared_as(own: Preprocess, how: str) -> Preprocess:
+def prepared_as(declared: Preprocess, how: str) -> Preprocess:
     """The preprocessing of a network under ``Setting.preprocess``."""
-    return {OF_NETWORK: own, RESIZE: own.of_whole_frame(), CROP: own.of_nyu_crop()}[how]
+    return {OF_NETWORK: declared, RESIZE: declared.of_whole_frame(), CROP: declared.of_nyu_crop()}[how]
 
 
 def stochastic(networks: Iterable[nn.Module]) -> list[MonteCarloDropout]:

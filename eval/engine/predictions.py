@@ -37,8 +37,8 @@ class Predicted(NamedTuple):
     def to(self, to: torch.device | torch.dtype) -> Predicted:
         """With its maps on a device, or of a type."""
         maps, a, e = self.maps, self.maps.aleatoric_variance, self.maps.epistemic_variance
-        own = (None if value is None else value.to(to) for value in (a, e))
-        return self._replace(maps=DepthPrediction(maps.depth.to(to), *own))
+        variances = (None if value is None else value.to(to) for value in (a, e))
+        return self._replace(maps=DepthPrediction(maps.depth.to(to), *variances))
 
 
 class DepthSource(ABC):
@@ -126,7 +126,7 @@ class FramePredictions:
         self.frame, self._device, self._store, self._sequence = frame, device, store, sequence
         self._content = "" if store is None else frame_digest(frame)
         # By source: what rows asked for, by member ("0", "1", ... or "all"), and single inferences.
-        self._known: dict[tuple[object, str], Predicted] = {}
+        self._cached: dict[tuple[object, str], Predicted] = {}
         self._inferences: dict[tuple[object, int], Predicted] = {}
 
     def of(self, source: DepthSource, position: int, every: bool) -> Predicted:
@@ -139,7 +139,7 @@ class FramePredictions:
         found = self._looked_up(source, member)
         if found is None:
             made = [self._inference(source, n) for n in passes]
-            found = self._known[source.digest or source, member] = _combined(made) if member == _ALL else made[0]
+            found = self._cached[source.digest or source, member] = _combined(made) if member == _ALL else made[0]
             if self._store is not None and source.cacheable:
                 self._store.store(self._stored_as(source, member), found)
         return found
@@ -155,11 +155,11 @@ class FramePredictions:
     def _looked_up(self, source: DepthSource, member: str) -> Predicted | None:
         """In memory, then in the store."""
         key = (source.digest or source, member)
-        if key not in self._known and self._store is not None and source.cacheable:
+        if key not in self._cached and self._store is not None and source.cacheable:
             stored = self._store.load(self._stored_as(source, member), self._device)
             if stored is not None:
-                self._known[key] = stored
-        return self._known.get(key)
+                self._cached[key] = stored
+        return self._cached.get(key)
 
     def _stored_as(self, source: DepthSource, member: str) -> PredictionKey:
         return PredictionKey(source.digest, self._sequence, self.frame.name, member, self._content)

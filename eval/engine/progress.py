@@ -31,7 +31,7 @@ class ProgressSink(FrameSink):
 
     def take(self, result: FrameResult) -> None:
         self._skipped += bool(result.skipped)
-        known = (row.statistics for row in result.rows.values())
-        statistics = next((one for one in known if one is not None), None)
+        each = (row.statistics for row in result.rows.values())
+        statistics = next((one for one in each if one is not None), None)
         components = None if statistics is None else int(statistics.components[0])
         self._progress(Progress("frames", result.number + 1, self._total, components, self._skipped))

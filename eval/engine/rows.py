@@ -105,8 +105,8 @@ class RowRunner:
         anchors = None if self.anchors is None else self.anchors.of(frame, T, predicted, truth)
         member = self.source.turn(self.images) if self.source.networks and not self.every else None
         with self._timer.stage("uncertainty"):
-            given = None if anchors is None else anchors.anchors
-            answer = self.estimator.update(predicted, torch.from_numpy(T), given)
+            sparse = None if anchors is None else anchors.anchors
+            answer = self.estimator.update(predicted, torch.from_numpy(T), sparse)
             answer = {name: value[0].cpu() if isinstance(value, Tensor) else value for name, value in answer.items()}
         times = {"network": predicted.ms, "anchors": None if anchors is None else anchors.ms, **self._timer.take()}
         self.images += 1
@@ -130,8 +130,8 @@ class RowRunner:
         """All tensors on which the next frame depends, networks left aside: they remember nothing."""
         anchors = {} if self._tracks is None else self._tracks.state()
         parts = ((_ESTIMATOR, self.estimator.state()), (_TRACKER, anchors), (_DRIFT, self._drift.state()))
-        kept = {prefix + name: value for prefix, state in parts for name, value in state.items()}
-        return {_IMAGES: torch.tensor(self.images), **kept}
+        tensors = {prefix + name: value for prefix, state in parts for name, value in state.items()}
+        return {_IMAGES: torch.tensor(self.images), **tensors}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Continue where ``state`` was taken. Raises ValueError: it is the state of another kind of row."""

@@ -81,8 +81,9 @@ def evaluate_item(
         made_of = {"sequence": digest, "device": str(judge.device)}
         for result in results:
             if result.row in todo:
-                own = {"landmarks": landmarks[result.row.slug]} if result.row.slug in landmarks else {}
-                folder.write(item, _record(job, item, judge, result, {**made_of, **own}), result)
+                slug = result.row.slug
+                anchors = {"landmarks": landmarks[slug]} if slug in landmarks else {}
+                folder.write(item, _record(job, item, judge, result, {**made_of, **anchors}), result)
         frames, seconds = results[0].frames.get("done", 0), time.monotonic() - started
         line = f"{item.label}: {len(todo)} rows, {frames} frames, {seconds:.1f} s"
     if len(todo) < len(missing):

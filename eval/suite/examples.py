@@ -27,7 +27,7 @@ from ufmstar_torch.eval.sequences.frame import Frame, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.sequences.intrinsics import scale_intrinsics
 
-# Of the frames, after which the mixture is kept; and again at the end.
+# Shares of the frames after which the mixture is stored; it is stored again at the end.
 ROOM_SHARES = (0.25, 0.5)
 _POINTS = 4  # along each side of a pixel, for the picture
 _MAPS = ("depth", "variance", "aleatoric", "epistemic", "disagreement")
@@ -53,7 +53,7 @@ class ExampleWriter(FrameSink):
         self._gaussians = {row.key: row.estimator for row in stream.rows if isinstance(row.estimator, Gaussians)}
 
     def take(self, result: FrameResult) -> None:
-        """After each frame; one that no row has taken in hands its place to the next. Raises OSError, see
+        """After each frame. If no row used the frame, the next one is stored instead. Raises OSError, see
         ``write_atomic``."""
         if not result.rows or result.frame is None:
             return

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from ufmstar_torch.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from ufmstar_torch.anchors.anchors import Anchors as Anchors
     from ufmstar_torch.anchors.dense import DenseConfig as DenseConfig
     from ufmstar_torch.anchors.dense import DenseEvidence as DenseEvidence
-    from ufmstar_torch.anchors.given import Anchors as Anchors
     from ufmstar_torch.anchors.landmarks import LandmarkMap as LandmarkMap
     from ufmstar_torch.anchors.landmarks import landmark_source as landmark_source
     from ufmstar_torch.anchors.tracker import Landmarks as Landmarks

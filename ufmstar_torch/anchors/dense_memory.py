@@ -96,7 +96,7 @@ class Memory(SavedState):
             K: [3, 3] [px].
             cell: side of a cell [px].
         """
-        from ufmstar_torch.kernels.sight_cpu import sight
+        from ufmstar_torch.kernels.landmarks_cpu import sight
 
         self.frame += 1
         kept = self._point, self._pose, self._sigma, self._patch, self._used
@@ -176,7 +176,7 @@ class Memory(SavedState):
             T_world_cam: [4, 4] [m].
             K: [3, 3] [px].
         """
-        from ufmstar_torch.kernels.sight_cpu import patches
+        from ufmstar_torch.kernels.landmarks_cpu import patches
 
         if slot is None:
             age = np.where(self._used, self._seen, -1)

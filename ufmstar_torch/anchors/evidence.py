@@ -39,7 +39,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.given import AnchorInput
+from ufmstar_torch.anchors.anchors import AnchorInput
 from ufmstar_torch.fixed_order import total
 
 # Entries of a row of sums.

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.anchors import AnchorInput, CheckKernel, check_anchors, check_values
 from ufmstar_torch.anchors.evidence import SUMS, Evidence, inliers, means, observe
-from ufmstar_torch.anchors.given import AnchorInput, CheckKernel, check_anchors, check_values
 from ufmstar_torch.camera import unproject_at
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Columns, Distribute, Extension, FrameExtension, Tensors, Total
@@ -41,37 +41,11 @@ class Learnt:
     stream: Tensor
 
 
-class LearnKernel(Protocol):
-    """Evidence with room for the mixture, M_i in the camera frame, a frame and its anchors (:func:`learn`)."""
-
-    def __call__(
-        self,
-        evidence: Evidence,
-        mixture_cam: GaussianMixture,
-        frame: FrameInput,
-        anchors: AnchorInput | None,
-        config: UfMStarConfig,
-        /,
-        distribute: Distribute,
-    ) -> Learnt: ...
-
-
-class LearnInView(Protocol):
-    """Like :func:`learn`, from what the compiled step has in view, into which it writes the columns; see
-    ``kernels.anchors_cpu.learn_in_view``."""
-
-    def __call__(
-        self,
-        evidence: Evidence,
-        capacity: int,
-        slots: Any,
-        seen: Any,
-        views: Any,
-        frame: FrameInput,
-        anchors: AnchorInput | None,
-        config: UfMStarConfig,
-        /,
-    ) -> Learnt: ...
+# As :func:`learn`, with the function that distributes by name.
+LearnKernel = Callable[..., Learnt]
+# Like :func:`learn`, from what the compiled step has in view, into which it writes the columns
+# (``kernels.anchors_cpu.learn_in_view``).
+LearnInView = Callable[..., Learnt]
 
 
 def learn(
@@ -109,12 +83,6 @@ def learn(
     return Learnt(evidence, used, *means(evidence, config.anchors.shrinkage))
 
 
-class TermKernel(Protocol):
-    """B and M + B; see :func:`anchored_term`."""
-
-    def __call__(self, depth: Tensor, excess: Tensor, disagreement: Tensor, /) -> tuple[Tensor, Tensor]: ...
-
-
 def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> tuple[Tensor, Tensor]:
     """B = max(0, d^2 e - M) [m^2], the mean square error that anchors show beyond M, and M + B; NaN where M is.
 
@@ -132,19 +100,17 @@ class AnchorKernels:
     """The replaceable parts.
 
     Attributes:
-        check: see ``given.check_values``.
+        check: see ``anchors.check_values``.
         learn: see :func:`learn`.
         learn_in_view: the same for the compiled step; None = ``learn`` serves.
-        term: see :func:`anchored_term`.
     """
 
     check: CheckKernel
     learn: LearnKernel
     learn_in_view: LearnInView | None
-    term: TermKernel
 
 
-REFERENCE = AnchorKernels(check_values, learn, None, anchored_term)
+REFERENCE = AnchorKernels(check_values, learn, None)
 
 
 class AnchorFrame(FrameExtension):
@@ -199,7 +165,7 @@ class AnchorFrame(FrameExtension):
 
     def disagreement(self, disagreement: Tensor, depth: Tensor) -> Tensor:
         """M + B [m^2]."""
-        self._term, both = self._kernels.term(depth, self._residual[..., 1], disagreement)
+        self._term, both = anchored_term(depth, self._residual[..., 1], disagreement)
         return both
 
     def outputs(self) -> dict[str, Tensor]:

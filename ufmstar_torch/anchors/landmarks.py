@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
-from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker
 from ufmstar_torch.array_files import read_npz
 from ufmstar_torch.camera import invert_rigid

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.landmarks import LandmarkSource, landmark_source
 from ufmstar_torch.anchors.tracker import Landmarks
 

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.corners import find, follow
-from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.checked import Checked, number
 

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.anchors.anchors import FARTHEST_OFF, AnchorInput, Anchors, claimed
 from ufmstar_torch.anchors.evidence import (
     CLAIM,
     COUNTS,
@@ -23,7 +24,6 @@ from ufmstar_torch.anchors.evidence import (
 )
 from ufmstar_torch.anchors.extension import Learnt
 from ufmstar_torch.anchors.extension import learn as learn_reference
-from ufmstar_torch.anchors.given import FARTHEST_OFF, AnchorInput, Anchors, claimed
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Distribute
 from ufmstar_torch.frame import FrameInput
@@ -43,7 +43,7 @@ _NOTHING = 1e-30  # of a mean: less is 0 and not a number too small for single p
 
 
 def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> AnchorInput:
-    """As :func:`ufmstar_torch.anchors.given.check_values`, for CPU tensors."""
+    """As :func:`ufmstar_torch.anchors.anchors.check_values`, for CPU tensors."""
     b, n = anchors.depth.shape
     pixel, index, valid = np.empty((b, n, 2)), np.empty((b, n), np.int64), np.empty((b, n), np.bool_)
     predicted, depth, variance = np.empty((3, b, n))
@@ -142,22 +142,6 @@ def learn_in_view(
     each(_learn, [(*arguments, *settings, *into) for arguments, into in zip(arrays, out, strict=True)])
     learnt = Evidence(torch.from_numpy(component), torch.from_numpy(overall))
     return Learnt(learnt, torch.from_numpy(used[:, 0]), torch.from_numpy(beyond), torch.from_numpy(stream))
-
-
-def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> tuple[Tensor, Tensor]:
-    """As :func:`ufmstar_torch.anchors.extension.anchored_term`, for CPU tensors, in one pass."""
-    d, e, M = (array(value) for value in (depth, excess, disagreement))
-    term, both = np.empty_like(M), np.empty_like(M)
-    _add_term(*(value.reshape(-1) for value in (d, e, M, term, both)))
-    return torch.from_numpy(term), torch.from_numpy(both)
-
-
-@kernel
-def _add_term(depth, excess, disagreement, term, both):
-    for i in range(term.size):
-        beyond = depth[i] * depth[i] * excess[i] - disagreement[i]
-        term[i] = term.dtype.type(0) if beyond < 0 else beyond
-        both[i] = disagreement[i] + term[i]
 
 
 @kernel

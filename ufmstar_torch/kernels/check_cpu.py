@@ -20,6 +20,7 @@ from ufmstar_torch.kernels.arrays_cpu import array
 _Matrix = list[list[float]]
 _EYE3, _EYE4 = np.eye(3).tolist(), np.eye(4).tolist()
 _AXES = range(3)
+_ROUNDING = 4e-16  # of R^T R: a further step changes nothing
 
 
 def check_values(
@@ -86,11 +87,13 @@ def _camera(T: _Matrix, K: _Matrix, height: int, width: int, tolerance: float) -
     fault = (_pose_fault(T, deviation, tolerance) if finite else 1) or _intrinsics_fault(K, height, width)
     if fault:
         return _EYE4, _EYE3, fault, deviation
-    rotation = T
+    rotation = [row[:3] for row in T[:3]]
     for _ in range(POLAR_STEPS):  # as ``camera.nearest_rotation``: R <- R (3 I - R^T R)/2
-        Q = [[(1.5 if i == j else 0.0) - 0.5 * value for j, value in enumerate(row)]
-             for i, row in enumerate(_gram(rotation))]  # fmt: skip
-        rotation = [[a * Q[0][j] + b * Q[1][j] + c * Q[2][j] for j in _AXES] for a, b, c, *_ in rotation[:3]]
+        gram = _gram(rotation)
+        if max(abs(value - (i == j)) for i, row in enumerate(gram) for j, value in enumerate(row)) < _ROUNDING:
+            break
+        Q = [[(1.5 if i == j else 0.0) - 0.5 * value for j, value in enumerate(row)] for i, row in enumerate(gram)]
+        rotation = [[a * Q[0][j] + b * Q[1][j] + c * Q[2][j] for j in _AXES] for a, b, c in rotation]
     return [[*row, T[i][3]] for i, row in enumerate(rotation)] + _EYE4[3:], K, 0, deviation
 
 

@@ -9,18 +9,23 @@ it. Here a part is optimised and made machine code only in its kernels; of numba
 that such plain code needs. A first start takes half the time for it.
 
 A kernel on disk counts as long as its own file and those whose code and constants are compiled into kernels are the
-same: by itself numba looks at the first alone, and would go on with an outdated part.
+same: by itself numba looks at the first alone, and would go on with an outdated part. A damaged file, or one that
+cannot be written, is reported once (logger ``ufmstar_torch``), and the kernel is compiled in memory.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import logging
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numba
 from numba import njit, types
-from numba.core import cgutils, codegen, compiler, typed_passes, untyped_passes
+from numba.core import caching, cgutils, codegen, compiler, typed_passes, untyped_passes
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.extending import intrinsic, register_jitable
 from numba.np.arrayobj import get_itemsize, make_array, populate_array
@@ -147,6 +152,50 @@ def _sources() -> str:
 _SOURCES = _sources()
 
 
+class _KeptFiles(caching.IndexDataCacheFile):
+    """The files of a kernel on disk. Each is a checksum, the stamp of what the kernel depends on, and the content."""
+
+    def _load_index(self) -> dict[Any, str]:
+        return self._read(self._index_path) or {}
+
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        self._write(self._index_path, overloads)
+
+    def _load_data(self, name: str) -> Any:
+        return self._read(self._data_path(name))
+
+    def _save_data(self, name: str, data: Any) -> None:
+        self._write(self._data_path(name), data)
+
+    def _read(self, path: str) -> Any:
+        """The content of a file, None where there is none of this stamp."""
+        try:
+            data = Path(path).read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            return _report(f"{Path(path).parent} cannot be read ({error.strerror})")
+        checksum, data = data[:32], data[32:]
+        if hashlib.sha256(data).digest() != checksum:
+            return _report(f"a file in {Path(path).parent} is damaged and is replaced")
+        stamp, content = pickle.loads(data)
+        return pickle.loads(content) if stamp == self._source_stamp else None
+
+    def _write(self, path: str, content: Any) -> None:
+        data = pickle.dumps((self._source_stamp, self._dump(content)))
+        try:
+            with self._open_for_write(path) as file:
+                file.write(hashlib.sha256(data).digest() + data)
+        except OSError as error:
+            _report(f"{Path(path).parent} cannot be written to ({error.strerror})")
+
+
+@functools.cache
+def _report(what: str) -> None:
+    """Log once that a kernel has to be compiled in memory."""
+    logging.getLogger("ufmstar_torch").warning("compiled kernels: %s; compiling in memory", what)
+
+
 def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile at the first call, and keep the result on disk; in memory alone where no folder can be written to."""
 
@@ -156,8 +205,9 @@ def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             compiled = njit(cache=True, **settings)(function)
         except RuntimeError:  # numba: "no locator available"
             return njit(**settings)(function)
-        file = compiled._cache._cache_file  # no public way to widen what a cached kernel depends on
-        file._source_stamp = (file._source_stamp, _SOURCES)
+        cache = compiled._cache  # no public way to widen what a cached kernel depends on
+        stamp = numba.__version__, cache._cache_file._source_stamp, _SOURCES
+        cache._cache_file = _KeptFiles(cache._cache_path, f"{cache._impl.filename_base}.kept", stamp)
         return compiled
 
     return decorated

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.given import AnchorInput
+from ufmstar_torch.anchors.anchors import AnchorInput
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.cells_cpu import cell_means, features, ranges, read
 from ufmstar_torch.kernels.field_cpu import Field, Floats, Observed, Prior, at, distance, given

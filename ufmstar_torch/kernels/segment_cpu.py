@@ -59,7 +59,7 @@ def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[Gauss
     mean, covariance = np.zeros((b, k, 3), dtype), np.zeros((b, k, 3, 3), dtype)
     weight, count = np.zeros((b, k), dtype), np.zeros((b, k), np.int64)
     for i, (kept, gaussians, whole) in enumerate(fits):
-        write_gaussians(kept, gaussians, whole, mean[i], covariance[i], weight[i], count[i])
+        _write(kept, gaussians, whole, mean[i], covariance[i], weight[i], count[i])
     features = np.empty((b, k, 0), dtype)
     if given.features is not None:
         features = feature_means(array(given.features), labels, weight)
@@ -144,6 +144,11 @@ def _depth_bins(s: float, limits: _Limits) -> tuple[np.ndarray, np.ndarray]:
         lengths2[k], edges[k] = length * length, edge
         length = min(max(s * edge, limits.shortest_bin), limits.longest_bin)
     return lengths2, edges
+
+
+@kernel
+def _write(kept, gaussians, whole, mean, covariance, weight, count):
+    write_gaussians(kept, gaussians, whole, mean, covariance, weight, count)
 
 
 @kernel

@@ -30,7 +30,7 @@ from ufmstar_torch.kernels.regress_cpu import EPSILON, Seen, View, in_slots, loo
 from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, padded
 from ufmstar_torch.kernels.segment_cpu import feature_means, fit, most_gaussians
-from ufmstar_torch.kernels.stream_cpu import describe, join, match, tally
+from ufmstar_torch.kernels.stream_cpu import describe, join, match
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import StepOutput
@@ -256,7 +256,7 @@ def _within_limit(joined: _Joined, old: Sequence[int], position: Tensor, limit: 
 
 def _columns(
     state: UfMStarState, joined: _Joined, frame: FrameInput, extensions: FrameExtensions, config: UfMStarConfig
-) -> tuple[dict[str, Tensor], list[View] | None, Floats | None]:
+) -> tuple[dict[str, Tensor], list[View] | None, NDArray[np.float64] | None]:
     """Write the columns of extensions to the features before the last. Returns the tensors of the state that change;
     what is in view, and what the regression is to add to the columns, where an extension works on what is in view."""
     capacity, tensors = joined.mixture["weight"].shape[1], {**state.by_stream, **joined.sums}
@@ -293,6 +293,7 @@ def _counts(frame: FrameInput, pairs: Sequence[_Pairs], joined: _Joined, measure
             pair.c.size,
             new,
             gone + pair.found - pair.matched - new,  # too many, or too near
-            *tally(valid[b].reshape(-1), shares[b].reshape(-1), unmeasured.HALF),
+            np.count_nonzero(valid[b]),
+            np.count_nonzero(shares[b] < unmeasured.HALF),
         )
     return dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))

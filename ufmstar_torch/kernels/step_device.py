@@ -166,7 +166,7 @@ class DeviceStep:
                 last=False,
             )  # fmt: skip
             self._lost = lost.sum(1)
-        return replace(state, **grown.tensors())
+        return state.with_tensors(grown.tensors())
 
 
 def device_step(
@@ -213,15 +213,10 @@ def device_step(
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
     )
-    updated = replace(
-        state,
-        **mixture.tensors(),
-        T_world_first=here.first,
-        started=here.started,
-        frames=here.frames,
-        skipped=here.skipped,
-        smoothed=result.memory,
-    )
+    updated = state.with_tensors({
+        **mixture.tensors(), "T_world_first": here.first, "started": here.started, "frames": here.frames,
+        "skipped": here.skipped, "smoothed": result.memory,
+    })  # fmt: skip
     out = StepOutput(result.disagreement, result.features, result.measured, read_labels, current, statistics)
     return updated, out, waiting
 

@@ -7,9 +7,9 @@ import numpy as np
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, zeros
 from ufmstar_torch.kernels.correspond_cpu import matches
 from ufmstar_torch.kernels.fuse_cpu import WORK, append, floored, fuse_pairs
-from ufmstar_torch.kernels.reach_cpu import GROUP, reached
 from ufmstar_torch.kernels.rigid_cpu import FIELDS, gather, move, padded, relative, turn
 from ufmstar_torch.kernels.segment_image_cpu import write_gaussians
+from ufmstar_torch.kernels.visibility_cpu import GROUP, reached
 
 
 @kernel
@@ -140,14 +140,3 @@ def join(present, first, slots, segments, pairs, distance, new, occupied, near, 
             more[i, f] = features[slot, f]
         more[i, more.shape[1] - 1] = 1.0 if count[slot] > 1 else 0.0
     return slots_near, m, more, components
-
-
-@kernel
-def tally(valid, measured, half):
-    """How many pixels are valid, and how many shares of what was measured are below one half."""
-    pixels = below = 0
-    for i in range(valid.size):
-        pixels += valid[i]
-    for i in range(measured.size):
-        below += measured[i] < half
-    return pixels, below

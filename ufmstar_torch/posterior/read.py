@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.given import FARTHEST_OFF
+from ufmstar_torch.anchors.anchors import FARTHEST_OFF
 
 # No correction by more than this log factor: anchors that are off by more are not valid.
 LARGEST = math.log(FARTHEST_OFF)

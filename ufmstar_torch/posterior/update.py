@@ -37,13 +37,13 @@ depth: nothing was measured, and nothing reads as certain. A stream without anch
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.given import AnchorInput
+from ufmstar_torch.anchors.anchors import AnchorInput
 from ufmstar_torch.fixed_order import total
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.posterior.config import PosteriorConfig
@@ -61,15 +61,6 @@ LEAST_REST = 5
 STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
-class PosteriorUpdate(Protocol):
-    """See :func:`update`; ``kernels/posterior_cpu`` is the compiled one."""
-
-    def __call__(
-        self, packed: Tensor, frame: FrameInput, anchors: AnchorInput | None, claimed: Tensor,
-        config: PosteriorConfig, /,
-    ) -> tuple[Tensor, Posterior]: ...  # fmt: skip
-
-
 @dataclass(frozen=True)
 class Posterior:
     """Of B streams.
@@ -85,6 +76,10 @@ class Posterior:
     variance: Tensor
     calibration: Tensor
     unseen: Tensor
+
+
+# As :func:`update`; ``kernels/posterior_cpu`` has the compiled one.
+PosteriorUpdate = Callable[[Tensor, FrameInput, AnchorInput | None, Tensor, PosteriorConfig], tuple[Tensor, Posterior]]
 
 
 @dataclass(frozen=True)

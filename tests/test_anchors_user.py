@@ -9,7 +9,7 @@ from torch import nn
 
 import scenes
 from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.camera import resize_intrinsics
 
 H, W = 48, 64
@@ -160,22 +160,6 @@ def test_the_pipeline_takes_anchors_in_the_images_pixels(preprocess):
 
 
 # ---- a standing camera, and starting again ----
-
-
-def test_a_standing_camera_has_no_anchors_and_says_so():
-    from ufmstar_torch.anchors.tracker import LandmarkTracker
-    from ufmstar_torch.eval.sequences.open import open_sequence
-
-    frame = open_sequence("tour:5?frames=2&size=180x240")[0]
-    tracker, plain, anchored = LandmarkTracker(), UfMStar(), UfMStar(ON)
-    arguments = [torch.tensor(x)[None] for x in (1.2 * frame.depth, frame.T_world_cam, frame.intrinsics)]
-    for _ in range(4):
-        landmarks = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
-        a = plain(*arguments)
-        b = anchored(*arguments, anchors=landmarks.anchors(frame.intrinsics, arguments[2]))
-        assert b.statistics.anchors.tolist() == b.statistics.anchors_used.tolist() == [0]
-        torch.testing.assert_close(a.variance, b.variance, rtol=0, atol=0, equal_nan=True)
-    assert landmarks.tracked > 20, "corners are seen, but without parallax"
 
 
 def learnt():

@@ -6,9 +6,8 @@ prediction is known. ``evidence`` says what is learnt from that, and how it is s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -146,13 +145,6 @@ def claimed(own: Sequence[Tensor], index: Tensor, valid: Tensor) -> Tensor:
     return torch.where(valid, total.double(), zero)
 
 
-class CheckKernel(Protocol):
-    """Anchors of the right shapes and dtypes, on the frame's device, and what the network claims
-    (:func:`check_values`)."""
-
-    def __call__(self, anchors: Anchors, frame: FrameInput, own: Sequence[Tensor], /) -> AnchorInput: ...
-
-
 def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> AnchorInput:
     """The anchors, ready to be used; see :func:`check_anchors`.
 
@@ -182,6 +174,10 @@ def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> 
         own_variance=claimed(own, index, valid),
         valid=valid,
     )
+
+
+# As :func:`check_values`.
+CheckKernel = Callable[[Anchors, FrameInput, Sequence[Tensor]], AnchorInput]
 
 
 def check_anchors(
