@@ -171,7 +171,7 @@ def test_a_configuration_has_limits(text, reason, tmp_path):
 
 def test_help_has_the_attributes_texts(capsys):
     with pytest.raises(SystemExit) as ended:
-        _parse("--help")
+        _parse("--help-all")
     assert ended.value.code == 0
     text = " ".join(capsys.readouterr().out.split())
     for expected in (
@@ -184,6 +184,18 @@ def test_help_has_the_attributes_texts(capsys):
         "v_min [m^2], [0, inf]",
     ):
         assert expected in text
+
+
+def test_the_short_help_leaves_out_the_settings(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["run", "--help"])
+    text = capsys.readouterr().out
+    assert "--ufm.eta" not in text
+    assert "--ufm.segment.sparse" not in text
+    assert "--help-all" in text
+    assert "--ufm-preset" in text
+    assert len(text.splitlines()) < 150
+    assert _parse("seq --out o --ufm.eta .25").ufm["eta"] == 0.25
 
 
 def test_the_help_of_a_flag_names_no_default(capsys):
