@@ -159,7 +159,7 @@ def _is_json(content: bytes) -> bool:
     """Whether the content is nothing or JSON, neither of which can be unpickled."""
     try:
         json.loads(content or b"0")
-    except ValueError:
+    except (ValueError, RecursionError):
         return False
     return True
 

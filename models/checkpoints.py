@@ -105,7 +105,7 @@ def read_safetensors(path: str | Path, prefix: str | None = "") -> tuple[dict[st
             keys = [] if prefix is None else [name for name in names if name.startswith(prefix)]
             tensors = {key[len(prefix or "") :]: file.get_tensor(key) for key in keys}
             return tensors, json.loads((file.metadata() or {}).get("metadata", "null"))
-    except (safetensors.SafetensorError, json.JSONDecodeError) as error:
+    except (safetensors.SafetensorError, json.JSONDecodeError, RecursionError) as error:
         raise CheckpointError(f"{path} is not a readable safetensors file: {error}") from error
 
 

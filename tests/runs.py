@@ -105,3 +105,6 @@ class Recorder:
 
     def flush(self):
         pass
+
+    def isatty(self):
+        return False

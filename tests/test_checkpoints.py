@@ -12,7 +12,7 @@ import torch
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from ufmstar_torch.models import CheckpointError, atomic, load_state_dict_file, load_weights, save_checkpoint
@@ -104,6 +104,12 @@ def test_weights_that_are_not_finite(tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "w.pth", state)
     with pytest.raises(CheckpointError, match=r"w.pth does not fit .*1 with NaN or infinity: conv.bias"):
         load_weights(Small(), tmp_path / "w.pth")
+
+
+def test_metadata_nested_too_deeply_names_the_file(tmp_path: Path) -> None:
+    save_file({"a": torch.ones(1)}, tmp_path / "deep.safetensors", metadata={"metadata": "[" * 200_000})
+    with pytest.raises(CheckpointError, match=r"deep\.safetensors"):
+        load_weights(Small(), tmp_path / "deep.safetensors")
 
 
 # --- damage ------------------------------------------------------------------------------------------

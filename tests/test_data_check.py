@@ -14,7 +14,7 @@ import pytest
 from shared_data import require_shared
 
 from ufmstar_torch.cli import main
-from ufmstar_torch.eval.check.data_check import check_data
+from ufmstar_torch.eval.check.data_check import check_data, lines
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS
 from ufmstar_torch.eval.tour import export_tour
@@ -142,6 +142,16 @@ def test_a_sequence_that_cannot_be_opened(tour, capsys):
     assert "cannot be opened: trajectory has 23 poses for 24 images" in out
 
 
+def test_contradictory_poses_of_one_timestamp_are_named(tmp_path, capsys):
+    path, _ = layouts.write_tum(tmp_path)
+    file = path / "groundtruth.txt"
+    time = file.read_text().splitlines()[-1].split()[0]
+    file.write_text(f"{file.read_text().rstrip()}\n{time} 50 0 0 0 0 0 1\n")
+    code, out = command(capsys, path)
+    assert code == 1
+    assert re.search(r"PROBLEM +cannot be opened: .*groundtruth\.txt:\d+: the pose has the timestamp of line", out)
+
+
 def test_few_usable_frames(tour):
     T = [np.eye(4)[:3].ravel()] * 8
     np.savetxt(tour / "slam.txt", [[100 + i, *row] for i, row in enumerate(T)])
@@ -191,6 +201,12 @@ def test_no_depth_and_no_poses(tmp_path, capsys):
     code, out = command(capsys, path)
     assert code == 0
     assert re.search(r"undecided +nothing was compared: .* has no two readable frames with depth", out)
+    assert out.splitlines()[-1] == "not checked: no depth, no metric scale"
+    report = check_data(path)
+    assert report.ok
+    assert not report.compared
+    assert lines([report]).splitlines()[-1] == "0 of 1 sequences are fine"
+    assert "fine" not in lines([report]).splitlines()[0]
     root, _ = layouts_more.write_nyu(tmp_path / "nyu")
     code, out = command(capsys, root)
     assert code == 0

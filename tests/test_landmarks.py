@@ -90,8 +90,13 @@ def test_other_files_are_refused(tmp_path):
     np.savez(tmp_path / "pickled.npz", points=np.array([[{}, 1, 2]], dtype=object), sigma=np.ones(1))
     np.savez(tmp_path / "flat.npz", points=np.zeros(3), sigma=np.ones(3))
     (tmp_path / "bytes.npz").write_bytes(b"no archive")
+    whole = (tmp_path / "flat.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "negative.npz").write_bytes(whole.replace(b"(3,), }    ", b"(-3, 3), } "))
     for name, message in (
-        ("a", "'points'"),
+        ("a", "expected the arrays points, sigma, got xyz"),
+        ("cut", r"cut\.npz"),
+        ("negative", r"negative\.npz"),
         ("pickled", "allow_pickle"),
         ("flat", r"\[P, 3\]"),
         ("bytes", "landmarks"),

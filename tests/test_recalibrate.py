@@ -89,6 +89,9 @@ def test_a_file_comes_back(tmp_path):
     file.write_text(json.dumps({"variance": [1], "recalibrated": [1], "colour": "red"}))
     with pytest.raises(ValueError, match="colour"):
         Recalibration.from_json(file)
+    file.write_text("[" * 200_000)
+    with pytest.raises(ValueError, match=r"map\.json is not JSON: .*recursion"):
+        Recalibration.from_json(file)
 
 
 # ---- the fit ----

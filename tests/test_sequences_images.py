@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import struct
 import subprocess
+import tracemalloc
+import zipfile
 import zlib
+from contextlib import suppress
 
 import numpy as np
 import pytest
 from layouts import truncate, write_depth_png, write_image
 from PIL import Image
 
+from ufmstar_torch import array_files
 from ufmstar_torch.eval.sequences import images
 from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.eval.sequences.images import image_size, list_files, read_color, read_depth
@@ -124,7 +128,7 @@ def test_what_is_no_depth_map_is_named(tmp_path):
     with pytest.raises(FrameError, match="expected a 16-bit or float depth image"):
         read_depth(tmp_path / "grey.png")
     np.savez(tmp_path / "two.npz", a=np.zeros((2, 2)), b=np.zeros((2, 2)))
-    with pytest.raises(FrameError, match="expected the key 'depth' or a single array"):
+    with pytest.raises(FrameError, match=r"two\.npz.*expected the arrays depth, got a, b"):
         read_depth(tmp_path / "two.npz")
     np.save(tmp_path / "rgb.npy", np.zeros((4, 5, 3)))
     with pytest.raises(FrameError, match="expected a map"):
@@ -137,6 +141,67 @@ def test_what_is_no_depth_map_is_named(tmp_path):
     write_depth_png(tmp_path / "depth.png", np.ones((4, 5)), 1000)
     with pytest.raises(FrameError, match="expected an 8-bit colour or grey image"):
         read_color(tmp_path / "depth.png")
+
+
+def _npy(shape: str, descr: str = "'<f4'", content: bytes = bytes(64)) -> bytes:
+    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + content
+
+
+_HEADERS = {
+    "huge": _npy("(1000000, 1000000)"),
+    "overflow": _npy("(99999999999999999999, 4)"),
+    "negative": _npy("(-4, -4)"),
+    "type": _npy("(4, 4)", "'<q99'"),
+    "objects": _npy("(4, 4)", "'|O'"),
+    "brackets": _npy("(" * 5000),
+    "short": _npy("(4, 4)")[:9],
+    "cut": _npy("(4, 4)", content=bytes(63)),
+    "words": _npy("(4, 4,"),
+}
+
+
+@pytest.mark.parametrize("kind", _HEADERS)
+@pytest.mark.parametrize("suffix", ["npy", "npz"])
+def test_a_damaged_header_of_an_array_is_a_frame_error(tmp_path, kind, suffix):
+    file = tmp_path / f"a.{suffix}"
+    if suffix == "npy":
+        file.write_bytes(_HEADERS[kind])
+    else:
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("depth.npy", _HEADERS[kind])
+    with pytest.raises(FrameError, match=rf"a\.{suffix}"):
+        read_depth(file)
+
+
+def test_an_array_that_expands_has_a_bound(tmp_path, monkeypatch):
+    """Of a member, no more is read than its entry states, and no more than the limit is allocated."""
+    file = tmp_path / "a.npz"
+    np.savez_compressed(file, depth=np.zeros((2000, 5000), np.float32))
+    monkeypatch.setattr(array_files, "LARGEST", 1_000_000)
+    tracemalloc.start()
+    with pytest.raises(FrameError, match=r"a\.npz"):
+        read_depth(file)
+    content = bytearray(file.read_bytes())
+    entry = content.index(b"PK\x01\x02")
+    struct.pack_into("<I", content, entry + 24, 200)  # the expanded size in the archive's directory
+    file.write_bytes(content)
+    with pytest.raises(FrameError, match=r"a\.npz"):
+        read_depth(file)
+    assert tracemalloc.get_traced_memory()[1] < 5_000_000
+    tracemalloc.stop()
+
+
+def test_damage_at_any_byte_of_an_archive_is_a_frame_error(tmp_path):
+    np.savez_compressed(tmp_path / "a.npz", depth=np.ones((4, 5), np.float32))
+    content, file = (tmp_path / "a.npz").read_bytes(), tmp_path / "b.npz"
+    for place in range(len(content)):
+        file.write_bytes(content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :])
+        with suppress(FrameError):
+            assert read_depth(file).shape == (4, 5)  # a byte that nothing depends on
+        file.write_bytes(content[:place])
+        with pytest.raises(FrameError, match=r"b\.npz"):
+            read_depth(file)
 
 
 def test_numbers_in_names_sort_by_value(tmp_path):

@@ -74,10 +74,21 @@ def test_a_bad_line_is_named(tmp_path, text, message):
 
 
 def test_samples_are_sorted_and_repeated_times_dropped(tmp_path):
-    text = "2 20 0 0 0 0 0 1\n1 10 0 0 0 0 0 1\n2 99 0 0 0 0 0 1\n"
+    text = "2 20 0 0 0 0 0 1\n1 10 0 0 0 0 0 1\n2 20.005 0 0 0 0 0 1\n"
     trajectory = read_trajectory(write(tmp_path, text))
     assert trajectory.timestamps.tolist() == [1, 2]
     assert trajectory.T_world_cam[:, 0, 3].tolist() == [10, 20]
+
+
+@pytest.mark.parametrize(
+    "second", ["2 3 0 0 0 0 0 1", f"2 0.02 0 0 0 0 {QUARTER} {QUARTER}", "2 0.02 0 0 0 0 1 0"], ids=str
+)
+def test_poses_with_one_timestamp_that_contradict_each_other_are_refused(tmp_path, second):
+    text = f"1 0 0 0 0 0 0 1\n2 0.02 0 0 0 0 0 1\n{second}\n"
+    with pytest.raises(ValueError, match=r"txt:3: the pose has the timestamp of line 2, but lies .* degrees from it"):
+        read_trajectory(write(tmp_path, text))
+    for alike in ("2 0.02 0 0 0 0 0 1", "2 0.025 0 0 0 0 0.005 0.9999875", "2 0.02 0 0 0 0 0 -1", "2 nan 0 0 0 0 0 1"):
+        assert len(read_trajectory(write(tmp_path, f"1 0 0 0 0 0 0 1\n2 0.02 0 0 0 0 0 1\n{alike}\n"))) == 2
 
 
 @pytest.mark.parametrize("token", ["nan", "-inf", "-1.#IND", "1.#QNAN00", "-1.#INF"])

@@ -7,6 +7,7 @@ import os
 import shutil
 import struct
 import tracemalloc
+import zlib
 
 import layouts
 import numpy as np
@@ -132,6 +133,26 @@ def test_what_cannot_be_read_is_refused(tmp_path, options, message):
         open_sequence(path)
 
 
+def test_depth_that_expands_without_limit(tmp_path):
+    """A map whose 300 kB expand to 300 MB, or whose size in the header would be 32 EB."""
+    path, _, _ = write_sens(tmp_path / "a.sens", frames=1)
+    data, (offset,) = bytearray(path.read_bytes()), frame_offsets(path)
+    color, _ = struct.unpack_from("<2Q", data, offset + 80)
+    bomb = zlib.compress(bytes(300_000_000), 1)
+    struct.pack_into("<Q", data, offset + 88, len(bomb))
+    path.write_bytes(data[: offset + FRAME + color] + bomb)
+    sequence = open_sequence(path)
+    tracemalloc.start()
+    with pytest.raises(FrameError, match=r"a\.sens.* more than 6144 bytes"):
+        sequence[0]
+    assert tracemalloc.get_traced_memory()[1] < 20_000_000
+    tracemalloc.stop()
+    struct.pack_into("<2I", data, HEADER - 8 - 4 - 8, 2**32 - 1, 2**32 - 1)
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.sens: broken header"):
+        open_sequence(path)
+
+
 def test_a_broken_header_is_refused(file):
     data = bytearray(file.read_bytes())
     struct.pack_into("<Q", data, HEADER - 8, 2**62)
@@ -153,7 +174,7 @@ def test_broken_frames_are_found_when_decoding(file):
     message = [str(error) for error in errors]
     assert "cannot be decoded" in message[0]
     assert "depth map at byte" in message[1]
-    assert "has 6144 bytes, expected 64x47 of 2" in message[2]
+    assert "has more than 6016 bytes, expected 64x47 of 2" in message[2]
     struct.pack_into("<2I", data, HEADER - 8 - 4 - 16, 161, 121)
     file.write_bytes(data)
     with pytest.raises(FrameError, match="the image is 162x121, the sequence's are 161x121"):

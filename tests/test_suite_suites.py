@@ -265,6 +265,7 @@ def test_a_suite_is_the_same_after_a_way_through_json(name):
         ("include = ['eta']", "no suite is called 'eta'"),
         ("title = 'x'", "needs at least one row"),
         ("name = ", "Invalid value"),
+        ("name = " + "[" * 200_000, "recursion"),
     ],
 )
 def test_mistakes_in_a_file_are_told_with_its_name(tmp_path, text, told):

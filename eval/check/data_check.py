@@ -23,6 +23,7 @@ _QUANTILES = (0.01, 0.99)
 # Scales that are customary [m per unit]; one within the check's own tolerance of the measured one is meant.
 _CUSTOMARY = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5, 1 / 5000, 1 / 256, 1 / 4000, 1 / 1024)
 _CUSTOMARY_WITHIN = 1.1
+_REGISTERED = "depth is registered"  # in what check_sequence leaves open of the registration
 _FEW = 0.5  # share of the frames on disk that must be usable, or the trajectory is another recording's
 
 
@@ -55,9 +56,15 @@ class DataReport:
         """Whether no problem was detected."""
         return not self.problems
 
+    @property
+    def compared(self) -> bool:
+        """Whether depth was compared with other frames, or its edges with the images'."""
+        decided = self.checked.get("registration") and not any(_REGISTERED in text for text in self.undecided)
+        return bool(self.checked.get("pairs") or decided)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON; what is not finite is None."""
-        return {"ok": self.ok, **to_json(self)}
+        return {"ok": self.ok, "compared": self.compared, **to_json(self)}
 
 
 def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **options: Any) -> DataReport:
@@ -241,11 +248,13 @@ def page(report: DataReport) -> str:
 
 def lines(reports: Sequence[DataReport]) -> str:
     """Several sequences, a line each, and how many are fine."""
-    fine = sum(report.ok for report in reports)
+    fine = sum(report.ok and report.compared for report in reports)
     return "\n".join([*map(_line, reports), f"{fine} of {len(reports)} sequences are fine"])
 
 
 def _line(report: DataReport) -> str:
+    if report.ok and not report.compared:
+        return f"{_end(report)}  {report.name}: {report.layout}, {report.frames} of {report.on_disk} frames"
     if report.ok:
         error = report.checked.get("error")
         fit = f", depth fits to {error:.1%}" if error is not None and report.posed else ""
@@ -259,7 +268,11 @@ def _problems(report: DataReport) -> list[str]:
 
 
 def _end(report: DataReport) -> str:
-    return "fine" if report.ok else _count(len(report.problems), "problem")
+    if not report.ok:
+        return _count(len(report.problems), "problem")
+    if report.compared:
+        return "fine"
+    return f"not checked: {'no depth, no metric scale' if report.depth_range is None else 'nothing was compared'}"
 
 
 def _size(size: tuple[int, int] | None) -> str:

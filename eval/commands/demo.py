@@ -115,7 +115,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         raise ValueError("the demo needs networks with a variance of their own (an aleatoric or evidential head)")
     kind = FolderKind(program="ufmstar demo", noun="demo", manifest="summary.json", clear=remover(*DEMO_FILES))
     OutputFolder.open(options.out, kind, {}, overwrite=options.overwrite).close()
-    tour = {"seed": options.seed, "style": "mixed", "frames": options.frames, "size": info.spec.size}
+    tour: dict[str, Any] = {"seed": options.seed, "style": "mixed", "frames": options.frames, "size": info.spec.size}
     config = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
     warm_up_command(config, device, lambda done, total: progress(Progress("kernels", done, total)), dense=True)
     progress(Progress("rooms", 0, options.frames))

@@ -31,11 +31,13 @@ values are refused.
 from __future__ import annotations
 
 import types
-from argparse import Action
+from argparse import SUPPRESS, Action
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from functools import cache, reduce
 from operator import or_
+from os.path import isfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -43,6 +45,9 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
     from jsonargparse import ArgumentParser
 
+# Limits of a configuration file; the settings of all commands together are 3 levels deep and have 300 values.
+_CONFIG_BYTES, _CONFIG_DEPTH, _CONFIG_VALUES = 1_000_000, 50, 100_000
+_HELP_ALL = "--help-all"
 T = TypeVar("T", bound="DataclassInstance")
 
 
@@ -101,7 +106,9 @@ def parse(options: type[T], words: Sequence[str], prog: str, defaults: Mapping[s
     """
     from jsonargparse import ArgumentError
 
-    parser = parser_of(options, prog)
+    full = _HELP_ALL in words
+    parser = parser_of(options, prog, full=full)
+    words = ["--help"] if full else words
     parser.set_defaults(dict(defaults or {}))
     try:
         values = parser.parse_args(list(words)).as_dict()
@@ -110,9 +117,17 @@ def parse(options: type[T], words: Sequence[str], prog: str, defaults: Mapping[s
     return _build(options, values)
 
 
-def parser_of(options: type, prog: str) -> ArgumentParser:
-    """The parser for a dataclass of options; it raises ``ArgumentError`` instead of ending the program."""
+def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser:
+    """The parser for a dataclass of options; it raises ``ArgumentError`` instead of ending the program. Its help has
+    the options with a dot in their name (``--ufm.eta``) only if it is ``full``."""
     from jsonargparse import ActionConfigFile, ArgumentParser, DefaultHelpFormatter
+
+    class BoundedConfigFile(ActionConfigFile):
+        """Check the size and nesting of a configuration before it is parsed."""
+
+        def __call__(self, parser: Any, values: Any, content: str, option: str | None = None) -> None:
+            _require_bounded(content)
+            super().__call__(parser, values, content, option)
 
     class Formatter(DefaultHelpFormatter):
         """Of a flag, the default would be the field's: --no-register has (default: True) otherwise."""
@@ -126,9 +141,43 @@ def parser_of(options: type, prog: str) -> ArgumentParser:
     parser = ArgumentParser(
         prog=prog, usage=usage, description=description, exit_on_error=False, formatter_class=Formatter
     )
-    parser.add_argument("--config", action=ActionConfigFile, help="JSON or YAML file with any of these options")
-    _add_options(parser, parser, options)
+    parser.add_argument("--config", action=BoundedConfigFile, help="JSON or YAML file with any of these options")
+    parser.add_argument(_HELP_ALL, action="store_true", help="show every option, those of all settings included")
+    _add_options(parser, parser, options, full)
     return parser
+
+
+def _require_bounded(config: str) -> None:
+    """Check a configuration, a file's name or the text itself, by YAML's events, which neither recurse nor expand.
+
+    Raises:
+        ValueError: it is larger than 1 MB, nested deeper than 50 levels, or has over 100,000 values with its aliases
+            expanded; the message names it.
+    """
+    import yaml
+
+    name, text = "--config", config
+    if isfile(config):
+        name = f"--config {config}"
+        with open(config, "rb") as opened:
+            text = opened.read(_CONFIG_BYTES + 1).decode(errors="replace")
+    if len(text) > _CONFIG_BYTES:
+        raise ValueError(f"{name} is larger than {_CONFIG_BYTES:,} bytes, which no configuration needs")
+    values, sizes, open_nodes = 0, dict[str, int](), list[tuple[str | None, int]]()
+    with suppress(yaml.YAMLError):  # reported by the parser
+        for event in yaml.parse(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+            if isinstance(event, yaml.CollectionStartEvent):
+                open_nodes.append((event.anchor, values))
+            elif isinstance(event, yaml.CollectionEndEvent):
+                anchor, before = open_nodes.pop()
+                sizes[anchor or ""] = values - before
+            elif isinstance(event, yaml.AliasEvent):  # of an unfinished collection: it would contain itself
+                values += sizes.get(event.anchor, _CONFIG_VALUES)
+            values += isinstance(event, yaml.NodeEvent)
+            if len(open_nodes) > _CONFIG_DEPTH:
+                raise ValueError(f"{name} is nested deeper than {_CONFIG_DEPTH} levels")
+            if values > _CONFIG_VALUES:
+                raise ValueError(f"{name} has more than {_CONFIG_VALUES:,} values with its aliases expanded")
 
 
 def as_dict(options: Any) -> dict[str, Any]:
@@ -145,15 +194,15 @@ def as_dict(options: Any) -> dict[str, Any]:
     return plain
 
 
-def _add_options(parser: ArgumentParser, group: Any, options: type) -> None:
+def _add_options(parser: ArgumentParser, group: Any, options: type, full: bool) -> None:
     hints, (_, help_) = get_type_hints(options), _documentation(options)
     for f in fields(options):
         hint = hints[f.name]
         if "fields_of" in f.metadata:
-            _add_fields(group, f.metadata["fields_of"])
+            _add_fields(group, f.metadata["fields_of"], full)
         elif is_dataclass(hint) and isinstance(hint, type):
             title = (_documentation(hint)[0] or "").splitlines()[0].rstrip(".")
-            _add_options(parser, parser.add_argument_group(title), hint)
+            _add_options(parser, parser.add_argument_group(title), hint, full)
         else:
             names, how = _form(f, hint)
             group.add_argument(*names, help=help_.get(f.name, ""), **how)
@@ -185,7 +234,7 @@ def _form(f: Field[Any], hint: Any) -> tuple[list[str], dict[str, Any]]:
     return [name], how | ({"required": True} if default is MISSING else {})
 
 
-def _add_fields(group: Any, wanted: _Fields) -> None:
+def _add_fields(group: Any, wanted: _Fields, full: bool) -> None:
     """An option for every field of a settings class, and of the settings classes in it."""
     hints, (_, help_) = get_type_hints(wanted.config), _documentation(wanted.config)
     for f in fields(wanted.config):
@@ -193,7 +242,7 @@ def _add_fields(group: Any, wanted: _Fields) -> None:
             continue
         if (section := _section(hints[f.name])) is not None:
             absent = wanted.unset or _default(f) is None
-            _add_fields(group, _Fields(section, f"{wanted.prefix}{f.name}.", unset=absent))
+            _add_fields(group, _Fields(section, f"{wanted.prefix}{f.name}.", unset=absent), full)
             continue
         parts = get_args(hints[f.name]) if get_origin(hints[f.name]) in (Union, types.UnionType) else (hints[f.name],)
         parts += (types.NoneType,) if wanted.unset else ()
@@ -201,10 +250,11 @@ def _add_fields(group: Any, wanted: _Fields) -> None:
         kind = reduce(or_, sorted(dict.fromkeys(parts), key=lambda part: part is str))
         how = {"choices": f.metadata["choices"]} if "choices" in f.metadata and not wanted.unset else {"type": kind}
         name = wanted.prefix + f.name
+        text = " ".join(text for text in (help_.get(f.name), _range(f)) if text)
         group.add_argument(
             f"--{name if '.' in name else name.replace('_', '-')}",
             default=None if wanted.unset else wanted.defaults.get(f.name, _default(f)),
-            help=" ".join(text for text in (help_.get(f.name), _range(f)) if text),
+            help=text if full or "." not in name else SUPPRESS,
             **how,
         )
 

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
 
 class Bars:
-    """A progress bar for each stage of a run, or for each running sequence."""
+    """A progress bar for each stage of a run, or for each running sequence. Where standard error is no terminal, a line
+    at the start and the end of each stage instead."""
 
     def __init__(self) -> None:
         self._bars: dict[str, Any] = {}
@@ -27,7 +28,11 @@ class Bars:
             self._close()
             first = progress.done if progress.components is None and stage == "frames" else 0
             unit = "frame" if stage == "frames" else "step"
-            bar = tqdm(total=progress.total, initial=first, desc=stage, unit=unit, dynamic_ncols=True)
+            # None: no bar where standard error is no terminal
+            how = {"unit": unit, "dynamic_ncols": True, "disable": None}
+            bar = tqdm(total=progress.total, initial=first, desc=stage, **how)
+            if bar.disable:
+                self.say(f"{stage}: {progress.done} of {progress.total}")
             if stage == "kernels":
                 bar.set_postfix_str("compiled on the first run")
             self._bars = {stage: bar}
@@ -37,6 +42,8 @@ class Bars:
             skipped = {"skipped": progress.skipped} if progress.skipped else {}
             bar.set_postfix(K=progress.components, refresh=False, **skipped)
         bar.update(progress.done - bar.n)
+        if bar.disable and progress.done == progress.total:
+            self.say(f"{stage}: done, {progress.total} of {progress.total}")
 
     def frames(self, label: str, done: int, total: int) -> None:
         """Bring the bar of a sequence's frames up to date; it goes when they are done."""

@@ -138,7 +138,7 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
         hints: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in given.items()}
         sweep = tuple(dict.fromkeys(_sweep(values)))
         return Suite(values.get("name", own), values.get("title", own), rows, sweep, **hints)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{name}: {error}") from error
 
 

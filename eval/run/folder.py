@@ -71,7 +71,7 @@ class FolderKind:
             if manifest["program"] != self.program or manifest["format"] != self.format:
                 raise ValueError(f"made by {manifest['program']}, format {manifest['format']}")
             return dict(manifest)
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             article = "an" if self.noun[0] in "aeiou" else "a"
             text = f"--resume: {path} is not {article} {self.noun}'s that can be continued ({error})"
             raise FolderError(text) from error
@@ -85,7 +85,7 @@ class FolderKind:
         if known and self.format is None:
             try:
                 content = json.loads((out / self.manifest).read_text(encoding="utf-8"))
-            except (OSError, ValueError):
+            except (OSError, ValueError, RecursionError):
                 content = None
             known = isinstance(content, dict) and content.get("program") == self.program
             state = content.get("state", "") if known else ""

@@ -116,6 +116,8 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
     anchors, statistics = row.anchors, row.statistics
     if anchors is None or statistics is None or row.anchored is None or row.bias is None:
         return {}
+    assert statistics.anchors is not None
+    assert statistics.anchors_used is not None
     used, usable = int(statistics.anchors_used[0]), int(statistics.anchors[0])
     counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
     return {

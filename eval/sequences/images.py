@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 import struct
-import zipfile
 from collections.abc import Iterable
 from contextlib import redirect_stdout, suppress
 from functools import lru_cache, partial
@@ -20,6 +19,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from ufmstar_torch.array_files import read_npy, read_npz
 from ufmstar_torch.eval.sequences.frame import Entry, Frame, FrameError, Loader, Size, Skipped
 from ufmstar_torch.optional import optional
 
@@ -89,12 +89,12 @@ def read_map(path: str | Path, key: str) -> tuple[np.ndarray, float | None]:
         if suffix == ".exr":
             values = _read_exr(path)
         elif suffix == ".npy":
-            values = np.load(path, allow_pickle=False)
+            values = read_npy(path)
         elif suffix == ".npz":
-            values = _from_npz(path, key)
+            (values,) = read_npz(path, [key], or_single=True)
         else:
             values, scale = _from_image(path)
-    except (*_BROKEN_IMAGE, zipfile.BadZipFile, KeyError) as error:
+    except _BROKEN_IMAGE as error:
         raise FrameError(path, f"cannot be decoded: {error}") from error
     if values.ndim == 3 and 1 in (values.shape[0], values.shape[-1]):
         values = values[0] if values.shape[0] == 1 else values[..., 0]
@@ -218,15 +218,6 @@ def _from_image(path: Path) -> tuple[np.ndarray, float | None]:
         text = image.info.get(SCALE_KEY)
         values = np.array(image)
     return values, None if text is None else float(text)
-
-
-def _from_npz(path: Path, key: str) -> np.ndarray:
-    # Opened here: given a path, NumPy leaves the file open when the archive turns out to be broken.
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-        names = archive.files
-        if key not in names and len(names) != 1:
-            raise KeyError(f"expected the key {key!r} or a single array, got {names}")
-        return archive[key if key in names else names[0]]
 
 
 def _read_exr(path: Path) -> np.ndarray:

@@ -45,7 +45,7 @@ def read_records(content: bytes, file: Path) -> list[dict]:
     for number, line in enumerate(content.splitlines(), start=1):
         try:
             records.append(json.loads(line))
-        except ValueError:
+        except (ValueError, RecursionError):
             records.append(None)
         if not _is_record(records[-1]):
             shown = line[:60].decode(errors="replace")

@@ -32,6 +32,9 @@ _SAME_TIME = 1e-3
 # An image between samples that are too far apart, or outside the trajectory, takes a sample this close as it is [s]:
 # a camera at 1 m/s is 5 mm away from it.
 _NEAREST = 5e-3
+# Two poses with one timestamp are alike up to this distance [the poses' unit], or the median step between samples if
+# that is larger (rounded timestamps), and this angle [degrees].
+_SAME_PLACE, _SAME_DIRECTION = 0.01, 2.0
 # printf on Windows writes NaN and infinity as 1.#IND, 1.#QNAN, 1.#INF.
 _WINDOWS_NON_FINITE = re.compile(r"[+-]?1\.?#(IND|QNAN|SNAN|INF)\d*", re.IGNORECASE)
 
@@ -74,11 +77,12 @@ class Trajectory:
 def read_trajectory(path: str | Path) -> Trajectory:
     """Reads a trajectory in any of the formats of this module; ``#`` starts a comment.
 
-    Samples are sorted by time; of two with the same timestamp the first is kept.
+    Samples are sorted by time; of two alike with the same timestamp the first is kept.
 
     Raises:
         ValueError: a line (named by file and number) is no pose of a known format, the number of columns
-            changes, a quaternion's norm is not 1, a bottom row is not 0 0 0 1; or there is no pose at all.
+            changes, a quaternion's norm is not 1, a bottom row is not 0 0 0 1, two poses with one timestamp contradict
+            each other; or there is no pose at all.
     """
     rows, lines = _numbers(path)
     for row, where in zip(rows, lines, strict=True):
@@ -100,8 +104,9 @@ def read_trajectory(path: str | Path) -> Trajectory:
             raise ValueError(f"{lines[bad[0]]}: the timestamp must be finite, got {timestamps[bad[0]]}")
     T_world_cam = _poses_from_columns(values, lines)
     if timestamps is not None:
-        timestamps, first = np.unique(timestamps, return_index=True)
-        T_world_cam = T_world_cam[first]
+        stamps, first, same = np.unique(timestamps, return_index=True, return_inverse=True)
+        _require_consistent(T_world_cam, first, same, lines)
+        timestamps, T_world_cam = stamps, T_world_cam[first]
     return Trajectory(timestamps, T_world_cam)
 
 
@@ -216,6 +221,31 @@ def _poses_from_columns(values: np.ndarray, lines: list[str]) -> np.ndarray:
     T[finite, :3] = rows[finite, :3]
     T[finite, 3] = [0, 0, 0, 1]
     return T
+
+
+def _require_consistent(T_world_cam: np.ndarray, first: np.ndarray, same: np.ndarray, lines: list[str]) -> None:
+    """Raise ValueError where poses [N, 4, 4] with one timestamp contradict each other.
+
+    Args:
+        T_world_cam: in the order of the file.
+        first: [M] index of each timestamp's first pose.
+        same: [N] which of the M timestamps a pose has.
+        lines: FILE:LINE of each pose.
+    """
+    kept = T_world_cam[first]
+    step = np.linalg.norm(np.diff(kept[:, :3, 3], axis=0), axis=1)
+    step = step[np.isfinite(step)]
+    apart = max(_SAME_PLACE, float(np.median(step)) if step.size else 0.0)
+    distance = np.linalg.norm(T_world_cam[:, :3, 3] - kept[same, :3, 3], axis=1)
+    cosine = (np.einsum("nij,nij->n", T_world_cam[:, :3, :3], kept[same, :3, :3]) - 1) / 2
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    bad = np.flatnonzero((distance > apart) | (angle > _SAME_DIRECTION))
+    if bad.size:
+        i = bad[0]
+        raise ValueError(
+            f"{lines[i]}: the pose has the timestamp of line {lines[first[same[i]]].rpartition(':')[2]}, but lies "
+            f"{distance[i]:.3g} and {angle[i]:.3g} degrees from it ({bad.size} such poses); leave one of each out"
+        )
 
 
 def _numbers(path: str | Path) -> tuple[list[list[float]], list[str]]:

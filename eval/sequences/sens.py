@@ -42,6 +42,7 @@ _FRAME = np.dtype([("T_world_cam", *_MATRIX), ("times", "<u8", 2), ("bytes", "<u
 _BYTES_PER_DEPTH = 2
 _MAX_NAME = 10_000  # [bytes] a longer sensor name is no name: the file is something else
 _MAX_FRAMES = 10_000_000  # 92 hours at 30 Hz: more is a broken header
+_MAX_PIXELS = 100_000_000  # of a depth map
 _MICROSECOND = 1e-6
 
 
@@ -96,7 +97,12 @@ def _read_header(file: BinaryIO, path: Path) -> np.void:
     header = np.frombuffer(_take(file, path, _HEADER.itemsize), _HEADER)[0]
     (color_w, color_h), (depth_w, depth_h) = header["color_size"], header["depth_size"]
     frames, units = header["frames"], header["units_per_metre"]
-    if min(color_w, color_h, depth_w, depth_h) == 0 or not 1 <= units < np.inf or frames > _MAX_FRAMES:
+    if (
+        not 0 < int(depth_w) * int(depth_h) <= _MAX_PIXELS
+        or min(color_w, color_h) == 0
+        or not 1 <= units < np.inf
+        or frames > _MAX_FRAMES
+    ):
         raise ValueError(
             f"{path}: broken header: {frames} frames, images of {color_w}x{color_h}, depth of {depth_w}x{depth_h}, "
             f"{units:g} units per metre"
@@ -157,12 +163,16 @@ def _read_color(path: Path, offset: int, size: int) -> np.ndarray:
 def _read_depth(path: Path, offset: int, size: int, shape: Size, scale: float) -> np.ndarray:
     """[H, W] float32 [m], 0 = invalid."""
     try:
-        data = zlib.decompress(_bytes(path, offset, size))
+        stream, most = zlib.decompressobj(), _BYTES_PER_DEPTH * shape[0] * shape[1]
+        data = stream.decompress(_bytes(path, offset, size), most + 1)
     except zlib.error as error:
         raise FrameError(path, f"the depth map at byte {offset} cannot be decoded: {error}") from error
-    if len(data) != _BYTES_PER_DEPTH * shape[0] * shape[1]:
+    if not stream.eof and len(data) <= most:
+        raise FrameError(path, f"the depth map at byte {offset} cannot be decoded: it is cut off")
+    if len(data) != most:
+        has = f"more than {most}" if len(data) > most else f"{len(data)}"
         expected = f"{shape[1]}x{shape[0]} of {_BYTES_PER_DEPTH}"
-        raise FrameError(path, f"the depth map at byte {offset} has {len(data)} bytes, expected {expected}")
+        raise FrameError(path, f"the depth map at byte {offset} has {has} bytes, expected {expected}")
     return (np.frombuffer(data, "<u2").reshape(shape) * scale).astype(np.float32)
 
 

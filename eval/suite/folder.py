@@ -129,7 +129,7 @@ class EvalFolder:
             failure = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return None
-        except ValueError:
+        except (ValueError, RecursionError):
             return {"reason": f"{path} cannot be read", "rows": []}
         return failure if isinstance(failure, dict) else None
 

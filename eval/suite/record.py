@@ -47,7 +47,7 @@ class Record:
         """Read one. Raises ValueError: the file is not a record of this format; the message names it."""
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{path} is not a record: {error}") from error
         names = {f.name for f in fields(cls)}
         if not isinstance(values, dict) or values.pop("format", None) != FORMAT or values.keys() != names:

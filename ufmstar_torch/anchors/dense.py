@@ -117,7 +117,8 @@ class DenseEvidence(SavedState):
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Continue where :meth:`state` was taken; ValueError: another number of keyframes or landmarks."""
-        for part in (super(), self._keyframes, self._memory, self._errors):
+        super().load_state(state)
+        for part in (self._keyframes, self._memory, self._errors):
             part.load_state(state)
 
     def update(

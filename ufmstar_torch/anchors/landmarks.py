@@ -18,6 +18,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker
+from ufmstar_torch.array_files import read_npz
 from ufmstar_torch.camera import invert_rigid
 
 CORNERS, DENSE = "corners", "dense"
@@ -130,9 +131,9 @@ class LandmarkMap:
                 f"anchors: {str(path)!r} is neither {CORNERS!r}, {DENSE!r} nor a file {', '.join(FILE_TYPES)}"
             )
         try:
-            points, sigma = _read_npz(path) if path.suffix.lower() == ".npz" else _read_text(path)
+            points, sigma = read_npz(path, ["points", "sigma"]) if path.suffix.lower() == ".npz" else _read_text(path)
             return cls(points, sigma)
-        except (ValueError, KeyError) as error:
+        except (ValueError, TypeError) as error:
             raise ValueError(f"{path}: expected landmarks x y z sigma [m]: {error}") from error
 
     @property
@@ -199,13 +200,6 @@ class LandmarkMap:
         """
         if state:
             raise ValueError(f"state must be empty for a map of landmarks, got {sorted(state)}")
-
-
-def _read_npz(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    with np.load(path) as stored:
-        if not {"points", "sigma"} <= set(stored.files):
-            raise ValueError(f"the arrays must be 'points' [P, 3] and 'sigma' [P], got {sorted(stored.files)}")
-        return stored["points"], stored["sigma"]
 
 
 def _read_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -21,7 +21,7 @@ import logging
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numba
 from numba import njit, types
@@ -29,6 +29,7 @@ from numba.core import caching, cgutils, codegen, compiler, typed_passes, untype
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.extending import intrinsic, register_jitable
 from numba.np.arrayobj import get_itemsize, make_array, populate_array
+from numpy.typing import NDArray
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _PASSES = (
@@ -234,13 +235,13 @@ reordered_leaf = _inner(_nrt=False, fastmath=_ANY_ORDER)
 
 
 @intrinsic
-def empty(typing, shape, dtype):
+def _empty(typing, shape, dtype):
     """``np.empty(shape, dtype)``, which itself takes .1 s to compile for every kind of array, ``np.zeros`` .3 s."""
     return _array_type(shape, dtype)(shape, dtype), _allocated
 
 
 @intrinsic
-def zeros(typing, shape, dtype):
+def _zeros(typing, shape, dtype):
     """``np.zeros(shape, dtype)``."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -251,6 +252,11 @@ def zeros(typing, shape, dtype):
         return value
 
     return _array_type(shape, dtype)(shape, dtype), generate
+
+
+# As a type checker sees them from a kernel, where the typing context is not an argument.
+empty: Callable[..., NDArray[Any]] = cast(Any, _empty)
+zeros: Callable[..., NDArray[Any]] = cast(Any, _zeros)
 
 
 def _array_type(shape: Any, dtype: Any) -> types.Array:

@@ -196,7 +196,8 @@ def _prior(grid: _Grid, running: _Running) -> Prior:
     amplitude = running.ratios["amplitude"]
     diagonal = np.full(len(grid.log_depth), running.config.precision / amplitude)
     right, down = 1 / (grid.right * amplitude), 1 / (grid.down * amplitude)
-    return Prior(diagonal, right, down, mean, np.linalg.inv(covariance), grid.cols)
+    precision: Floats = np.linalg.inv(covariance).astype(np.float64)
+    return Prior(diagonal, right, down, mean, precision, grid.cols)
 
 
 def _fitted(scene: _Scene) -> tuple[Field, _LeftOut, Floats]:

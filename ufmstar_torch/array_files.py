@@ -1,0 +1,69 @@
+"""NumPy's files of unknown origin: damaged ones are named, and none allocates more than a fixed number of bytes."""
+
+from __future__ import annotations
+
+import lzma
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Sequence
+from math import prod
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+LARGEST = 2**30  # [bytes] of an array; a depth map of 8192 x 8192 values of float64 has half of them
+# Raised by NumPy and zipfile for damaged files, RuntimeError with NotImplementedError and RecursionError.
+_DAMAGED = (
+    *(OSError, EOFError, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError, SyntaxError, MemoryError),
+    *(struct.error, tokenize.TokenError, zlib.error, lzma.LZMAError, zipfile.BadZipFile),
+)
+
+
+def read_npy(path: str | Path) -> NDArray[Any]:
+    """The array of a .npy file. Nothing is unpickled.
+
+    Raises:
+        OSError: the file cannot be opened.
+        ValueError: it is damaged, its header states more data than it holds, or more than ``LARGEST`` bytes; the
+            message names the file.
+    """
+    with Path(path).open("rb") as file:
+        try:
+            return _array(file, Path(path).stat().st_size)
+        except _DAMAGED as error:
+            raise ValueError(f"{path} is no readable .npy file: {error}") from error
+
+
+def read_npz(path: str | Path, names: Sequence[str], *, or_single: bool = False) -> list[NDArray[Any]]:
+    """The arrays ``names`` of a .npz file; with ``or_single``, its only array whatever its name. Errors as
+    :func:`read_npy`; also ValueError: an array is not in the file."""
+    with Path(path).open("rb") as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+                names = list(members) if or_single and len(members) == 1 else names
+                if missing := [name for name in names if name not in members]:
+                    raise ValueError(f"expected the arrays {', '.join(missing)}, got {', '.join(sorted(members))}")
+                arrays = []
+                for name in names:
+                    with archive.open(members[name]) as member:  # ends after file_size bytes, whatever it expands to
+                        arrays.append(_array(cast(BinaryIO, member), members[name].file_size))
+                return arrays
+        except _DAMAGED as error:
+            raise ValueError(f"{path} is no readable .npz file: {error}") from error
+
+
+def _array(file: BinaryIO, size: int) -> NDArray[Any]:
+    """The array of an open .npy file of ``size`` bytes, of which the header is read first."""
+    version = npy.read_magic(file)
+    header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, _, dtype = header(file)
+    stated = prod(shape) * dtype.itemsize
+    if min(shape, default=0) < 0 or not 0 <= stated <= min(LARGEST, size - file.tell()):
+        raise ValueError(f"its header states {list(shape)} values of {dtype}; it holds {size:,} bytes")
+    file.seek(0)
+    return cast("NDArray[Any]", npy.read_array(file, allow_pickle=False))
