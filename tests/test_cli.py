@@ -131,6 +131,7 @@ MISTAKES = {
     "device": ("--depth self --device abacus", "--device abacus"),
     "no data": ("--depth self --device meta", "--device meta is not"),
     "threads": ("--depth self --threads 0", "--threads"),
+    "threads without measure": ("--depth self --threads 10000", "--threads must be 1 to"),
     "contradiction": ("--depth self --resume --overwrite", "--resume and --overwrite contradict"),
     "another command": ("ufmstar bench --frames x", "frames"),
     "report": ("ufmstar report", "out"),

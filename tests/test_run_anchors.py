@@ -78,9 +78,8 @@ def test_a_run_with_maps_equals_a_loop_by_hand(tour, finished):
     out, summary = finished
     ufm, tracker, expected = UfMStar(ON), LandmarkTracker(), []
     for frame, record in zip(tour, records(out), strict=True):
-        actual = too_far(frame)
         landmarks = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
-        K, depth, a = (torch.from_numpy(x)[None] for x in (actual.intrinsics, actual.depth, actual.variance))
+        depth, a, K = (torch.from_numpy(x)[None] for x in too_far(frame))
         anchors = landmarks.anchors(frame.intrinsics, K)
         result = ufm(depth, torch.from_numpy(frame.T_world_cam)[None], K, a, anchors=anchors)
         stored = read_frame(out / "frames" / f"{frame.name}.npz")

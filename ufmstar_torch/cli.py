@@ -6,6 +6,7 @@ returns the exit code. It is imported when it is called, so that help and errors
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -35,6 +36,9 @@ ufmstar COMMAND --help shows a command's options, ufmstar --version the version.
 """
 # What a network, a file or a full disk may raise. A user gets one line, and the traceback with --debug.
 _FAILURES = (ImportError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
+
+# OpenMP starts as many threads as it is told; thousands of them stall the machine and crash torch.
+_MOST_THREADS = 64
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -88,12 +92,14 @@ def _set_up(options: Any) -> None:
     """Check the options ``device`` and ``threads``, where a command has them, and set torch's CPU threads.
 
     Raises:
-        ValueError: there is no such device, or the number of threads is not positive.
+        ValueError: there is no such device, or the number of threads is not positive or absurd.
     """
     threads, device = getattr(options, "threads", None), getattr(options, "device", None)
     if threads is not None:
         if threads < 1:
             raise ValueError(f"--threads must be at least 1, got {threads}")
+        if threads > (most := max(_MOST_THREADS, os.cpu_count() or 1)):
+            raise ValueError(f"--threads must be 1 to {most}, got {threads}")
         import torch
 
         torch.set_num_threads(threads)  # and with them those of the compiled kernels
