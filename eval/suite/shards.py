@@ -137,6 +137,9 @@ def run_pool(
     pool = ProcessPoolExecutor(processes, spawn, initializer=_begin, initargs=(parent_alive, threads))
     try:
         waiting = {pool.submit(task, item) for item in items}
+        # Python's pool does not watch the process that it started last until the next submission wakes it: without
+        # this one, nobody would notice that the process was killed.
+        pool.submit(os.getpid)
         while waiting and not stop():
             done, waiting = wait(waiting, _POLL_SECONDS, FIRST_COMPLETED)
             for line in filter(None, [one.result() for one in done]):
