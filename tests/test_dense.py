@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -32,26 +33,27 @@ def test_after_a_jump_of_the_poses_landmarks_from_before_are_not_believed(tour):
     assert np.median(counts[-14:]) > 40, "evidence comes back"
 
 
-def wrong_focal_length(frames):
+def wrong_focal_length(frames, seed):
     return [replace(f, intrinsics=f.intrinsics * np.array([[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]])) for f in frames]
 
 
-def noisy(frames):
-    setting = Setting(rotation_noise=0.1, translation_noise=0.003)
+def noisy(frames, seed):
+    setting = Setting(rotation_noise=0.1, translation_noise=0.003, seed=seed)
     return [replace(f, T_world_cam=perturbed(f.T_world_cam, setting, f.index)) for f in frames]
 
 
-def drifting(frames):
-    walked = Drift(Setting(rotation_drift=0.05, translation_drift=0.002))
+def drifting(frames, seed):
+    walked = Drift(Setting(rotation_drift=0.05, translation_drift=0.002, seed=seed))
     return [replace(f, T_world_cam=walked.of(f.T_world_cam, f.index)) for f in frames]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("disturbed", [noisy, drifting, wrong_focal_length])
-def test_on_worse_recordings_errors_are_as_large_as_stated(disturbed):
+@pytest.mark.parametrize(("disturbed", "seeds"), [(noisy, 6), (drifting, 6), (wrong_focal_length, 1)])
+def test_on_worse_recordings_errors_are_as_large_as_stated(disturbed, seeds):
+    # One walk of drift decides between .9 and 1.8, and a last place of rounding moves it by .2: the mean is over several.
     middle, outliers = [], []
-    for frames in long_walks():
-        results = run(DenseEvidence(), disturbed(frames))
+    for frames, seed in itertools.product(long_walks(), range(seeds)):
+        results = run(DenseEvidence(), disturbed(frames, seed))
         sizes = np.concatenate([surprise(frame, result) for frame, result in zip(frames, results, strict=True)])
         assert len(sizes) > 90 * len(frames)
         middle.append(np.median(sizes) / 0.674)

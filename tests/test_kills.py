@@ -32,7 +32,7 @@ methods = ["DepthOnly", "UfM-DepthOnly", "UfM*-DepthOnly"]
 """
 TRAINING = (
     "--preset fastdepth-ensemble --members 2 --data sequences --part 0:12 --validation-part 12:16 --epochs 2 "
-    "--batch-size 4 --network.widths 0.05 --network.size [32,32] --network.preprocess resize --checkpoint-every 2"
+    "--batch-size 4 --network.widths 0.05 --network.size [32,32] --network.preprocess resize"
 )
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
