@@ -50,7 +50,7 @@ def drifting(frames, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize(("disturbed", "seeds"), [(noisy, 6), (drifting, 6), (wrong_focal_length, 1)])
 def test_on_worse_recordings_errors_are_as_large_as_stated(disturbed, seeds):
-    # One walk of drift decides between .9 and 1.8, and a last place of rounding moves it by .2: the mean is over several.
+    # One drift gives .9 to 1.8, and rounding in the last place moves it by .2: the mean is over several.
     middle, outliers = [], []
     for frames, seed in itertools.product(long_walks(), range(seeds)):
         results = run(DenseEvidence(), disturbed(frames, seed))
