@@ -66,4 +66,5 @@ def _array(file: BinaryIO, size: int) -> NDArray[Any]:
     if min(shape, default=0) < 0 or not 0 <= stated <= min(LARGEST, size - file.tell()):
         raise ValueError(f"its header states {list(shape)} values of {dtype}; it holds {size:,} bytes")
     file.seek(0)
-    return cast("NDArray[Any]", npy.read_array(file, allow_pickle=False))
+    array: NDArray[Any] = npy.read_array(file, allow_pickle=False)
+    return array

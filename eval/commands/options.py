@@ -125,9 +125,9 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
     class BoundedConfigFile(ActionConfigFile):
         """Check the size and nesting of a configuration before it is parsed."""
 
-        def __call__(self, parser: Any, values: Any, content: str, option: str | None = None) -> None:
-            _require_bounded(content)
-            super().__call__(parser, values, content, option)
+        def __call__(self, parser: Any, cfg: Any, values: Any, option_string: Any = None) -> None:
+            _require_bounded(values)
+            super().__call__(parser, cfg, values, option_string)
 
     class Formatter(DefaultHelpFormatter):
         """Of a flag, the default would be the field's: --no-register has (default: True) otherwise."""
