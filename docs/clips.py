@@ -1,4 +1,4 @@
-"""What the scripts of docs/results/disagreement.md share: predictions of a sequence, variances, their figures."""
+"""Predictions, variances and figures of a sequence, used by the scripts of docs/results/disagreement.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the variances of UfM and UfM* are worth beside variances that know nothing, and where they miss the error.
+"""Compares the variances of UfM and UfM* with constant and random ones, and shows where they miss the error.
 
     python docs/measure_disagreement.py baselines --root ../shared
     python docs/measure_disagreement.py regions --root ../shared

@@ -1,4 +1,4 @@
-"""What each constant of the posterior does, on rendered tours with networks that are wrong in three ways.
+"""Measures the effect of each constant of the posterior on rendered tours with networks that are wrong in three ways.
 
     python docs/measure_posterior.py --weights fastdepth_nyu.onnx
 
@@ -51,7 +51,7 @@ STUDENT = 2.571  # 97.5 % quantile for six tours
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What the posterior is given of a frame, with anchors by evidence, and the truth [h, w] [m]."""
+    """One frame's input of the posterior, its anchors by source of evidence, and the true depth [h, w] [m]."""
 
     frame: FrameInput
     anchors: Mapping[str, AnchorInput]

@@ -117,7 +117,7 @@ def load_exported(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
     declared = ProgramSpec.required(spec)
     try:
         program = torch.export.load(_checked_copy(_existing(path))).module()
-    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, NotImplementedError, BadZipFile) as error:
+    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, BadZipFile) as error:
         raise ValueError(
             f"{path} is not a readable torch.export file: {error}; expected what torch.export.save of a compatible "
             f"torch writes (this one is {torch.__version__}): export the network again"

@@ -103,7 +103,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: onnx({"outputs": METRIC, "preprocess": {"resize": 3}}), r"Preprocess has no \['resize'\]"),
     (lambda: OutputSpec("metric", focal=0.0), "focal"),
     (lambda: wrap_network(Linear(), inverse=True), "declared 'inverse', but UfM"),
-    (lambda: wrap_network("weights.pth"), "network .*got str"),  # type: ignore[arg-type]
+    (lambda: wrap_network("weights.pth"), "network .*got str"),
     (lambda: wrap_network(lambda x: x[:, 0], "metric")(IMAGE), "no output 'metric'"),
     (lambda: named(IMAGE), r"returns \['a', 'b'\]; declare"),
     (lambda: wrap_network(lambda x: x[:, 0, :3])(IMAGE), "output 'depth' has"),

@@ -79,7 +79,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: settings(max_minutes=NAN), "max_minutes"),
     (lambda: loss_of(PointDepth(MAP), MAP, MAP), "valid"),
     (lambda: loss_of(PointDepth(MAP), MAP[:1], MAP > 0), "target"),
-    (lambda: loss_of(MAP, MAP, MAP > 0), "distribution"),  # type: ignore[arg-type]
+    (lambda: loss_of(MAP, MAP, MAP > 0), "distribution"),
     (lambda: loss(evidence_weight=-1.0), "evidence_weight"),
     (lambda: loss(beta_nll=2.0), "beta_nll"),
 ]

@@ -31,7 +31,7 @@ Total = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Columns:
-    """What is regressed beside H, C numbers a component.
+    """Columns that are regressed beside H, C numbers a component.
 
     Attributes:
         values: [B, K, C], 0 for the prior.
@@ -63,7 +63,7 @@ class FrameExtension:
             mixture_cam: after the fusion.
             distribute: sums values at points by component (:func:`ufmstar_torch.regress.distribute`).
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} states columns, but does not compute them")
 
     def in_view(self, tensors: Tensors, capacity: int, slots: Any, seen: Any, views: Any) -> Columns | None:
         """Like :meth:`before_regression` for the compiled step, where it has a faster way (None: it has none): the

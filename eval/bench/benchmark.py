@@ -1,4 +1,4 @@
-"""``ufmstar bench``: UfM*, with anchors and with the posterior, beside a network's forward pass, on the same frames."""
+"""``ufmstar bench``: times UfM*, plain, anchored and with the posterior, and a network on the same frames."""
 
 from __future__ import annotations
 

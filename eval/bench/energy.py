@@ -81,7 +81,7 @@ def _open(gpu: int | None) -> Any:
 
 
 def difference(part: Energy, other: Energy) -> Energy:
-    """What a part takes beyond another one, window by window."""
+    """Subtract one part's energy from another's, window by window; a reason for a missing value is passed on."""
     return part if isinstance(part, str) else other if isinstance(other, str) else part - other
 
 

@@ -149,8 +149,8 @@ def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
 
 
 def over_sequences(measured: Mapping[tuple[str, str], Mapping[str, Any]]) -> dict[str, Any]:
-    """What :func:`measure` returned for every (data set, sequence) as one: every number is the mean over the sequences,
-    and "sequences" has what uncertainty costs on each of them, for intervals.
+    """Average the results of :func:`measure` over sequences, by (data set, sequence): every number is the mean, and
+    "sequences" has what uncertainty costs on each of them, for intervals.
 
     Of each sequence and row: "energy_mj", gross, of uncertainty in the network and of the multiview step [mJ]; None
     where a part was not measured.

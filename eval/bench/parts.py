@@ -59,7 +59,7 @@ class _Replay(nn.Module):
 
 
 class MultiviewStep:
-    """UfM or UfM* of a row on a device, with a state of its own; UfM* with the landmarks and the posterior of the row.
+    """Runs one row's UfM or UfM* on a device; UfM* includes the row's landmarks and posterior.
 
     A row whose variance leaves A and E aside gets the depth alone.
     """
@@ -111,7 +111,7 @@ class MultiviewStep:
 
 @dataclass
 class TimedParts:
-    """What was run and its times.
+    """A measured row and its times.
 
     Attributes:
         warm_up: frames at the beginning that are not counted.

@@ -11,7 +11,7 @@ ARCHITECTURES = ("fastdepth", "monodepth2")  # that are timed with random weight
 
 @dataclass(frozen=True, kw_only=True)
 class BenchSettings:
-    """Time UfM*, with anchors and with the posterior, beside a depth network, on the same frames.
+    """Measure the time of UfM* (plain, anchored, with the posterior) and of a depth network on the same frames.
 
     With --weights, the network predicts the depth. Without, it has random weights, and UfM* gets the rendered depth
     with smooth errors of 3 %. Times depend on the machine and on its other load: compare ratios.

@@ -149,7 +149,7 @@ def _remedies(check: SequenceCheck, sequence: FrameSequence, path: str | Path, o
 
 
 def _scale_remedy(factor: float, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> str:
-    """What brings depth and positions to one scale: depth times ``factor``."""
+    """The change that brings depth and positions to one scale: depth times ``factor``."""
     positions = f"divide the positions of the poses by {factor:.4g}"
     if options.get("trajectory") is not None:
         return f"a single camera's trajectory has no scale: {positions}"

@@ -1,4 +1,4 @@
-"""What an evaluation would do: its rows, its sequences, and how large the cache of predictions gets."""
+"""Describes an evaluation without running it: its rows, its sequences, and how large the cache of predictions gets."""
 
 from __future__ import annotations
 

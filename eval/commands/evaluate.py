@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteOptions:
-    """What is evaluated.
+    """Evaluate the rows of a suite on sequences.
 
     Attributes:
         suite: name of a suite (see --list), or a TOML file of your own

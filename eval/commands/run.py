@@ -155,7 +155,7 @@ class RunOptions:
         return UfMStarConfig.from_dict(chosen.ufm | sections)
 
     def settings(self) -> dict[str, Any]:
-        """What is run, as plain values that a configuration file may hold: not how it is started."""
+        """Return the options that define the result, as plain values of a configuration file."""
         started = ("resume", "overwrite", "debug")
         plain = {name: value for name, value in as_dict(self).items() if name not in started}
         sections = ("anchors", "posterior", "merge")

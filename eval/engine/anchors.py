@@ -152,7 +152,7 @@ class AnchorSource:
 
 
 def landmarks_of(value: str | bool, folder: Path | None) -> LandmarkSource:
-    """What yields the landmarks of a sequence; True, "corners" and "tracked" mean tracked corners, other values are as
+    """The source of landmarks of a sequence; True, "corners" and "tracked" mean tracked corners, other values are as
     ``landmark_source`` takes them. A file of landmarks lies in the sequence's folder or the working folder.
 
     Raises:

@@ -50,8 +50,8 @@ class Estimator(ABC):
         """
 
     def memory(self) -> dict[str, float]:
-        """What is kept for the next frame: "bytes" and "count" of points or components, "smoothing_bytes" of the map
-        kept for smoothing [B]; {} if nothing is. With anchors also "anchors", those used of the frame."""
+        """Size of the state: "bytes" and "count" of points or components, "smoothing_bytes" of the map kept for
+        smoothing [B]; {} if nothing is. With anchors also "anchors", those used of the frame."""
         return {}
 
     def state(self) -> dict[str, Tensor]:

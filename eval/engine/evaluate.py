@@ -131,7 +131,7 @@ def evaluate_sequence(
 
 
 def _result(row: Row, metrics: RowMetrics, accounts: _Accounts, left_out: Mapping[str, Any]) -> RowFigures:
-    """Of one row after the last frame. Raises SequenceError: it has judged nothing."""
+    """Compute one row's figures after the last frame. Raises SequenceError: no frame was judged."""
     key = row.slug
     frames = accounts.frames(key, metrics.judged[key])
     if not frames["judged"]:
@@ -188,7 +188,7 @@ class _Accounts(FrameSink):
         return {**counts, "reasons": dict(sorted(reasons.items()))}
 
     def state(self, key: str) -> dict[str, float]:
-        """What the method kept over the sequence, as ``Record`` has it."""
+        """The size of the method's state over the sequence, as ``Record`` has it."""
         state: dict[str, float] = {}
         for name, end in (self._memory[key][-1] if self._memory[key] else {}).items():
             values = [memory[name] for memory in self._memory[key]]
@@ -199,7 +199,7 @@ class _Accounts(FrameSink):
         return state
 
     def median_ms(self, key: str) -> dict[str, float]:
-        """Of the typical frame, by stage [ms]."""
+        """Median time of a frame by stage [ms]."""
         stages = ("network", "anchors", "uncertainty")
         times = {stage: [ms[stage] for ms in self._ms[key] if stage in ms] for stage in stages}
         return {stage: median(values) for stage, values in times.items() if values}

@@ -242,7 +242,7 @@ def load_members(
 
 
 def _run_by(members: Iterable[DepthNetwork], inference: Inference) -> dict[str, str]:
-    """What decides about the last bits of a prediction, for the identity: runtime and precision."""
+    """Settings that change the last bits of a prediction, for the identity: runtime and precision."""
     first = runtime_of(next(iter(members)), inference.precision)
     return {"runtime": first["name"], "precision": inference.precision}
 

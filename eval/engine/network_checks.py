@@ -69,7 +69,7 @@ def check_members(base: str, members: Sequence[DepthNetwork], device: torch.devi
 
 
 def _tried(member: DepthNetwork, device: torch.device) -> DepthPrediction:
-    """What it predicts for a grey image."""
+    """Its prediction for a grey image."""
     height, width = _PROBE
     K = torch.tensor([[[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]]], dtype=torch.float64)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""What depth sources predict for one frame: each inference is made once, and may be kept on disk."""
+"""Predictions of depth sources for one frame; each inference runs once and may be cached on disk."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class DepthSource(ABC):
 
     @property
     def runtime(self) -> Mapping[str, Any] | None:
-        """What runs the networks, for the record: name, version, threads, precision; None of maps."""
+        """The runtime of the networks, for the record: name, version, threads, precision; None of maps."""
         return None
 
     @abstractmethod
@@ -92,7 +92,7 @@ class DepthSource(ABC):
 
 @dataclass(frozen=True)
 class PredictionKey:
-    """What a prediction depends on."""
+    """All inputs that determine a prediction."""
 
     network: str  # digest of the network(s)
     sequence: str  # ``sequence_digest``
@@ -130,8 +130,8 @@ class FramePredictions:
         self._inferences: dict[tuple[object, int], Predicted] = {}
 
     def of(self, source: DepthSource, position: int, every: bool) -> Predicted:
-        """What a row gets that has used ``position`` images before: of all members, or of the one in turn. Raises
-        FrameError: the frame has nothing to predict from."""
+        """The prediction for a row that has used ``position`` images before: of all members, or of the one in turn.
+        Raises FrameError: the frame has nothing to predict from."""
         if every and source.passes > 1:
             member, passes = _ALL, range(source.passes)
         else:
@@ -145,7 +145,7 @@ class FramePredictions:
         return found
 
     def _inference(self, source: DepthSource, n: int) -> Predicted:
-        """Of member (or sample) n, made once whichever rows use it; the store keeps only what a row asked for."""
+        """Return the prediction of member (or sample) n; it is computed once and shared by all rows."""
         key = (source.digest or source, n)
         if key not in self._inferences:
             made = source.one(self.frame, n).to(self._device)

@@ -26,7 +26,7 @@ _IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drif
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RowResult:
-    """What a row makes of a frame: maps [h, w] on the CPU, and what they were made from."""
+    """One row's result for a frame: its maps [h, w] on the CPU, its prediction and its anchors."""
 
     depth: Tensor  # as predicted, or corrected by the anchors, where the row is about that [m]
     # total variance [m^2], NaN where not valid; None for a network that predicts depth alone.

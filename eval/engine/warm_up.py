@@ -1,4 +1,4 @@
-"""What a command will need of compiled kernels, compiled before its first frame (``ufmstar_torch.warm_up``)."""
+"""Compiles the kernels that a command needs before its first frame (``ufmstar_torch.warm_up``)."""
 
 from __future__ import annotations
 

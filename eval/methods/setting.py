@@ -1,4 +1,4 @@
-"""What is chosen and changed about a row: settings of UfM*, preprocessing, noise on poses, frames left out, anchors.
+"""The settings of a row: those of UfM*, preprocessing, noise on poses, frames left out, anchors.
 
 A setting's values have flat names: ``Setting``'s own fields, and those of ``UfMStarConfig``, as "segment.min_pixels".
 """
@@ -103,14 +103,14 @@ class Setting(Checked):
         return Setting, (dict(self.overrides), *(getattr(self, name) for name in _OWN))
 
     def to_dict(self) -> dict[str, Any]:
-        """What differs from the default, flat: {} for the row as it is."""
+        """The values that differ from the default, flat: {} for the row as it is."""
         own = {f.name: f.default for f in fields(self) if f.name not in ("overrides", "seed")}
         changed = {name: getattr(self, name) for name, plain in own.items() if getattr(self, name) != plain}
         return {**dict(self.overrides), **changed, **({"seed": self.seed} if self.draws else {})}
 
     @property
     def chosen(self) -> Setting:
-        """What is chosen and not varied: the preset and the preprocessing alone."""
+        """The values that are chosen and not varied: the preset and the preprocessing alone."""
         return Setting(ufm_preset=self.ufm_preset, preprocess=self.preprocess)
 
     @property
@@ -132,7 +132,7 @@ class Setting(Checked):
 
     @property
     def pose_noise(self) -> tuple[float, ...]:
-        """What decides how poses are disturbed: the size of each kind of noise, and the seed; () where they are not."""
+        """The size of each kind of noise on the poses, and the seed; () without noise."""
         sizes = tuple(getattr(self, name) for name in _OF_POSES)
         return (*sizes, self.seed) if any(sizes) else ()
 

@@ -80,7 +80,7 @@ class Suite:
 
     @property
     def bases(self) -> tuple[str, ...]:
-        """What networks the rows need, in their order."""
+        """The networks that the rows need, in their order."""
         return tuple(dict.fromkeys(row.method.base for row in self.rows))
 
     def with_bases(self, bases: Iterable[str]) -> Suite:

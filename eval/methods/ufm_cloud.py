@@ -49,7 +49,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class View:
-    """What a camera predicts, in one stream."""
+    """The prediction of one camera, in one stream."""
 
     depth: Tensor  # [H, W] [m], 0 where not valid
     variance: Tensor  # [H, W] s^2 [m^2] that the network itself states, 0 where it states none

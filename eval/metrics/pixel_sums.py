@@ -206,7 +206,7 @@ def log_bin(value: float, bins: int) -> int:
 
 @part
 def _entropy_bin(h: float, edges: Any) -> int:
-    """How many edges are at or below h."""
+    """The number of bin edges that are at most h."""
     if not h >= edges[0]:
         return 0
     if h >= edges[-1]:

@@ -206,7 +206,7 @@ def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
 
 
 def differences(then: Manifest, now: Manifest) -> str:
-    """What differs between two nested mappings of plain values, by dotted names; "" if nothing does."""
+    """The difference between two nested mappings of plain values, by dotted names; "" if nothing does."""
     before, after = _flat(then), _flat(now)
     changed = [key for key in sorted(before.keys() | after.keys()) if before.get(key) != after.get(key)]
     text = "; ".join(f"{key} was {_short(before.get(key))}, now {_short(after.get(key))}" for key in changed[:_SHOWN])

@@ -27,7 +27,7 @@ from ufmstar_torch.ufmstar import UfMStar
 
 @dataclass(frozen=True, eq=False)
 class RunJob:
-    """What to run."""
+    """A run: its sequence, network and settings."""
 
     sequence: FrameSequence  # the posed frames
     indices: range  # which of them, in order

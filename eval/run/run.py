@@ -87,7 +87,7 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
 
 
 def _ending(job: RunJob, folder: RunFolder) -> tuple[str, str]:
-    """Of a run that went through all frames."""
+    """State and message of a run that has processed all frames."""
     if any(record["state"] == "done" for record in folder.records):
         return FINISHED, _counts(folder, job)
     reasons = sorted({record["reason"] for record in folder.records})

@@ -46,9 +46,9 @@ def resample_nearest(values: NDArray, K_from: NDArray, K_to: NDArray, size: Size
 
 @lru_cache(maxsize=16)
 def _source(mapping: bytes, size_from: Size, size: Size) -> tuple[NDArray[np.intp], NDArray[np.bool_] | None]:
-    """Of every pixel [h, w] of the second camera the pixel of the first one (H, W), counted along its rows, and whether
-    there is one; None = everywhere. ``mapping`` [3, 3] float64 takes pixels of the second camera to the first one. The
-    same for all frames of a sequence."""
+    """For every pixel [h, w] of the second camera, the pixel of the first one (H, W), counted along its rows, and
+    whether there is one; None = everywhere. ``mapping`` [3, 3] float64 takes pixels of the second camera to the first
+    one. The same for all frames of a sequence."""
     M = np.frombuffer(mapping).reshape(3, 3)
     v, u = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float64)
     column = np.floor(M[0, 0] * u + M[0, 1] * v + M[0, 2] + 0.5 + _BORDER).astype(np.intp)

@@ -159,7 +159,7 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
 
 
 def depth_loader(path: Path | None, scale: float | None, default_scale: float = _MILLIMETRE) -> Loader | None:
-    """What :class:`Entry` keeps for a depth file (None stays None)."""
+    """The loader that :class:`Entry` keeps for a depth file (None stays None)."""
     return None if path is None else partial(read_depth, path, scale, default_scale=default_scale)
 
 

@@ -174,7 +174,7 @@ def _poses(root: Path, drive: str, camera: str) -> dict[int, np.ndarray]:
 def _depth(
     folder: Path, poses: dict[int, np.ndarray], names: list[str], options: Options, K: np.ndarray, size: Size
 ) -> dict[str, Loader | None]:
-    """What loads the depth of each frame that has any."""
+    """The loaders of depth, for the frames that have any."""
     if options.depth is not None:
         if options.scans is not None:
             raise ValueError("scans goes with depth from the laser, not with a folder of depth maps")

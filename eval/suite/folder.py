@@ -123,7 +123,7 @@ class EvalFolder:
         return f"{item.label}: failed: {reason}"
 
     def failure(self, item: WorkItem) -> dict[str, Any] | None:
-        """What :meth:`fail` has stored about a sequence; None if nothing."""
+        """The failure that :meth:`fail` has stored for a sequence; None if nothing."""
         path = self.place(item) / FAILED
         try:
             failure = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""What is evaluated: a suite with its networks, on sequences, into a folder."""
+"""An evaluation: a suite, its networks, the sequences and the output folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ufmstar_torch.recalibrate import Recalibration
 
 @dataclass(frozen=True)
 class EvalJob:
-    """What is evaluated."""
+    """An evaluation."""
 
     suite: Suite  # its rows, of the bases that have a network
     networks: Mapping[str, NetworkChoice]  # chosen, by base

@@ -1,4 +1,4 @@
-"""What is kept of one row on one sequence: the line from which every table and figure is made."""
+"""The record of one row on one sequence: the line from which every table and figure is made."""
 
 from __future__ import annotations
 

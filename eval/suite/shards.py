@@ -277,5 +277,5 @@ def evaluate_on_slurm(job: EvalJob, slurm: Slurm, *, stop: Stop, report: Report,
 
 
 def _evaluate_shard(job: EvalJob, options: Mapping[str, Any], shard: Shard) -> bool:
-    """What a job of the array runs; whether it came to its end."""
+    """Run one job of the array; return whether it finished."""
     return evaluate_suite(job, shard=shard, resume=True, report=print, **options).finished

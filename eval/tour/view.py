@@ -19,7 +19,7 @@ from ufmstar_torch.eval.tour.visibility import Window, surface_windows
 
 @dataclass(frozen=True, eq=False)
 class TourView:
-    """What a camera sees."""
+    """A rendered image with its depth."""
 
     image: Tensor  # [H, W, 3] uint8 RGB
     depth: Tensor  # [H, W] float64 along z [m]
