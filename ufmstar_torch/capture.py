@@ -90,7 +90,7 @@ class Captured:
         return ufm(depth, pose, intrinsics, *optional)
 
     def _frame(self) -> None:
-        """What is recorded: a step from the state's memory back into it."""
+        """The recorded work: a step from the state's memory back into it."""
         self._out = self._run(self._ufm)
         for name, value in self._ufm._stored().tensors().items():
             self._state[name].copy_(value)

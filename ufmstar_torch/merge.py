@@ -183,7 +183,7 @@ def partition(mixture: GaussianMixture, limit: float) -> Tensor:
 
 
 def _best(mixture: GaussianMixture, compared: Tensor) -> tuple[Tensor, Tensor]:
-    """Of each component the least loss [B, K], infinite without a partner, and the first partner with it [B, K]."""
+    """For each component, the least loss [B, K], infinite without a partner, and the first partner with it [B, K]."""
     k = mixture.capacity
     rows = max(1, _CHUNK // max(1, mixture.streams * k))
     eye = torch.eye(3, dtype=torch.float64, device=mixture.mean.device)

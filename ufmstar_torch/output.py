@@ -1,4 +1,4 @@
-"""What a step and what UfM* returns for one image."""
+"""The outputs of a step and of UfM* for one image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ufmstar_torch.mixture import GaussianMixture
 
 @dataclass(frozen=True, repr=False)
 class FrameStatistics:
-    """What happened to one frame, per stream [B].
+    """Counts of one frame, per stream [B].
 
     Attributes:
         components: K, occupied components after the frame.

@@ -1,4 +1,4 @@
-"""What every depth network returns, and how one is called."""
+"""The output of every depth network, and how one is called."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the modules with a state of their own share: buffers that move, save and load as wholes."""
+"""The base of modules with a state: buffers that move, save and load together."""
 
 from __future__ import annotations
 

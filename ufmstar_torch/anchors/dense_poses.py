@@ -63,7 +63,7 @@ class Fit:
 
 
 class PoseErrors(SavedState):
-    """What is known of the errors of the poses and of the camera.
+    """Estimated errors of the poses and of the camera.
 
     Args:
         baselines: number of baselines that are told apart.

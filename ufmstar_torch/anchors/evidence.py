@@ -1,4 +1,4 @@
-"""What anchors teach: how far off the network has been lately, by component and overall.
+"""The network's recent error at anchors, by component and overall.
 
 At an anchor (depth g, variance s^2) the prediction d has the relative error r = (g - d)/d. Were the network's own
 variance A + E all there is, E[r^2] = (A + E + s^2)/d^2. What is left over,
@@ -164,7 +164,7 @@ def _weight(r2: Tensor, claim: Tensor, supported: Tensor) -> Tensor:
 
 
 def means(evidence: Evidence, shrinkage: float) -> tuple[Tensor, Tensor]:
-    """What was learnt of each component beyond the stream, and of the stream.
+    """Mean errors of each component beyond the stream's, and of the stream.
 
     Args:
         evidence: so far.

@@ -26,7 +26,7 @@ from ufmstar_torch.state import UfMStarState
 
 @dataclass(frozen=True)
 class Learnt:
-    """What is known after a frame's anchors.
+    """The evidence after a frame's anchors.
 
     Attributes:
         evidence: this frame's included.
@@ -174,7 +174,7 @@ class AnchorFrame(FrameExtension):
 
 
 class AnchorExtension(Extension):
-    """What anchors teach of the network's error.
+    """The network's error, measured at anchors.
 
     Args:
         config: with ``anchors``.

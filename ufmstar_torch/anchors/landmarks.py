@@ -1,4 +1,4 @@
-"""What yields the landmarks of one camera, image after image: the corner tracker, dense evidence, or a map of
+"""Sources of landmarks for one camera, image by image: the corner tracker, dense evidence, or a map of
 landmarks in a file.
 """
 

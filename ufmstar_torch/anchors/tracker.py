@@ -268,7 +268,7 @@ class LandmarkTracker(SavedState):
         return chosen, result
 
     def _landmarks(self, tracked: int) -> Landmarks:
-        """What the views in the window say of the corners that the newest one shows."""
+        """Triangulate the newest image's corners from the views in the window."""
         config = self.config
         chosen, result = self._triangulated()
         none = _NO_DEPTH if tracked else _NO_TRACK

@@ -1,4 +1,4 @@
-"""What the anchors around an anchor say of it: on which side of an edge its surface is, and whether it stands alone.
+"""Checks each anchor against its neighbours: which side of a depth edge it lies on, and whether it is an outlier.
 
 A pixel of large gradient lies on an edge of a thing. The patch is matched as a whole, but the pixel shows one surface
 or the other. Of the anchors around it, some have its depth: on their side of the edge is its surface.

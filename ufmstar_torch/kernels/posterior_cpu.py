@@ -154,7 +154,7 @@ def _of_stream(
     config: PosteriorConfig, packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any],
     given_: _Anchors | None,
 ) -> tuple[Floats, NDArray[Any], NDArray[Any]]:  # fmt: skip
-    """What is known after the frame; depth and variance."""
+    """The memory after the frame; depth and variance."""
     running, anchors = _Running.of(packed, config), _NONE if given_ is None else given_
     some = len(anchors.depth) > 0
     if given_ is None and not running.frames:

@@ -47,7 +47,7 @@ _COUNTS += ("unmeasured",)
 
 
 class _Pairs(NamedTuple):
-    """What :func:`match` returns of a stream."""
+    """The result of :func:`match` for a stream."""
 
     c: NDArray[np.int64]
     k: NDArray[np.int64]

@@ -17,7 +17,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Solved:
-    """Of A x = y on n nodes.
+    """The system A x = y on n nodes.
 
     Attributes:
         columns: [B, n, q] A^-1 Y.

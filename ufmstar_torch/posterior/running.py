@@ -1,4 +1,4 @@
-"""What the posterior learns of a stream: sums with a half-life, and the last frame's coefficients.
+"""The posterior's memory of a stream: sums with a half-life, and the last frame's coefficients.
 
 Everything here is learnt from anchors alone, in frames that have some: how far the network's error varies (amplitude),
 how much anchors and network differ from one pixel to the next (roughness), by what factor the anchors' variances are
@@ -48,7 +48,7 @@ SIZE = 2 + 2 * RATIOS + FEATURES + _MATRIX
 
 @dataclass(frozen=True)
 class Running:
-    """Of B streams.
+    """The posterior's memory of B streams.
 
     Attributes:
         config: of the posterior.

@@ -194,7 +194,7 @@ def _none(frame: FrameInput) -> AnchorInput:
 
 
 def _prior(grid: Grid, running: Running) -> Prior:
-    """Of b and f, in the frame to come."""
+    """The prior of b and f in the next frame."""
     mean, covariance = running.expected(grid.mean)
     amplitude = running.ratio("amplitude")[:, None]
     diagonal = (running.config.precision / amplitude).expand_as(grid.log_depth)
@@ -278,7 +278,7 @@ def _relative(claimed: Tensor, anchors: AnchorInput) -> Tensor:
 def _learnt(
     scene: _Scene, field: Field, weight: Tensor, left_out: _LeftOut, claimed: Tensor, running: Running,
 ) -> Running:  # fmt: skip
-    """What is known after the frame."""
+    """The memory after the frame."""
     sums = _of_neighbours(scene, left_out, running) | _of_discs(scene, weight, claimed, running)
     added = {name: running.added(name, *sums[name]) for name in ratios(scene.config)}
     above, below = ({name: pair[i] for name, pair in added.items()} for i in range(2))

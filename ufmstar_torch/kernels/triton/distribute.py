@@ -1,4 +1,4 @@
-"""What anchors teach, shared out among the components on a GPU in two launches: every point's evidence, then the sums.
+"""Distributes the anchors' evidence among the components on a GPU in two launches: every point's evidence, then the sums.
 
 A lane of the second launch is a component, which takes the points in their order: the sums depend on nothing else.
 """
