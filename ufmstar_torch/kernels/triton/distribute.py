@@ -1,4 +1,4 @@
-"""Distributes the anchors' evidence among the components on a GPU in two launches: every point's evidence, then the sums.
+"""Shares the anchors' evidence among components on a GPU in two launches: every point's evidence, then the sums.
 
 A lane of the second launch is a component, which takes the points in their order: the sums depend on nothing else.
 """
