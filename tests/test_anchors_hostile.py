@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import scenes
-from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.anchors import AnchorInput, Anchors
 from ufmstar_torch.anchors.evidence import Evidence, inliers, observe
 
@@ -50,6 +50,33 @@ def test_an_anchor_without_information_changes_nothing(spoilt, without):
     assert used >= 30
     # The frame with the bad anchor alone teaches nothing, so the rest stays within what a frame's forty change.
     np.testing.assert_allclose(result, without, rtol=0.25)
+
+
+@pytest.mark.parametrize(
+    ("predicted", "truth", "right", "far"),
+    [(0.015, 2.0, 0, 200), (8.0, 0.04, 0, 200), (0.015, 2.0, 200, 4), (2.0, 2.0, 200, 0)],
+)
+def test_many_rejected_anchors_widen_the_variance(predicted, truth, right, far, caplog):
+    """Two streams, of which the second has no anchor that is off."""
+    config = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
+    ufm, rng, n = UfMStar(config), np.random.default_rng(0), right + far
+    K = torch.tensor([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+    pixel = torch.tensor(rng.uniform([0, 0], [W - 1, H - 1], (n, 2)))[None].expand(2, -1, -1)
+    depth = torch.tensor([predicted] * right + [truth] * far, dtype=torch.float64)
+    anchors = Anchors(
+        pixel, torch.stack([depth, torch.full_like(depth, predicted)]), torch.full((2, n), 1e-12).double()
+    )
+    for _ in range(3):
+        out = ufm(torch.full((2, H, W), predicted), torch.eye(4), K, anchors=anchors)
+    many, statistics = far > right, out.statistics
+    assert statistics.anchors_rejected.tolist() == [far, 0]
+    assert int(statistics.anchors_used[1]) > 0.9 * n
+    for sigma in (out.std, out.posterior_variance.sqrt()):
+        assert float(sigma[1].median()) < 0.3 * predicted
+        assert (sigma[0] > 0.3 * abs(truth - predicted)).all() if many else sigma[0].median() < 0.3 * predicted
+    assert [record.message[:9] for record in caplog.records if "anchors are off" in record.message] == [
+        "stream 0:"
+    ] * many
 
 
 def anchored_std(claim, frames=6, every=False):

@@ -10,11 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors import landmark_source
 from ufmstar_torch.anchors.dense import DenseConfig, DenseEvidence
+from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 
 SMALL = {
     "corners": lambda: LandmarkTracker(TrackerConfig(max_points=40, window=4)),
-    "dense": lambda: DenseEvidence(DenseConfig(keyframes=5, landmarks=150)),
+    "dense": lambda: DenseEvidence(DenseConfig(keyframes=5, landmarks=150, corners=40)),
 }
 
 
@@ -60,6 +61,42 @@ def test_poses_that_contradict_the_images_give_few_anchors(tour, kind):
     right, noisy = (sum(len(f.depth) for f in run(landmark_source(kind), tour, T)[4:]) for T in (None, wrong))
     assert right > 200
     assert noisy < 0.1 * right
+
+
+DEFECTS = {
+    "late": lambda poses, images: ([*poses[:3], *poses[:-3]], images),
+    "reversed": lambda poses, images: (poses[::-1], images),
+    "frozen": lambda poses, images: (poses, [images[0]] * len(images)),
+    "noisy": lambda poses, images: (_noisy(poses, 2.0), images),
+}
+
+
+def _noisy(poses, degrees):
+    rng, turned = np.random.default_rng(0), [T.copy() for T in poses]
+    for T in turned:
+        T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(rng.normal(0, np.deg2rad(degrees), 3)).as_matrix()
+    return turned
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_images_that_contradict_the_poses_give_no_depth_and_a_warning(tour, kind, defect, caplog):
+    poses, images = DEFECTS[defect]([f.T_world_cam for f in tour], [f.image for f in tour])
+    streams, K = StreamLandmarks(kind), torch.from_numpy(tour[0].intrinsics)
+    for T, image in zip(poses, images, strict=True):
+        anchors = streams.update(torch.from_numpy(image).permute(2, 0, 1)[None], torch.from_numpy(T), K)
+    assert streams.last[0].contradicted
+    assert anchors.valid.sum() == 0
+    assert anchors.pose_error > 0.01 * 240
+    assert sum("poses contradict the images" in record.message for record in caplog.records) == 1, "once a stream"
+    assert streams.last[0].none.startswith("poses contradict the images")
+
+
+def test_right_poses_are_told_from_wrong_ones(tour, kind):
+    right = run(landmark_source(kind), tour)[-1]
+    wrong = run(landmark_source(kind), tour, _noisy([f.T_world_cam for f in tour], 0.2))[-1]
+    assert right.pose_error < 0.004 * 240
+    assert right.shared < wrong.shared, "what the poses add to the variance of all inverse depths"
+    assert right.pose_error < wrong.pose_error
 
 
 def test_a_saved_state_continues_and_a_reset_forgets_everything(tour, kind):

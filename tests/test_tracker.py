@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from landmark_runs import true_depth, walk
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.anchors.tracker import LandmarkTracker
+from ufmstar_torch.anchors.tracker import LandmarkTracker, off_lines
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.kernels.triangulate_cpu import triangulate
 
@@ -156,3 +156,23 @@ def test_anchors_lie_on_the_depth_map(tour):
     np.testing.assert_array_equal(anchors.variance[0, :n].numpy(), result.variance)
     with pytest.raises(ValueError, match="capacity must be at least"):
         result.anchors(frame.intrinsics, small, capacity=n - 1)
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.2])
+def test_matches_lie_on_the_part_of_the_line_where_points_of_the_scene_are(turned):
+    rng, T, before = np.random.default_rng(0), np.eye(4), np.eye(4)
+    before[:3, :3], before[0, 3] = Rotation.from_rotvec([0, turned, 0]).as_matrix(), 0.2
+    points = rng.uniform([-1, -1, 2], [1, 1, 6], (50, 3))
+    now, then = seen_from(points, np.stack([T, before])).transpose(1, 0, 2)
+
+    def off(match):
+        distance, rho, baseline = off_lines(now, match, T, np.tile(before, (50, 1, 1)), K, 3.0)
+        np.testing.assert_allclose(baseline, 0.2)
+        return np.median(distance), rho
+
+    distance, rho = off(then)
+    assert distance < 1e-6
+    np.testing.assert_allclose(rho, 1 / points[:, 2], rtol=1e-9)
+    assert abs(off(then + np.array([0, 1.5]))[0] - 1.5) < 0.3, "across the line, nearly"
+    assert off(2 * seen_from(1e9 * points, before[None])[:, 0] - then)[0] > 5, "the wrong way: a baseline of 7 to 30 px"
+    assert off(seen_from(1e9 * points, before[None])[:, 0])[0] > 1.5, "no motion but the rotation's"

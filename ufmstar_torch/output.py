@@ -34,6 +34,10 @@ class FrameStatistics:
         anchors: with ``config.anchors``, given and usable; 0 for a standing camera, say. None without.
         anchors_used: of those, no gross outliers. 0 = nothing new was learnt: M + A + E is plain UfM*'s and B what had
             been learnt before, which at the start is nothing.
+        anchors_rejected: those that are off from the prediction by more than a factor of 100. Where they are the most,
+            they show an error, by which the variance is widened.
+        pose_error: by how much poses and images disagree: standard deviation of tracked corners from their epipolar
+            lines [px] of the image that was searched; NaN = not measured, None = no source of anchors measures it.
         calibration: with ``config.posterior``, mean z^2 of held-out anchors lately: 1 = the posterior is off by as much
             as it states, more = it is too certain. NaN before any; None without.
         unseen: likewise, variance of log g/d that held-out anchors show for surfaces far from all anchors: large where
@@ -54,6 +58,8 @@ class FrameStatistics:
     rotation_deviation: Tensor
     anchors: Tensor | None = None
     anchors_used: Tensor | None = None
+    anchors_rejected: Tensor | None = None
+    pose_error: Tensor | None = None
     calibration: Tensor | None = None
     unseen: Tensor | None = None
 

@@ -17,8 +17,9 @@ from ufmstar_torch.fixed_order import apply, product
 from ufmstar_torch.frame import FrameInput
 
 # An anchor whose standard deviation is as large as its depth, or that is off from the prediction by a factor like this,
-# measures nothing: one alone would decide the mean of all others, and larger values overflow in the state.
-FARTHEST_OFF = 100.0
+# measures nothing: one alone would decide the mean of all others, and larger values overflow in the state. More than
+# FEW of them, and more than there are others, measure that the prediction is wrong.
+FARTHEST_OFF, FEW = 100.0, 3
 
 
 @dataclass(frozen=True)
@@ -33,12 +34,18 @@ class Anchors:
         depth: [B, N] along the optical axis [m].
         variance: [B, N] of ``depth`` [m^2].
         valid: [B, N] bool, True = use; None = all.
+        pose_error: [B] by how much the poses disagree with the images, a standard deviation [px], NaN = not measured;
+            None = by nothing that is known.
+        shared: [B] variance of inverse depths by an error that all anchors of the frame have in common, as wrong poses
+            make [1/m^2]; None = 0.
     """
 
     pixel: Tensor
     depth: Tensor
     variance: Tensor
     valid: Tensor | None = None
+    pose_error: Tensor | None = None
+    shared: Tensor | None = None
 
     @classmethod
     def from_points(
@@ -107,8 +114,7 @@ class Anchors:
 
     def to(self, device: torch.device | str) -> Anchors:
         """The same on another device."""
-        valid = None if self.valid is None else self.valid.to(device)
-        return Anchors(self.pixel.to(device), self.depth.to(device), self.variance.to(device), valid)
+        return Anchors(*(value if value is None else value.to(device) for value in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -123,6 +129,10 @@ class AnchorInput:
         own_variance: [B, N] what the network itself claims there, A + E as far as they are used [m^2].
         valid: [B, N] bool: finite, depth > 0, 0 <= variance < depth^2, off from the prediction by a factor of at most
             100, on a valid pixel, not masked.
+        rejected: [B] anchors that would be valid, but are off by more; None = not counted.
+        contradiction: [B] mean of their r^2, at most 100^2, where they are more than the valid ones: then they are no
+            outliers, and show the error; else 0. None likewise.
+        pose_error, shared: [B] as in :class:`Anchors`.
     """
 
     pixel: Tensor
@@ -132,6 +142,10 @@ class AnchorInput:
     variance: Tensor
     own_variance: Tensor
     valid: Tensor
+    rejected: Tensor | None = None
+    contradiction: Tensor | None = None
+    pose_error: Tensor | None = None
+    shared: Tensor | None = None
 
 
 def claimed(own: Sequence[Tensor], index: Tensor, valid: Tensor) -> Tensor:
@@ -207,7 +221,24 @@ def check_anchors(
     depth = require_float("anchors.depth", anchors.depth, shape, frame.depth).detach().double()
     variance = require_float("anchors.variance", anchors.variance, shape, frame.depth).detach().double()
     valid = None if anchors.valid is None else require_mask("anchors.valid", anchors.valid, shape, frame.depth)
-    return kernel(Anchors(pixel, depth, variance, valid), frame, own)
+    given = Anchors(pixel, depth, variance, valid)
+    checked = replace(kernel(given, frame, own), pose_error=anchors.pose_error, shared=anchors.shared)
+    return _with_rejected(checked, given, frame)
+
+
+def _with_rejected(checked: AnchorInput, given: Anchors, frame: FrameInput) -> AnchorInput:
+    """Count the anchors that are off by more than a factor of ``FARTHEST_OFF``."""
+    predicted = torch.gather(frame.depth.flatten(1), 1, checked.index).double()
+    ratio = given.depth / predicted
+    far = ((ratio > FARTHEST_OFF) | (ratio < 1 / FARTHEST_OFF)) & ~checked.valid & _inside(given.pixel, frame.size)
+    far = far & (given.depth > 0) & (given.variance >= 0) & (given.variance.sqrt() < given.depth) & ratio.isfinite()
+    if given.valid is not None:
+        far = far & given.valid
+    square = torch.where(far, (ratio - 1).clamp_max(FARTHEST_OFF).square(), torch.zeros_like(ratio))
+    rejected = far.sum(1)
+    many = (rejected > FEW) & (rejected > checked.valid.sum(1))
+    mean = square.sum(1) / rejected.clamp_min(1)
+    return replace(checked, rejected=rejected, contradiction=torch.where(many, mean, torch.zeros_like(mean)))
 
 
 def require_anchors(anchors: object) -> Anchors:

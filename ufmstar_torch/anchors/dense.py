@@ -3,6 +3,8 @@
 Where :class:`~ufmstar_torch.anchors.tracker.LandmarkTracker` follows corners, this searches along epipolar lines: edges
 give depths too, on most surfaces, and what has little parallax is kept with a large variance. Inverse depth is what is
 measured, rho = 1/depth with a standard deviation sigma: an anchor has the depth 1/rho and the variance sigma^2 depth^4.
+Some corners are followed too. They measure how far poses and images disagree, which a search along lines of these poses
+cannot, and are anchors where no other lies near.
 
 Needs OpenCV and numba, on the CPU. One a camera; what it keeps is of fixed size: the keyframes and some numbers.
 """
@@ -21,7 +23,7 @@ from ufmstar_torch.anchors.dense_keyframes import Keyframes
 from ufmstar_torch.anchors.dense_memory import Memory
 from ufmstar_torch.anchors.dense_poses import PoseErrors
 from ufmstar_torch.anchors.saved_state import SavedState
-from ufmstar_torch.anchors.tracker import Landmarks, checked
+from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker, TrackerConfig, checked
 from ufmstar_torch.checked import Checked, number
 
 if TYPE_CHECKING:
@@ -37,6 +39,7 @@ _AGREE, _ENOUGH = 2, 10
 _JUMPED = 3
 # Standard deviation of an inverse depth, as a share, by what no image shows: the scale of the poses.
 _SCALE = 0.005
+_CORNERS = "corners_"  # before the names of the tracker's state
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,9 @@ class DenseConfig(Checked):
         width: largest width of the image that is searched [px]; larger images are reduced to it.
         keyframes: how many are kept.
         landmarks: how many are remembered.
-        searches: pixels that are searched in a frame at most; what is left has its turn in the next ones.
+        corners: corners that are followed.
+        corner_distance: of a corner that is an anchor from all dense ones, as a share of the width.
+        corner_sigma: its largest standard deviation, as a share of its depth.
         start_depth: median depth of the scene before one is known [m]; right to a factor of 5.
         least_score: of a match, zero-mean normalised cross-correlation (ZNCC).
         rival: a match is unique where the best other one has this many times its 1 - ZNCC at least.
@@ -64,7 +69,9 @@ class DenseConfig(Checked):
     width: int = number(320, "", "px", 80, 1280)
     keyframes: int = number(50, "", "1", 2)
     landmarks: int = number(2048, "", "1", 100)
-    searches: int = number(400, "", "1", 10)
+    corners: int = number(150, "", "1", 10)
+    corner_distance: float = number(0.04, "", "width", 0)
+    corner_sigma: float = number(0.1, "", "1", 0)
     start_depth: float = number(2.0, "", "m", 0, open_low=True)
     least_score: float = number(0.85, "", "1", 0, 1)
     rival: float = number(1.5, "", "1", 1)
@@ -89,13 +96,21 @@ class DenseEvidence(SavedState):
     """
 
     needs_image = True
-    HELD: ClassVar = {"_size": "size", "_K": "K", "_depth": "depth", "_contradicted": "contradicted"}
+    HELD: ClassVar = {
+        "_size": "size",
+        "_K": "K",
+        "_depth": "depth",
+        "_contradicted": "contradicted",
+        "_baseline": "baseline",
+    }
 
     def __init__(self, config: DenseConfig | None = None) -> None:
         self.config = config if config is not None else DenseConfig()
         self._keyframes = Keyframes(self.config.keyframes)
         self._memory = Memory(self.config.landmarks, self.config.memory)
         self._errors = PoseErrors(len(_BASELINES), self.config.memory)
+        corners = TrackerConfig(max_points=self.config.corners, start_depth=self.config.start_depth)
+        self._tracker = LandmarkTracker(corners)
         self.reset()
 
     @property
@@ -108,18 +123,22 @@ class DenseEvidence(SavedState):
         self._keyframes.reset()
         self._memory.reset()
         self._errors.reset()
+        self._tracker.reset()
         self._size, self._K = np.zeros(2, np.int64), np.eye(3)  # of the images; no size before the first
-        self._depth, self._contradicted = self.config.start_depth, 0
+        self._depth, self._contradicted, self._baseline = self.config.start_depth, 0, 0.0
 
     def state(self) -> dict[str, Tensor]:
         """All that is remembered, for :meth:`load_state`; images are shared and must not be written to."""
-        return super().state() | self._keyframes.state() | self._memory.state() | self._errors.state()
+        corners = {_CORNERS + name: value for name, value in self._tracker.state().items()}
+        return super().state() | self._keyframes.state() | self._memory.state() | self._errors.state() | corners
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Continue where :meth:`state` was taken; ValueError: another number of keyframes or landmarks."""
         super().load_state(state)
         for part in (self._keyframes, self._memory, self._errors):
             part.load_state(state)
+        corners = {name: value for name, value in state.items() if name.startswith(_CORNERS)}
+        self._tracker.load_state({name.removeprefix(_CORNERS): value for name, value in corners.items()})
 
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
@@ -145,7 +164,8 @@ class DenseEvidence(SavedState):
             raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
         self._size, self._K = np.array(gray.shape), K
         small, scale = _reduced(gray, self.config.width)
-        result = self._measured(small, scale, T, scale @ K)
+        corners = self._tracker.update(small, T, scale @ K)
+        result = self._measured(small, scale, T, scale @ K, corners)
         if self._contradicted >= _JUMPED:
             self._contradicted = 0
             self._keyframes.reset()
@@ -153,9 +173,11 @@ class DenseEvidence(SavedState):
         self._keyframes.add(small, T, self._depth)
         return result
 
-    def _measured(self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray) -> Landmarks:
-        """The depths of a reduced image: landmarks that it shows, measured again where the camera has moved, and new
-        ones in the cells between them. The running estimates follow."""
+    def _measured(
+        self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray, corners: Landmarks
+    ) -> Landmarks:
+        """The depths of a reduced image: landmarks that it shows, measured again where the camera has moved, new ones
+        in the cells between them, and corners where none is. The running estimates follow."""
         from ufmstar_torch.kernels.beside_cpu import beside  # kernels compile when they are first needed
         from ufmstar_torch.kernels.dense_cpu import measure
 
@@ -164,19 +186,18 @@ class DenseEvidence(SavedState):
         known, searched = len(sighted.slot), 0
         pixel = np.concatenate([sighted.pixel, _pixels(small, cell, sighted.pixel)])
         rho, variance = np.zeros(len(pixel)), np.ones(len(pixel))
-        agreed, trusted = np.zeros(len(pixel), dtype=np.bool_), True
+        agreed, trusted = np.zeros(len(pixel), dtype=np.bool_), not corners.contradicted
         chosen = self._keyframes.choose(T, K, self._depth, _BASELINES)
-        if len(chosen) >= _AGREE:
+        if len(chosen) >= _AGREE and trusted:
             expected = np.concatenate([np.flatnonzero(sighted.due), np.arange(known, len(pixel))])
-            every = -(-len(expected) // self.config.searches) or 1
-            expected = expected[self._memory.frame % every :: every]
             shares = np.array([share for share, _ in chosen])
-            noise = self._errors.positions(K, small.shape[1], self._depth)[shares]
+            noise = self._errors.positions(K, small.shape[1], self._depth, self._tracker.pose_variance)[shares]
             views = self._views([keyframe for _, keyframe in chosen], noise, T, K)
+            self._baseline = float(np.linalg.norm(np.linalg.inv(K) @ views.b[-1]))
             actual = measure(small, pixel[expected], views, self._search())
             agreed[expected] = (actual.agreed >= _AGREE) & (actual.contradicted == 0)
             matched = int((actual.agreed > 0).sum())
-            trusted = matched < _ENOUGH or agreed.sum() >= self.config.min_share * matched
+            trusted &= matched < _ENOUGH or bool(agreed.sum() >= self.config.min_share * matched)
             fit = self._errors.corrected(pixel[expected], actual, shares, views, K, self._depth, trusted)
             searched = len(expected)
             rho[expected], variance[expected] = fit.rho, fit.variance + np.square(_SCALE * fit.rho)
@@ -191,10 +212,22 @@ class DenseEvidence(SavedState):
         if len(kept) >= _ENOUGH:
             step = (1 - self.config.memory) * np.log(np.median(1 / rho[kept]) / self._depth)
             self._depth *= float(np.exp(step))
-        stated = variance[kept] + self._memory.apart * np.square(rho[kept])
+        shared = self._tracker.shared(max(self._baseline, self._tracker.baseline))
+        stated = variance[kept] + self._memory.apart * np.square(rho[kept]) + shared
         surface, alone = beside(small, pixel[kept], rho[kept], stated, cell)
-        depth, position = 1 / rho[kept], (surface - scale[:2, 2]) / scale.diagonal()[:2]
-        return Landmarks(position, depth, (stated + alone) * depth**4, searched + known)
+        far = self._apart(corners, surface, small.shape[1]) if trusted else np.zeros(0, np.int64)
+        depth = np.concatenate([1 / rho[kept], corners.depth[far]])
+        spread = np.concatenate([(stated + alone) * depth[: len(kept)] ** 4, corners.variance[far]])
+        position = (np.concatenate([surface, corners.pixel[far]]) - scale[:2, 2]) / scale.diagonal()[:2]
+        judged = {"pose_error": corners.pose_error, "shared": shared, "contradicted": corners.contradicted}
+        none = {"none": corners.none} if corners.contradicted else {}
+        return Landmarks(position, depth, spread, searched + known, **none, **judged)
+
+    def _apart(self, corners: Landmarks, taken: NDArray[np.float64], width: int) -> NDArray[np.int64]:
+        """Which corners are anchors: certain ones, away from positions [N, 2] that are taken."""
+        fine = np.flatnonzero(np.sqrt(corners.variance) <= self.config.corner_sigma * corners.depth)
+        square = np.square(corners.pixel[fine, None] - taken).sum(-1).min(1, initial=np.inf)
+        return fine[square > (self.config.corner_distance * width) ** 2]
 
     def _search(self) -> Search:
         from ufmstar_torch.kernels.dense_cpu import Search

@@ -6,6 +6,7 @@ regressed beside H; the stream's are added at every pixel.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.anchors import AnchorInput, CheckKernel, check_anchors, check_values
+from ufmstar_torch.anchors.anchors import FARTHEST_OFF, AnchorInput, CheckKernel, check_anchors, check_values
 from ufmstar_torch.anchors.evidence import SUMS, Evidence, inliers, means, observe
 from ufmstar_torch.camera import unproject_at
 from ufmstar_torch.config import UfMStarConfig
@@ -121,6 +122,7 @@ class AnchorFrame(FrameExtension):
         anchors: of the frame, checked, or None.
         config: with ``anchors``.
         kernels: which implementation of each part.
+        warn: takes the anchors of every frame.
 
     Attributes:
         frame, anchors: as above.
@@ -129,9 +131,10 @@ class AnchorFrame(FrameExtension):
     columns = 2  # mean r and mean e
 
     def __init__(
-        self, frame: FrameInput, anchors: AnchorInput | None, config: UfMStarConfig, kernels: AnchorKernels
-    ) -> None:
-        self.frame, self.anchors = frame, anchors
+        self, frame: FrameInput, anchors: AnchorInput | None, config: UfMStarConfig, kernels: AnchorKernels,
+        warn: Callable[[AnchorInput], None],
+    ) -> None:  # fmt: skip
+        self.frame, self.anchors, self._warn = frame, anchors, warn
         self._config, self._kernels = config, kernels
         self._used = self._residual = self._term = torch.empty(0)
 
@@ -159,14 +162,23 @@ class AnchorFrame(FrameExtension):
         self._residual = values
 
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
-        """Count the anchors, and those that were used."""
-        given = torch.zeros_like(self._used) if self.anchors is None else self.anchors.valid.sum(1)
-        return state, replace(out, statistics=replace(out.statistics, anchors=given, anchors_used=self._used))
+        """Count the anchors, those that were used and those that were rejected."""
+        none, anchors = torch.zeros_like(self._used), self.anchors
+        given, rejected = (none, none) if anchors is None else (anchors.valid.sum(1), anchors.rejected)
+        counts = {"anchors": given, "anchors_used": self._used, "anchors_rejected": rejected}
+        if anchors is not None:
+            self._warn(anchors)
+            counts["pose_error"] = anchors.pose_error
+        return state, replace(out, statistics=replace(out.statistics, **counts))
 
     def disagreement(self, disagreement: Tensor, depth: Tensor) -> Tensor:
-        """M + B [m^2]."""
+        """M + B [m^2]; where most anchors were rejected, at least d^2 times the mean of their r^2."""
         self._term, both = anchored_term(depth, self._residual[..., 1], disagreement)
-        return both
+        if self.anchors is None or self.anchors.contradiction is None:
+            return both
+        least = self.anchors.contradiction.view(-1, *[1] * (depth.dim() - 1)).to(depth.dtype) * depth.square()
+        self._term = torch.maximum(self._term, least)
+        return torch.maximum(both, disagreement + least)
 
     def outputs(self) -> dict[str, Tensor]:
         """B and r."""
@@ -185,6 +197,7 @@ class AnchorExtension(Extension):
 
     def __init__(self, config: UfMStarConfig, kernels: Callable[[str, str], AnchorKernels]) -> None:
         self._config, self._kernels = config, kernels
+        self._warned = set[int]()
 
     def by_component(
         self, streams: int, slots: int, dtype: torch.dtype, device: torch.device | str
@@ -206,7 +219,20 @@ class AnchorExtension(Extension):
         """
         kernels = self._kernels(self._config.backend, frame.depth.device.type)
         anchors = None if given is None else check_anchors(given, frame, own, kernels.check)
-        return AnchorFrame(frame, anchors, self._config, kernels)
+        return AnchorFrame(frame, anchors, self._config, kernels, self._warn)
+
+    def _warn(self, anchors: AnchorInput) -> None:
+        """Report, once a stream, that most anchors are off by more than a factor of 100; on the CPU only, elsewhere it
+        would have to wait."""
+        if anchors.contradiction is None or anchors.rejected is None or not anchors.contradiction.is_cpu:
+            return
+        for b in set(anchors.contradiction.nonzero().flatten().tolist()) - self._warned:
+            self._warned.add(b)
+            logging.getLogger("ufmstar_torch").warning(
+                "stream %d: %d of %d anchors are off from the predicted depth by more than a factor of %g; the "
+                "variance is widened. Are depth, poses and anchors in metres, and is it no inverse depth? (said once)",
+                *(b, int(anchors.rejected[b]), int(anchors.rejected[b] + anchors.valid[b].sum()), FARTHEST_OFF),
+            )
 
 
 def _evidence(tensors: Tensors) -> Evidence:

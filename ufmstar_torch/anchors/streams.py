@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -14,8 +15,13 @@ from ufmstar_torch.anchors.tracker import Landmarks
 from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.frame import FRAME_FAULTS, intrinsics_fault, pose_fault
 
+_LOG = logging.getLogger("ufmstar_torch")
+_CAUSES = (
+    "Are poses camera-to-world, of the images' times, and the intrinsics the images'? Does the video stand still? "
+    "(said once)"
+)
 Given = str | Path | LandmarkSource
-_PARTS = ("pixel", "depth", "variance", "valid")
+_PARTS = ("pixel", "depth", "variance", "valid", "pose_error", "shared")
 
 
 class StreamLandmarks:
@@ -38,6 +44,7 @@ class StreamLandmarks:
         self._before = self._states()
         self.needs_image = any(source.needs_image for source in self._sources)
         self.last: list[Landmarks] = []
+        self._warned = set[int]()
 
     def update(
         self, image: Tensor | None, pose: Tensor, intrinsics: Tensor, rotation_tolerance: float | None = None
@@ -79,6 +86,10 @@ class StreamLandmarks:
             self._restore(before, range(b))
             raise
         self._before, self.last = before, result
+        for i, landmarks in enumerate(result):
+            if landmarks.contradicted and i not in self._warned:
+                self._warned.add(i)
+                _LOG.warning("stream %d: %s; no depth is used. %s", i, landmarks.none, _CAUSES)
         room = max(len(landmarks.depth) for landmarks in result)
         each = [landmarks.anchors(K[i].numpy(), K[i], room) for i, landmarks in enumerate(result)]
         parts = (torch.cat([getattr(one, name) for one in each]) for name in _PARTS)

@@ -35,6 +35,16 @@ _MEMORY, _LONG = 0.8, 4
 _NO_TRACK, _NO_DEPTH = "no corner followed from the frame before", "no parallax, or no track that fits the poses"
 # Of the median depth: nearer, a point's position in an image is not computed but bounded.
 _NEAREST = 1e-3
+# Depths of a scene, over the median: where the poses allow a corner's point to be. Half of the corners lie nearer than
+# the median, and matches without motion, as of a frozen image, beyond ten times of it.
+_RANGE, _AHEAD = (1 / 50, 10.0), 0.98
+# Share of the running comparison with the poses that remains after a frame, and the motion of a corner that shows a
+# depth [px].
+_FOLLOWS, _MOVES = 0.6, 1.0
+# Cells of the image, in a row, that count alike in what corners show of the poses.
+_CELLS = 6
+# The median of the absolute value of a standard normal variable.
+_MEDIAN = 0.6745
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,9 @@ class TrackerConfig(Checked):
             parallax, and to leave it out would hide the error there.
         min_share: least share of the triangulated tracks that fit, 0 to 1. Where fewer do, poses and image contradict
             each other, and those that fit do so by chance: none is used.
+        max_pose_error: largest distance of tracked corners from their epipolar lines, a standard deviation, as a share
+            of the image's width: beyond, poses and images contradict each other, and no depth is used.
+        start_depth: median depth of the scene before one is known [m]; right to a factor of 5.
 
     Raises:
         ValueError: an impossible value.
@@ -70,6 +83,8 @@ class TrackerConfig(Checked):
     max_error: float = number(3.0, "", "px", 0, open_low=True)
     max_relative_sigma: float = number(0.4, "", "1", 0, open_low=True)
     min_share: float = number(0.2, "", "1", 0, 1)
+    max_pose_error: float = number(0.01, "", "width", 0, open_low=True)
+    start_depth: float = number(2.0, "", "m", 0, open_low=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -87,6 +102,10 @@ class Landmarks:
         variance: [N] of ``depth`` [m^2].
         tracked: corners followed into this image, of which these N passed all tests; of a map, its landmarks.
         none: why there is no landmark, where N = 0.
+        pose_error: standard deviation of tracked corners from their epipolar lines [px]; NaN = not measured.
+        shared: variance of inverse depths by errors of the poses, the same error for all landmarks of the image
+            [1/m^2]; it is in ``variance`` too.
+        contradicted: the poses contradict the images, and no depth is used.
     """
 
     pixel: NDArray[np.float64]
@@ -94,6 +113,9 @@ class Landmarks:
     variance: NDArray[np.float64]
     tracked: int
     none: str = "no parallax, or no earlier view that agrees"
+    pose_error: float = float("nan")
+    shared: float = 0.0
+    contradicted: bool = False
 
     @classmethod
     def skipped(cls, fault: str) -> Landmarks:
@@ -122,7 +144,8 @@ class Landmarks:
             return torch.from_numpy(full).to(intrinsics.device)
 
         valid = torch.arange(room, device=intrinsics.device)[None] < n
-        result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid)
+        frame = torch.tensor([[self.pose_error], [self.shared]], dtype=torch.float64, device=intrinsics.device)
+        result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, *frame)
         return result.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
 
@@ -131,6 +154,9 @@ class LandmarkTracker(SavedState):
 
     Args:
         config: see :class:`TrackerConfig`; None = its defaults.
+
+    Attributes:
+        baseline: of the corners of the last image, the median over their first views [m].
 
     Example::
 
@@ -148,6 +174,9 @@ class LandmarkTracker(SavedState):
         "_poses": "poses",
         "_view": "view",
         "_noise": "noise",
+        "_off": "off",
+        "baseline": "baseline",
+        "_depth": "depth",
     }
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
@@ -168,6 +197,8 @@ class LandmarkTracker(SavedState):
         self._poses = np.tile(np.eye(4), (w, 1, 1))
         self._view = -1
         self._noise = self.config.pixel_noise**2
+        self._off = -1.0  # variance of corners from their epipolar lines [px^2]; negative = not measured
+        self.baseline, self._depth = 0.0, self.config.start_depth  # of the views, and of the scene [m]
         self._point = np.full((n, 3), np.nan)  # of the corners in the newest image [m]; the window decides it
 
     def state(self) -> dict[str, Tensor]:
@@ -213,9 +244,44 @@ class LandmarkTracker(SavedState):
         self._pixel[:, self._view] = position
         self._poses[self._view] = T
         tracked = int(alive.sum())
-        self._fill(gray)
         self._gray, self._K = gray, K
+        self._compare_with_poses()
+        self._fill(gray)
         return self._landmarks(tracked)
+
+    @property
+    def pose_error(self) -> float:
+        """Standard deviation of corners from their epipolar lines [px]; NaN = not measured."""
+        return float(np.sqrt(self._off)) if self._off >= 0 else float("nan")
+
+    @property
+    def pose_variance(self) -> float:
+        """What errors of the poses add to the variance of a tracked position [px^2]."""
+        return max(self._off - self.config.pixel_noise**2, 0.0)
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the poses contradict the images."""
+        return self._off > (self.config.max_pose_error * self._gray.shape[1]) ** 2
+
+    def _compare_with_poses(self) -> None:
+        """Follow how far corners lie from where the poses allow them to be, each in the first view that has it."""
+        order = (self._view + 1 + np.arange(self.config.window)) % self.config.window
+        seen = self._seen[:, order]
+        chosen = np.flatnonzero(seen[:, -1] & seen[:, :-1].any(1))
+        if len(chosen) < _ENOUGH:
+            return
+        first = order[seen[chosen].argmax(1)]
+        views = self._pixel[chosen, self._view], self._pixel[chosen, first], self._poses[self._view], self._poses[first]
+        distance, rho, baseline = off_lines(*views, self._K, self._depth)
+        cell = (views[0] * _CELLS / self._gray.shape[::-1]).astype(np.int64).clip(0, _CELLS - 1) @ [1, _CELLS]
+        weight = 1 / np.bincount(cell)[cell]  # by area: a thing that moves by itself may have most of the corners
+        now = (_median(distance, weight) / _MEDIAN) ** 2
+        self._off = now if self._off < 0 else _FOLLOWS * self._off + (1 - _FOLLOWS) * now
+        self.baseline = float(np.median(baseline))
+        shows = (rho > 0) & (np.linalg.norm(views[0] - views[1], axis=1) > _MOVES)
+        if shows.sum() >= _ENOUGH:
+            self._depth *= (1 / _median(rho[shows], weight[shows]) / self._depth) ** (1 - _MEMORY)
 
     def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Positions [N, 2] in the new image and which corners could be followed there and back [N]."""
@@ -276,9 +342,12 @@ class LandmarkTracker(SavedState):
         """Triangulate the newest image's corners from the views in the window."""
         config = self.config
         chosen, result = self._triangulated()
-        none = _NO_DEPTH if tracked else _NO_TRACK
-        if result is None:
-            return Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked, none=none)
+        none, judged = _NO_DEPTH if tracked else _NO_TRACK, {"pose_error": self.pose_error}
+        if self.contradicted:
+            none = contradiction(self.pose_error, config.max_pose_error * self._gray.shape[1])
+        if result is None or self.contradicted:
+            nothing = np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked, none
+            return Landmarks(*nothing, **judged, contradicted=self.contradicted)
         T = self._poses[self._view]
         axis = T[:3, 2]
         depth = (result.point - T[:3, 3]) @ axis
@@ -297,7 +366,62 @@ class LandmarkTracker(SavedState):
         # Hopeless geometry can make the covariance indefinite.
         independent = np.maximum(residual, config.pixel_noise**2) * one_pixel
         fine &= (variance >= 0) & (independent <= np.square(config.max_relative_sigma * safe))
-        return Landmarks(self._pixel[chosen][fine, self._view], depth[fine], variance[fine], tracked, none=none)
+        pixel, shared = self._pixel[chosen][fine, self._view], self.shared(self.baseline)
+        variance = variance[fine] + shared * depth[fine] ** 4
+        return Landmarks(pixel, depth[fine], variance, tracked, none, **judged, shared=shared)
+
+    def shared(self, baseline: float) -> float:
+        """Variance of inverse depths by errors of the poses over a baseline [m], alike for all points [1/m^2]."""
+        return self.pose_variance / max(self._K[0, 0] * baseline, 1e-9) ** 2 if self.pose_variance else 0.0
+
+
+def contradiction(error: float, limit: float) -> str:
+    """Why no depth is used, where corners lie ``error`` px from their epipolar lines."""
+    return f"poses contradict the images: corners lie {error:.1f} px from their epipolar lines, at most {limit:.1f}"
+
+
+def off_lines(
+    position: NDArray, before: NDArray, T: NDArray, T_before: NDArray, K: NDArray, depth: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """How far matches lie from where two poses allow them: from the part of the epipolar line on which points of a
+    scene lie. Without parallax, that is a point; a match that moved the wrong way, or not at all, lies beyond its end.
+
+    Args:
+        position: [N, 2] (u, v) in the present view [px].
+        before: [N, 2] in an earlier one.
+        T: [4, 4] camera-to-world of the present view [m].
+        T_before: [N, 4, 4] of the earlier ones.
+        K: [3, 3] [px].
+        depth: median of the scene [m].
+
+    Returns:
+        [N] distances [px], [N] inverse depths of the nearest points of the whole lines [1/m], [N] baselines [m].
+    """
+    rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ np.linalg.inv(K).T
+    into = T_before[:, :3, :3].transpose(0, 2, 1)
+    moved = (into @ (T[:3, 3] - T_before[:, :3, 3])[..., None])[..., 0]
+    x, b = (into @ (T[:3, :3] @ rays.T).T[..., None])[..., 0] @ K.T, moved @ K.T
+
+    # In front of the earlier camera too: 1/z < x_z/-b_z.
+    most = np.where(b[:, 2] < 0, _AHEAD * x[:, 2] / np.maximum(-b[:, 2], 1e-12), np.inf)
+
+    def seen(ratio: float) -> NDArray[np.float64]:
+        point = x + b * np.minimum(1 / (ratio * depth), most)[:, None]
+        return np.asarray(point[:, :2] / np.maximum(point[:, 2:], _NEAREST))
+
+    near, end = (seen(ratio) for ratio in _RANGE)
+    way = end - near
+    share = ((before - near) * way).sum(1) / np.maximum(np.square(way).sum(1), 1e-12)
+    off = before - near - share.clip(0, 1)[:, None] * way
+    speed = b[:, :2] - before * b[:, 2:]
+    rho = ((before * x[:, 2:] - x[:, :2]) * speed).sum(1) / np.maximum(np.square(speed).sum(1), 1e-12)
+    return np.linalg.norm(off, axis=1), rho, np.linalg.norm(moved, axis=1)
+
+
+def _median(values: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
+    """Weighted."""
+    order = values.argsort()
+    return float(values[order[np.searchsorted(weight[order].cumsum(), weight.sum() / 2)]])
 
 
 def checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:

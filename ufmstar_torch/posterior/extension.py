@@ -38,8 +38,13 @@ class PosteriorFrame(FrameExtension):
         claimed = total(out.disagreement).detach()
         frame, anchors, packed = self._anchors.frame, self._anchors.anchors, state.by_stream["posterior"]
         learnt, posterior = self._update(packed, frame, anchors, claimed, self._config.posterior)
-        floor = self._config.variance_floor
-        self._posterior = replace(posterior, variance=posterior.variance.clamp_min(floor))
+        variance = posterior.variance.clamp_min(self._config.variance_floor)
+        if anchors is not None and anchors.contradiction is not None:  # most are off by more than a factor of 100
+            variance = variance + posterior.depth.square() * anchors.contradiction[:, None, None].to(variance.dtype)
+        if anchors is not None and anchors.shared is not None:  # an error of the poses, which no anchor beside can show
+            shared = anchors.shared[:, None, None].to(variance.dtype)
+            variance = variance + torch.minimum(posterior.depth**4 * shared, posterior.depth.square())
+        self._posterior = replace(posterior, variance=variance)
         statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
         return state.with_tensors({"posterior": learnt}), replace(out, statistics=statistics)
 
