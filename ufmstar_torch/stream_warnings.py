@@ -72,14 +72,8 @@ class StreamWarnings:
                 continue
             moving, total = moving + 1, total + used
             if moving >= _MOVED_FRAMES and total < moving:
-                yield (
-                    b,
-                    "anchors",
-                    (
-                        f"{total} anchors were used in {moving} frames of a moving camera, so the error on which all views "
-                        f"agree is not measured. {_CAUSES}"
-                    ),
-                )
+                text = f"{total} anchors were used in {moving} frames of a moving camera, so the error on which all "
+                yield b, "anchors", text + f"views agree is not measured. {_CAUSES}"
             self._moved[b] = place, moving, total
 
 
@@ -91,16 +85,10 @@ def _without_segments(
         return
     given = (statistics.valid_pixels + frame.beyond + frame.out_of_range).tolist()
     for b in (b for b, count in enumerate(segments) if not count and given[b]):
-        yield (
-            b,
-            "segments",
-            (
-                f"a frame has no segment, so nothing is compared between views: of {given[b]} pixels "
-                f"{int(frame.beyond[b])} lie beyond segment.max_depth = {config.segment.depth_limit} m and "
-                f"{int(frame.out_of_range[b])} outside the accepted ranges. Is the depth in metres, smooth, and the "
-                "intrinsics the depth map's?"
-            ),
-        )
+        text = f"a frame has no segment, so nothing is compared between views: of {given[b]} pixels "
+        text += f"{int(frame.beyond[b])} lie beyond segment.max_depth = {config.segment.depth_limit} m and "
+        text += f"{int(frame.out_of_range[b])} outside the accepted ranges. Is the depth in metres, smooth, and the "
+        yield b, "segments", text + "intrinsics the depth map's?"
 
 
 def _alone(statistics: FrameStatistics, frames: Tensor) -> Iterator[tuple[int, str, str]]:
@@ -108,11 +96,5 @@ def _alone(statistics: FrameStatistics, frames: Tensor) -> Iterator[tuple[int, s
     counts = torch.stack([statistics.single_view, statistics.components, frames]).tolist()
     for b, (alone, components, seen) in enumerate(zip(*counts, strict=True)):
         if seen >= _FRAMES and components >= _COMPONENTS and alone > _ALONE * components:
-            yield (
-                b,
-                "views",
-                (
-                    f"after {seen} frames {alone} of {components} Gaussians were seen in one view alone, so hardly "
-                    f"anything is compared between views. {_CAUSES}, or views that do not overlap"
-                ),
-            )
+            text = f"after {seen} frames {alone} of {components} Gaussians were seen in one view alone, so hardly "
+            yield b, "views", text + f"anything is compared between views. {_CAUSES}, or views that do not overlap"
