@@ -169,11 +169,11 @@ def _with_problem(fit: ImageFit, text: str) -> ImageFit:
 def _error(tracks: Iterable[FollowedCorners], T: np.ndarray, K: np.ndarray, reading: Reading) -> float:
     """Median over pairs of the median distance [px]; inf where no pair has poses."""
     convert, scaled = CONVENTIONS[reading.poses].convert, K * np.array([[reading.factor], [reading.factor], [1.0]])
-    distances = [
-        np.median(_beside(one, *convert(T[[one.first + reading.late, one.last + reading.late]]), scaled)[0])
-        for one in tracks
-        if one.first + reading.late >= 0 and one.last + reading.late < len(T)
-    ]
+    distances = []
+    for one in tracks:
+        first, last = one.first + reading.late, one.last + reading.late
+        if first >= 0 and last < len(T):
+            distances.append(np.median(_beside(one, convert(T[first]), convert(T[last]), scaled)[0]))
     return float(np.median(distances)) if distances else float("inf")
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.run.files import write_together
 
 # Metres per count that a run may choose from, finest first: up to 65.5 m, 256 m (KITTI's), 655 m, 6.6 km.
@@ -96,9 +97,8 @@ class FrameWriter:
 
 def read_frame(path: str | Path) -> dict[str, NDArray[Any]]:
     """The maps of a frame's npz: depth [m], variance [m^2], disagreement [m^2], valid, each [H, W]; with anchors
-    also anchored [m^2] and bias, with a posterior its depth and variance."""
-    with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+    also anchored [m^2] and bias, with a posterior its depth and variance. Errors as ``read_npz_whole``."""
+    return read_npz_whole(path)
 
 
 def fitting_unit(depth: NDArray[Any]) -> float:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.engine.predictions import Predicted, PredictionKey
 from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.prediction import DepthPrediction
@@ -54,8 +55,7 @@ class PredictionCache:
             return None
         if len(content) < _DIGEST or hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
             return None
-        with np.load(io.BytesIO(content[_DIGEST:]), allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+        arrays = read_npz_whole(key.path, content[_DIGEST:])
         if bytes(arrays.pop("content")).decode() != key.content:
             return None
         K = torch.from_numpy(arrays.pop("intrinsics"))
