@@ -159,7 +159,7 @@ def test_a_broken_header_is_refused(file, frames, message):
     data = bytearray(file.read_bytes())
     struct.pack_into("<Q", data, HEADER - 8, frames)
     file.write_bytes(data)
-    with pytest.raises(ValueError, match=rf"a\.sens: broken header: {message}"):
+    with pytest.raises(ValueError, match=rf"scene\.sens: broken header: {message}"):
         open_sequence(file)
 
 
