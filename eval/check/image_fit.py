@@ -19,9 +19,10 @@ from ufmstar_torch.anchors.tracker import checked
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
-# Places of the sequence, frames over which corners are followed there at most, and their median motion that suffices,
-# as a share of the image's width.
-_PLACES, _FRAMES, _MOTION = 6, 12, 0.02
+# Places of the sequence, frames over which corners are followed there at most, and their median motions as shares of
+# the image's width at which they are compared: near, where recordings are within a pixel, and far, where a trajectory
+# that is late by a frame of a smooth motion shows.
+_PLACES, _FRAMES, _NEAR, _FAR = 6, 12, 0.02, 0.08
 _CORNERS, _SPACING, _BACK = 200, 14 / 640, 0.5  # as the tracker of anchors has them
 _FEWEST, _STILL = 20, 2.0  # corners of a pair, and their median motion [px], without which it shows nothing
 # Other readings: frames by which the trajectory is late, and factors of the intrinsics. Nearer to 1 is calibration.
@@ -103,15 +104,17 @@ def track_corners(sequence: FrameSequence, indices: range | None = None) -> list
     ``indices``. Frames without an image or that cannot be read end a track; corners that hardly move are left out."""
     first, last = (0, len(sequence) - 1) if not indices else (min(indices), max(indices))
     starts = np.unique(np.linspace(first, max(first, last - _FRAMES // 2), _PLACES).astype(int)).tolist()
-    tracked = (_followed(sequence, start, min(start + _FRAMES, last)) for start in starts)
-    return [one for one in tracked if one is not None and one.motion >= _STILL]
+    tracked = (one for start in starts for one in _followed(sequence, start, min(start + _FRAMES, last)))
+    return [one for one in tracked if one.motion >= _STILL]
 
 
-def _followed(sequence: FrameSequence, first: int, last: int) -> FollowedCorners | None:
+def _followed(sequence: FrameSequence, first: int, last: int) -> list[FollowedCorners]:
+    """The first frame with the first one at which corners moved near, and with that at which they moved far or were
+    followed last."""
     image = _gray(sequence, first)
     if image is None:
-        return None
-    width, result = image.shape[1], None
+        return []
+    width, result = image.shape[1], list[FollowedCorners]()
     start = find(image, _CORNERS, _SPACING * width, np.zeros((0, 2)))
     position = start
     for index in range(first + 1, last + 1):
@@ -122,8 +125,9 @@ def _followed(sequence: FrameSequence, first: int, last: int) -> FollowedCorners
         start, position, image = start[alive], position[alive], following
         if len(start) < _FEWEST:
             break
-        result = FollowedCorners(first, index, start, position)
-        if result.motion >= _MOTION * width:
+        one = FollowedCorners(first, index, start, position)
+        result = [*result[: bool(result) and result[0].motion >= _NEAR * width], one]
+        if one.motion >= _FAR * width:
             break
     return result
 
@@ -147,14 +151,19 @@ def image_fit(sequence: FrameSequence, tracks: Sequence[FollowedCorners]) -> Ima
     T = np.array([entry.T_world_cam for entry in sequence.entries])
     others = [Reading(poses=name) for name in CONVENTIONS if name != OURS] + [Reading(late=n) for n in _LATE]
     others += [Reading(factor=float(factor)) for factor in _FACTORS]
-    error = _error(tracks, T, sequence.intrinsics, GIVEN)
-    errors = [_error(tracks, T, sequence.intrinsics, other) for other in others]
-    best, reading = min(zip(errors, others, strict=True), key=lambda pair: pair[0])
-    if not (error > _HALVES * best and error - best > _APART):
-        best, reading = error, GIVEN
-    motion = float(np.median([one.motion for one in tracks]))
+    near = list({one.first: one for one in reversed(tracks)}.values())
+    far = list({one.first: one for one in tracks}.values())
+    reading = GIVEN
+    best = error = _error(near, T, sequence.intrinsics, GIVEN)
+    for pairs in (near, far):
+        given = _error(pairs, T, sequence.intrinsics, GIVEN)
+        errors = [_error(pairs, T, sequence.intrinsics, other) for other in others]
+        least = min(errors)
+        if reading == GIVEN and given > _HALVES * least and given - least > _APART:
+            reading, error, best = others[errors.index(least)], given, least
+    motion = float(np.median([one.motion for one in near]))
     width = 2 * sequence.intrinsics[0, 2] if sequence.image_size is None else sequence.image_size[1]
-    fit = ImageFit(len(tracks), motion, error, reading, best, "")
+    fit = ImageFit(len(near), motion, error, reading, best, "")
     if reading != GIVEN:
         return _with_problem(fit, f"{reading}: corners fit to {best:.1f} px then")
     if error > max(_FINE, _LARGEST * width):
@@ -228,6 +237,10 @@ def depth_fit(
     if order < _INVERSE:
         problem = f"far is near in the depth (rank correlation {order:.2f} with tracked corners): is it inverse depth?"
     elif not 1 / _UNITS < ratio < _UNITS:
-        factor = f"{ratio:.3g} times" if ratio > 1 else f"1/{1 / ratio:.3g} of"
+        factor = f"{_digits(ratio)} times" if ratio > 1 else f"1/{_digits(1 / ratio)} of"
         problem = f"depth is {factor} that of tracked corners by parallax: one of depth and poses is not in metres"
     return DepthFit(len(ratios), ratio, order, problem)
+
+
+def _digits(factor: float) -> str:
+    return f"{factor:.0f}" if factor >= 10 else f"{factor:.1f}"
