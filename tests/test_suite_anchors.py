@@ -173,9 +173,9 @@ def test_truth_is_exact_at_random_pixels_and_more_hold_the_fewer(tour):
 
     def drawn(count, seed=0):
         source = AnchorSource(Setting(anchors="truth", anchor_count=count, seed=seed), None)
-        result = source.of(frame, frame.T_world_cam, p, truth)
-        assert result.ms is None
-        return result.anchors
+        _, anchors, ms = source.of(frame, frame.T_world_cam, p, truth)
+        assert ms is None
+        return anchors
 
     few, many, default = drawn(20), drawn(300), drawn(None)
     assert [a.depth.shape[1] for a in (few, many, default)] == [20, 300, 100]
@@ -196,10 +196,10 @@ def test_track_noise_has_the_size_that_the_tracker_states_for_it(tour):
         pair = []
         for size, own in zip((0.0, 0.5), tracks, strict=True):
             source = AnchorSource(Setting(anchors="tracked", track_noise=size), own)
-            result = source.of(frame, frame.T_world_cam, p, None)
-            assert isinstance(result.anchors, Anchors)
-            assert result.ms > 0
-            pair.append(result.anchors)
+            _, anchors, ms = source.of(frame, frame.T_world_cam, p, None)
+            assert isinstance(anchors, Anchors)
+            assert ms > 0
+            pair.append(anchors)
         assert torch.equal(pair[0].variance, pair[1].variance), "the tracker does not know of the noise"
         clean.append(torch.cat([pair[0].pixel, pair[0].depth[..., None]], -1)[0])
         noisy.append(torch.cat([pair[1].pixel, pair[1].depth[..., None]], -1)[0])

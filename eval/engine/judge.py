@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -40,9 +41,8 @@ def metrics_of(metrics: dict[str, SequenceMetrics], key: str, **how: Any) -> Seq
 
 class RunMetrics(FrameSink):
     """The figures of a run's row, ``UFM``, beside them those of its network alone, ``ALONE``, and of its ``POSTERIOR``.
-    All are of the pixels that the row uses; the others are masked. ``sums`` are those of an earlier part of the run."""
-
-    stage: str | None = "metrics"
+    All are of the pixels that the row uses; the others are masked. ``sums`` are those of an earlier part of the run.
+    Its time is added to ``FrameResult.ms`` as "metrics" [ms]."""
 
     def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]]) -> None:
         self._key = key
@@ -64,10 +64,12 @@ class RunMetrics(FrameSink):
 
     def take(self, result: FrameResult) -> None:
         """Add a frame."""
-        row = result.rows.get(self._key)
-        if row is None or row.truth is None:
-            return
-        target = torch.from_numpy(row.truth)
+        started, row = perf_counter(), result.rows.get(self._key)
+        if row is not None and row.truth is not None:
+            self._add(row, torch.from_numpy(row.truth))
+        result.ms["metrics"] = 1000 * (perf_counter() - started)
+
+    def _add(self, row: RowResult, target: Tensor) -> None:
         maps: dict[str, tuple[Tensor, Tensor | None]] = {UFM: (row.depth, row.variance)}
         maps |= {} if row.network_variance is None else {ALONE: (row.depth, row.network_variance)}
         if row.posterior_depth is not None:
