@@ -20,8 +20,8 @@ from ufmstar_torch.eval.bench.energy import CPU, GPU, Energy, EnergyMeter, diffe
 from ufmstar_torch.eval.bench.memory import overhead_percent
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
 from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, Part, TimedParts, inference_of, time_parts
-from ufmstar_torch.eval.bench.timing import pinned_threads
-from ufmstar_torch.eval.engine.clock import paired_ratio, spread, synchronize
+from ufmstar_torch.eval.bench.timing import paired_ratio, pinned_threads, spread
+from ufmstar_torch.eval.engine.clock import synchronize
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.files import write_json_atomic
