@@ -120,7 +120,7 @@ def test_declared_ranges_reach_the_pipeline_and_the_evaluation():
     assert AlignedNetwork(network, Alignment("inverse", 1.0, 0.0, max_depth=5.0)).max_depth == 5.0
     assert UfMStarConfig().within(7.0).segment == SPGFConfig(max_depth=7.0)
     assert UfMStarConfig().segment.depth_limit == 20.0
-    source = NetworkSource(NetworksInTurn(network), torch.device("cpu"), {}, seeding=None)
+    source = NetworkSource(NetworksInTurn(network), torch.device("cpu"), {})
     assert source.max_depth == 7.0
     made = make_estimator(Row(Method.parse("UfM*-DepthOnly")), torch.device("cpu"), source.max_depth)
     assert made.ufm.config.segment.max_depth == 7.0

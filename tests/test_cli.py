@@ -264,7 +264,7 @@ def test_a_run_prints_its_table_and_outputs(ufmstar, path, tmp_path, brightness)
     assert lines[-1] == "ufmstar run: finished: 6 of 6 frames"
     assert [line for line in err.splitlines() if "frames" in line] == ["frames: 0 of 6", "frames: done, 6 of 6"]
     assert "%" not in err
-    assert [file["name"] for file in summary["source"]["weights"]] == ["first.pt", "second.pt"]
+    assert [file["name"] for file in summary["source"]["files"]] == ["first.pt", "second.pt"]
 
 
 def test_other_weights_under_the_same_name_do_not_go_on(ufmstar, path, tmp_path, brightness):

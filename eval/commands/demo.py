@@ -120,7 +120,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     warm_up_command(config, device, lambda done, total: progress(Progress("kernels", done, total)), dense=True)
     progress(Progress("rooms", 0, options.frames))
     sequence = in_memory(tour_sequence(**tour), lambda done: progress(Progress("rooms", done, options.frames)))
-    networks = NetworkSource(NetworksInTurn(members, preprocess=members[0].preprocess), device, {}, seeding=None)
+    networks = NetworkSource(NetworksInTurn(members, preprocess=members[0].preprocess), device, {})
     suite = suite_named("demo")
     names = {row.slug: name for row, name in zip(suite.rows[: 5 if len(members) > 1 else 4], ROWS, strict=False)}
     rooms = make_tour(options.seed, "mixed")

@@ -91,8 +91,8 @@ def folder_source(
     selected = [name for index in chosen if (name := sequence.names[index]) not in (run.skipped if run else ())]
     if not selected:
         raise ValueError(f"{folder}: none of the {len(chosen)} frames has a map")
-    place = DepthFolder(run.frames if run else folder, scale, variance)
-    maps = place.for_frames(sequence.names, sequence.names_on_disk, selected)
+    found = DepthFolder(run.frames if run else folder, scale, variance)
+    maps = found.for_frames(sequence.names, sequence.names_on_disk, selected)
     number = {name: i for i, name in enumerate(selected)}
     K_given = None if intrinsics is None else read_intrinsics(intrinsics)
 
@@ -101,17 +101,11 @@ def folder_source(
             raise FrameError(frame.name, f"skipped in {folder}: {run.skipped[frame.name]}" if run else "no map")
         file = maps.depth_files[number[frame.name]]
         depth, spread = maps[number[frame.name]]
-        if K_given is not None:
-            return depth, spread, K_given
-        if run is not None and file.stem in run.intrinsics:
-            return depth, spread, run.intrinsics[file.stem]
-        try:
-            K = scale_intrinsics(frame.intrinsics, sequence.image_size, depth.shape[:2])
-        except ValueError as error:
-            raise FrameError(file, _cropped(sequence, depth)) from error
-        return depth, spread, K
+        K = K_given if run is None or K_given is not None else run.intrinsics.get(file.stem)
+        return depth, spread, _of_whole_image(file, depth, sequence, frame.intrinsics) if K is None else K
 
-    _check_first(sequence, maps, K_given is not None or run is not None)
+    if K_given is None and run is None:
+        _check_first(sequence, maps)
     files = (*maps.depth_files, *maps.variance_files)
     listing = "\n".join(f"{file.name} {file.stat().st_size}" for file in files)
     identity = {
@@ -124,24 +118,26 @@ def folder_source(
     return MapSource(read, identity, size=size)
 
 
-def _check_first(sequence: FrameSequence, maps: DepthMaps, any_shape: bool) -> None:
-    """Raises ValueError at once where the first map has another shape than the images, as then all have."""
+def _check_first(sequence: FrameSequence, maps: DepthMaps) -> None:
+    """Raises ValueError where the first map has another aspect ratio than the images, as then all have."""
     try:
         depth, _ = maps[0]
-        if not any_shape:
-            scale_intrinsics(sequence.intrinsics, sequence.image_size, depth.shape[:2])
     except FrameError:  # counted when its turn comes
         return
+    try:
+        _of_whole_image(maps.depth_files[0], depth, sequence, sequence.intrinsics)
+    except FrameError as error:
+        raise ValueError(str(error)) from error
+
+
+def _of_whole_image(file: Path, depth: np.ndarray, sequence: FrameSequence, K: np.ndarray) -> np.ndarray:
+    """[3, 3] the camera of a map that shows the whole image, whose intrinsics are K. Raises FrameError: it does not."""
+    try:
+        return scale_intrinsics(K, sequence.image_size, depth.shape[:2])
     except ValueError as error:
-        raise ValueError(f"{maps.depth_files[0]}: {_cropped(sequence, depth)}") from error
-
-
-def _cropped(sequence: FrameSequence, depth: np.ndarray) -> str:
-    height, width = sequence.image_size or (0, 0)
-    return (
-        f"the map is {depth.shape[1]}x{depth.shape[0]}, the images are {width}x{height}: it does not show the whole "
-        "image: give the intrinsics of the maps, --map-intrinsics"
-    )
+        height, width = sequence.image_size or (0, 0)
+        reason = f"the map is {depth.shape[1]}x{depth.shape[0]}, the images are {width}x{height}: it does not show the "
+        raise FrameError(file, f"{reason}whole image: give the intrinsics of the maps, --map-intrinsics") from error
 
 
 def own_depth(
