@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 from layouts import write_generic
 
-from ufmstar_torch.eval.engine.evaluate import RowFigures
+from ufmstar_torch.eval.engine.judge import RowFigures
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.stream import Stopped

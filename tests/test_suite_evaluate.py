@@ -12,7 +12,7 @@ from layouts import truncate, write_generic, write_tum
 from tiny_suite import CPU, base_network, evaluate, row, same, unbatched, write_networks
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.eval.engine.evaluate import SequenceError
+from ufmstar_torch.eval.engine.judge import SequenceError
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.sequences import FrameError, open_sequence

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ufmstar_torch.eval.commands.options import UsageError, as_dict, parse
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.engine.evaluate import RowFigures
+    from ufmstar_torch.eval.engine.judge import RowFigures
     from ufmstar_torch.eval.engine.progress import Progress
 
 _WEIGHTS = ("weights", "demo.safetensors")

@@ -9,7 +9,10 @@ pixels.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.rows import RowResult
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.methods import method
 from ufmstar_torch.eval.methods.row import Row
 
@@ -28,6 +31,10 @@ if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence with
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Of a row's sums.
 METRICS, BY_ERROR = "metrics", "nll_by_error"
+
+
+class SequenceError(Exception):
+    """A sequence cannot be used as a whole: no frame can be read, or there is no ground truth."""
 
 
 def metrics_of(metrics: dict[str, SequenceMetrics], key: str, **how: Any) -> SequenceMetrics:
@@ -78,65 +85,110 @@ class RunMetrics(FrameSink):
             metrics_of(self._metrics, name).update(depth, variance, target, row.valid)
 
 
-class RowMetrics(FrameSink):
-    """The figures of every row of an evaluation.
+@dataclass(frozen=True)
+class RowFigures:
+    """The figures of one row on one sequence."""
 
-    Pixels that a row leaves out are NaN, not masked, so that the metrics count them.
+    row: Row  # which
+    # frames, figures, curves, state, ms: as ``Record`` has them.
+    frames: dict[str, Any]
+    figures: dict[str, float]
+    curves: dict[str, Any]
+    state: dict[str, float]
+    ms: dict[str, float]
+    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and "nll_by_error:REFERENCE"
+    # (``NLLByError``), to be added up over sequences.
+    sums: dict[str, dict[str, Tensor]]
 
-    Args:
-        references: by row, the rows on whose confident pixels its NLL is binned by error, and their names.
-        confident: of the pixels of a frame, the share of which a reference counts as confident.
-        bins: of the calibration errors, see ``SequenceMetrics``.
 
-    Attributes:
-        judged: frames with ground truth, by row.
-    """
+class RowJudge:
+    """Collects counts, metrics, times and memory of one row over a sequence; ``named`` are the references by whose
+    confident pixels its NLL is binned by error: their names by key."""
 
-    def __init__(self, references: Mapping[str, Mapping[str, str]], confident: float, bins: str = "ours") -> None:
-        self._references, self._confident = references, confident
+    def __init__(self, row: Row, named: Mapping[str, str], bins: str) -> None:
+        self.row, self.named, self._bins = row, named, bins
         self._metrics: dict[str, SequenceMetrics] = {}
-        self._bins = bins
-        self._by_error: dict[str, dict[str, NLLByError]] = {}
-        self.judged = dict.fromkeys(references, 0)
+        self._by_error: dict[str, NLLByError] = {}
+        self._judged, self.reasons = 0, Counter[str]()
+        self._ms: list[Mapping[str, float]] = []
+        self._memory: list[Mapping[str, float]] = []
+
+    def add(self, result: RowResult, memory: Mapping[str, float], masks: Mapping[str, Tensor]) -> None:
+        """Add a frame. Pixels that the row leaves out are NaN, not masked, so that the metrics count them."""
+        self._ms.append(result.ms)
+        self._memory.append(memory)
+        if result.truth is None:
+            return
+        from ufmstar_torch.eval.metrics import NLLByError
+
+        self._judged += 1
+        depth, variance, target = (
+            torch.where(result.valid, result.depth, torch.nan), result.variance, torch.from_numpy(result.truth)
+        )  # fmt: skip
+        how = {"with_variance": variance is not None, "bins": self._bins}
+        metrics_of(self._metrics, METRICS, **how).update(depth, variance, target)
+        for other, name in self.named.items() if variance is not None else ():
+            by_error = self._by_error.setdefault(name, NLLByError(sync_on_compute=False))
+            by_error.update(depth, variance, target, masks[other])
+
+    def figures(self) -> RowFigures:
+        """The figures after the last frame. Raises SequenceError: no frame was judged."""
+        reasons, done, skipped = dict(sorted(self.reasons.items())), len(self._ms), self.reasons.total()
+        if not self._judged:
+            worst = "; ".join(f"{count} x {reason}" for reason, count in list(reasons.items())[:3])
+            raise SequenceError(f"no frame could be judged: {worst or 'none of those that were read has ground truth'}")
+        frames = {"selected": done + skipped, "done": done, "judged": self._judged, "skipped": skipped}
+        metrics = self._metrics[METRICS]
+        curves: dict[str, Any] = metrics.curves()
+        sums = {METRICS: metrics.state_dict()}
+        for name, by_error in self._by_error.items():
+            curves |= {f"{curve}:{name}": values.tolist() for curve, values in by_error.compute().items()}
+            sums[f"{BY_ERROR}:{name}"] = by_error.state_dict()
+        stages = ("network", "anchors", "uncertainty")
+        times = {stage: [ms[stage] for ms in self._ms if stage in ms] for stage in stages}
+        return RowFigures(
+            row=self.row,
+            frames={**frames, "reasons": reasons},
+            figures=metrics.compute(),
+            curves=curves,
+            state=self._state(),
+            ms={stage: median(values) for stage, values in times.items() if values},
+            sums={name: {entry: value.cpu() for entry, value in own.items()} for name, own in sums.items()},
+        )
+
+    def _state(self) -> dict[str, float]:
+        """The size of the method's state over the sequence, as ``Record`` has it."""
+        state: dict[str, float] = {}
+        for name, end in self._memory[-1].items():
+            values = [memory[name] for memory in self._memory]
+            mean = sum(values) / len(values)
+            if name in ("bytes", "count"):
+                state |= {f"{name}_mean": mean, f"{name}_max": max(values), f"{name}_end": end}
+            else:
+                state |= {"anchors_mean": mean} if name == "anchors" else {name: end}
+        return state
+
+
+class RowJudges(FrameSink):
+    """Judges every row of an evaluation, by key; of the pixels of a frame, a reference counts the share ``confident``
+    as confident."""
+
+    def __init__(self, judges: Mapping[str, RowJudge], confident: float) -> None:
+        self._judges, self._confident = judges, confident
+
+    def begin(self, stream: FrameStream) -> None:
+        self._estimators = {row.key: row.estimator for row in stream.rows}
 
     def take(self, result: FrameResult) -> None:
         """Add a frame."""
-        targets = {key: torch.from_numpy(row.truth) for key, row in result.rows.items() if row.truth is not None}
-        expected = {other for key in targets for other in self._references[key]}
-        masks = {other: confident_pixels(result.rows[other], targets[other], self._confident) for other in expected}
-        for key, target in targets.items():
-            self._judge(key, result.rows[key], target, masks)
-
-    def _judge(self, key: str, row: RowResult, target: Tensor, masks: Mapping[str, Tensor]) -> None:
-        from ufmstar_torch.eval.metrics import NLLByError
-
-        self.judged[key] += 1
-        depth = torch.where(row.valid, row.depth, torch.nan)
-        metrics = metrics_of(self._metrics, key, with_variance=row.variance is not None, bins=self._bins)
-        metrics.update(depth, row.variance, target)
-        if row.variance is None:
-            return
-        binned = self._by_error.setdefault(key, {})
-        for other, name in self._references[key].items():
-            by_error = binned.setdefault(name, NLLByError(sync_on_compute=False))
-            by_error.update(depth, row.variance, target, masks[other])
-
-    def figures(self, key: str) -> dict[str, float]:
-        """``SequenceMetrics.compute`` of a judged row."""
-        return self._metrics[key].compute()
-
-    def curves(self, key: str) -> dict[str, Any]:
-        """``SequenceMetrics.curves`` of a judged row, and its NLL and error by reference."""
-        curves: dict[str, Any] = self._metrics[key].curves()
-        for reference, by_error in self._by_error.get(key, {}).items():
-            curves |= {f"{name}:{reference}": curve.tolist() for name, curve in by_error.compute().items()}
-        return curves
-
-    def sums(self, key: str) -> dict[str, dict[str, Tensor]]:
-        """States of a judged row's metrics on the CPU by name: "metrics" and "nll_by_error:REFERENCE"."""
-        named: dict[str, Any] = {METRICS: self._metrics[key]}
-        named |= {f"{BY_ERROR}:{reference}": binned for reference, binned in self._by_error.get(key, {}).items()}
-        return {name: {entry: value.cpu() for entry, value in m.state_dict().items()} for name, m in named.items()}
+        for key, reason in result.skipped.items():
+            self._judges[key].reasons[reason] += 1
+        expected = {
+            other for key, row in result.rows.items() if row.truth is not None for other in self._judges[key].named
+        }
+        masks = {other: confident_pixels(result.rows[other], self._confident) for other in expected}
+        for key, row in result.rows.items():
+            self._judges[key].add(row, self._estimators[key].memory(), masks)
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:
@@ -162,11 +214,12 @@ def references(row: Row, rows: Sequence[Row]) -> list[Row]:
     return chosen
 
 
-def confident_pixels(row: RowResult, truth: Tensor, share: float) -> Tensor:
-    """[h, w] bool, of the pixels with ground truth [h, w] [m] (0 = none) those whose variance is at or below the
-    frame's ``share`` quantile, in (0, 1]."""
+def confident_pixels(row: RowResult, share: float) -> Tensor:
+    """[h, w] bool, True where there is ground truth and the variance is at or below the frame's ``share`` quantile,
+    in (0, 1]."""
     assert row.variance is not None
-    judged = row.valid & (truth > 0)
+    assert row.truth is not None
+    judged = row.valid & torch.from_numpy(row.truth > 0)
     values = row.variance[judged]
     if not len(values):
         return judged

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from ufmstar_torch.eval.engine.anchors import landmark_digests
-from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, RowFigures, evaluate_sequence
-from ufmstar_torch.eval.engine.judge import references
+from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, evaluate_sequence
+from ufmstar_torch.eval.engine.judge import RowFigures, references
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row

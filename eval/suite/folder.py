@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import RowFigures
+from ufmstar_torch.eval.engine.judge import RowFigures
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.metrics.packed_sums import pack
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
