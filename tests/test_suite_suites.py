@@ -44,7 +44,6 @@ def test_tables_have_the_papers_rows_in_its_order(number, rows):
     suite = suite_named(f"paper-table-{number}")
     assert [row.method.name for row in plain_rows(suite.rows)] == rows.split()
     assert {row.setting.preprocess for row in suite.rows} == {"resize"}
-    assert suite.sequences == 100
     assert suite.efficiency == (number in (1, 2))
 
 
@@ -116,7 +115,6 @@ def test_figures_vary_what_the_paper_varies():
     assert [(r.setting.skip, r.method.name) for r in overlap.rows] == [
         (skip, name) for name in ("Aleatoric", *["UfM*-Aleatoric"] * 2) for skip in (0, 1, 2, 4, 8, 16, 32)
     ]
-    assert suite_named("paper-figure-entropy").datasets == ("scannet", "tartanair", "kitti360")
 
 
 @pytest.mark.parametrize(
@@ -163,7 +161,6 @@ def test_rows_without_a_network_are_left_out():
 TOML = """
 title = "Smoothing"
 sweep = ["ema_alpha"]
-datasets = ["scannet"]
 [[rows]]
 methods = ["Ensemble", "UfM*-Ensemble"]
 [[rows]]
@@ -203,12 +200,7 @@ methods = ["Ensemble"]
 def test_a_suite_from_a_file(tmp_path):
     (tmp_path / "my-own.toml").write_text(TOML)
     suite = suite_named(str(tmp_path / "my-own.toml"))
-    assert (suite.name, suite.title, suite.sweep, suite.datasets) == (
-        "my-own",
-        "Smoothing",
-        ("ema_alpha",),
-        ("scannet",),
-    )
+    assert (suite.name, suite.title, suite.sweep) == ("my-own", "Smoothing", ("ema_alpha",))
     assert suite.rows[:2] == rows_of(["Ensemble", "UfM*-Ensemble"])
     assert [row.setting.to_dict() for row in suite.rows[2:]] == [
         {"ema_alpha": alpha, "segment.min_pixels": 2000, **({"skip": skip} if skip else {})}

@@ -6,7 +6,7 @@ last room has other sizes and textures.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -14,7 +14,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from ufmstar_torch.eval.commands.options import UsageError, as_dict, parse
+from ufmstar_torch.eval.commands.options import UsageError, as_dict, reader
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.engine.judge import RowFigures
@@ -57,9 +57,7 @@ class DemoOptions:
             raise ValueError(f"--seed must be at least 0, got {self.seed}")
 
 
-def read(words: Sequence[str]) -> DemoOptions:
-    """The options of a command line; errors as :func:`parse`."""
-    return parse(DemoOptions, words, "ufmstar demo")
+read = reader(DemoOptions, "ufmstar demo")
 
 
 def main(options: DemoOptions) -> int:
