@@ -34,7 +34,7 @@ commands:
 
 ufmstar COMMAND --help shows a command's options, ufmstar --version the version.
 """
-# What a network, a file or a full disk may raise. A user gets one line, and the traceback with --debug.
+# Errors of a network, a file or a full disk. A user gets one line, and the traceback with --debug.
 _FAILURES = (ImportError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
 
 # OpenMP starts as many threads as it is told; thousands of them stall the machine and crash torch.

@@ -76,7 +76,7 @@ def measure(
         meter: of energy; None = what this machine has.
 
     Returns:
-        Plain values for JSON, described in the docs. What could not be measured has the reason in place of numbers.
+        Plain values for JSON, described in the docs; in place of numbers the reason where a part was not measured.
 
     Raises:
         ValueError: no row can be measured, or too few frames can be read.

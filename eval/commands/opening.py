@@ -10,7 +10,7 @@ from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
 LAYOUTS = ("auto", "tum", "7scenes", "scannet", "sens", "tartanair", "kitti360", "nyu", "generic")
-# What `open_sequence` calls the options whose names on the command line say that they are about ground truth.
+# Names in `open_sequence` of the options for ground truth.
 _TRUTH = {"truth": "depth", "truth_scale": "depth_scale"}
 
 

@@ -27,9 +27,9 @@ from ufmstar_torch.eval.methods.row import Row
 if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence without ground truth need not wait for
     from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 
-# Of a run: UfM*, beside it the network alone, and the posterior where there is one.
+# Names of a run's figures: UfM*, beside it the network alone, and the posterior if there is one.
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
-# Of a row's sums.
+# Names of a row's sums.
 METRICS, BY_ERROR = "metrics", "nll_by_error"
 
 

@@ -41,8 +41,8 @@ class NetworkChoice:
     # a name that ``load_network`` accepts, or "ground-truth" (of "depth_only": the sequence's own depth, which shows
     # what a method makes of perfect depth).
     model: str
-    # its weights, one or several files, in the order of the members. Of "trained", "FILE#2" is member 2 of the file
-    # alone. A file .json is the spec that goes with the weights. Of "ground-truth" nothing, or "HxW".
+    # weights, one or several files, in the order of the members: "FILE#2" is member 2 of a file of "trained" alone, a
+    # file .json the spec that belongs to the weights; for "ground-truth" nothing, or "HxW".
     files: tuple[str, ...] = ()
     label: str = ""  # as shown; "" = derived from the files
 

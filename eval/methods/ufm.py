@@ -217,7 +217,7 @@ class UfM(StatefulModule):
         first = torch.where((fine & ~state["started"])[:, None, None], frame.T_world_cam, state["T_world_first"])
         R, t = relative_pose(frame.T_world_cam, first)
         s2 = self._observation_variance(frame)
-        # Of a stream at fault no pixel is valid: nothing is taken in.
+        # No pixel of a stream at fault is valid: it stays as it is.
         given = zip(clouds, frame.depth, s2, frame.valid, frame.intrinsics, R, t, strict=True)
         taken = [take_in(cloud, View(*view), self.config.max_points) for cloud, *view in given]
 

@@ -2,7 +2,7 @@
 
 Ranks need all pixels at once; a stream has none of the earlier ones. So the pixels go into bins of equal
 width in the logarithm of the variance and of the error, finer than anyone reads a variance, and pixels
-of one bin count as ties. What that can change is bounded: see each class.
+of one bin count as ties. Each class states a bound on the error that this makes.
 """
 
 from __future__ import annotations

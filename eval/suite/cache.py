@@ -1,7 +1,7 @@
 """Predictions on disk, so that a network sees an image once, however often the rows on it are changed.
 
 One file for each network, frame and member: ``NETWORK/SEQUENCE/FRAME@MEMBER.maps``, which begins with the SHA-256
-of the rest, an npz with the maps in float32. What is read is bit for bit what was written, or is not used.
+of the rest, an npz with the maps in float32. A file that was changed or cut off is not used.
 """
 
 from __future__ import annotations
