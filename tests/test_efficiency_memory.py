@@ -10,8 +10,16 @@ import torch
 from efficiency_cases import network
 from onnx_files import small_network, write_fastdepth
 
-from ufmstar_torch.eval.bench.memory import overhead_percent, weight_bytes
-from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, depth_alone, timed_networks
+from ufmstar_torch.eval.bench.measure import overhead_percent
+from ufmstar_torch.eval.bench.networks import (
+    DEPTH,
+    EVERY,
+    ONCE,
+    TimedNetwork,
+    depth_alone,
+    timed_networks,
+    weight_bytes,
+)
 from ufmstar_torch.eval.bench.parts import MultiviewStep
 from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.method import Method

@@ -18,8 +18,7 @@ import torch
 from trainings import RECIPE, logged, tiny_job, with_network, write_frames
 
 from ufmstar_torch.models.checkpoints import read_safetensors
-from ufmstar_torch.train.ensemble import share_of_time
-from ufmstar_torch.train.fit import fit
+from ufmstar_torch.train.fit import fit, share_of_time
 from ufmstar_torch.train.member import WEIGHTS, make_data
 
 # Without batch norm, whose statistics are those of each process's own part of the batch.
