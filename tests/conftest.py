@@ -112,6 +112,6 @@ def ufmstar(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
 @pytest.fixture(scope="session")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three sequences of 4 frames. Nobody may change them."""
-    from suite_runs import write_rooms
+    from tiny_suite import write_rooms
 
     return write_rooms(tmp_path_factory.mktemp("rooms"))

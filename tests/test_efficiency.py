@@ -9,8 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from efficiency_cases import SIZE, network, room_sequence, rows_of
+from efficiency_cases import SIZE, network, room_sequence
 from tiny_networks import Linear
+from tiny_suite import rows_of
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.bench.energy import CPU, GPU
@@ -18,9 +19,6 @@ from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.parts import MULTIVIEW, MultiviewStep, time_parts
 from ufmstar_torch.eval.engine.predictions import Predicted
-from ufmstar_torch.eval.methods.method import Method
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.any_network import wrap_network
 from ufmstar_torch.models.preprocess import Preprocess
@@ -83,11 +81,11 @@ def test_stages_add_up_and_warm_up_is_not_counted(timed):
 
 @pytest.mark.parametrize("anchors", ["tracked", "dense"])
 def test_rows_with_anchors_and_a_posterior_are_measured(sequence, anchors):
-    row = Row(Method.parse("UfM*-Aleatoric"), Setting(anchors=anchors, posterior=True))
+    (one,) = rows_of("UfM*-Aleatoric", anchors=anchors, posterior=True)
     aleatoric = {"aleatoric": TimedNetwork("aleatoric", [network()], "Linear")}
-    timed = parts_of([row], aleatoric, list(sequence)[:4], warm_up=1)
-    assert min(timed.ms(row.label, MULTIVIEW)) > 0
-    step, frame = MultiviewStep(row, torch.device("cpu")), sequence[0]
+    timed = parts_of([one], aleatoric, list(sequence)[:4], warm_up=1)
+    assert min(timed.ms(one.label, MULTIVIEW)) > 0
+    step, frame = MultiviewStep(one, torch.device("cpu")), sequence[0]
     x, K = aleatoric["aleatoric"].prepare(frame, torch.device("cpu"))
     prediction = aleatoric["aleatoric"].predict(ONCE, x, K)
     answer = step(image_tensor(frame), frame, Predicted(prediction, K))
@@ -181,7 +179,7 @@ def test_a_row_states_its_latency_and_memory(unpowered):
 
 def test_what_cannot_be_measured_is_left_out_and_named(sequence):
     one = {"ensemble": TimedNetwork("ensemble", [network()], "Linear")}
-    odd = [Row(Method.parse("UfM*-Ensemble"), Setting(**s)) for s in ({"skip": 2}, {"anchors": "truth"})]
+    odd = [*rows_of("UfM*-Ensemble", skip=2), *rows_of("UfM*-Ensemble", anchors="truth")]
     rows = [*rows_of("Ensemble", "UfM*-Ensemble", "Evidential"), *odd]
     message = measure(rows, one, sequence, plan=QUICK, meter=NO_METER)
     assert [row["row"] for row in message["rows"]] == ["UfM*-Ensemble"]

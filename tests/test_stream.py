@@ -21,6 +21,7 @@ from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream, Stopped
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
+from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.tour.sequence import open_tour
 
 FRAMES = 6
@@ -51,13 +52,7 @@ def sequence(tmp_path_factory):
 @pytest.fixture(scope="module")
 def tour():
     """Rendered frames in memory, with corners to track."""
-    rendered = open_tour("tour:5?frames=6&size=96x128")
-    frames = list(rendered)
-    entries = [
-        replace(entry, load_image=lambda f=f: f.image, load_depth=lambda f=f: f.depth)
-        for entry, f in zip(rendered.entries, frames, strict=True)
-    ]
-    return replace(rendered, entries=tuple(entries))
+    return in_memory(open_tour("tour:5?frames=6&size=96x128"))
 
 
 def counted(sequence, broken=()):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_suite import Biased, base_network, evaluate, in_memory, row, unbatched, write_network
+from tiny_suite import Biased, base_network, evaluate, row, unbatched, write_network
 
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.anchors import Anchors
@@ -19,6 +19,7 @@ from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.data import setting_of
+from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.sequence import open_tour
 
@@ -30,7 +31,8 @@ FIGURES = ("delta1", "rmse", "nll", "ece_delta", "ece_q", "spearman")
 @pytest.fixture(scope="module")
 def tour():
     """Ten decoded frames: rendering them again for every test would take most of the time."""
-    return in_memory(open_tour("tour:300003?frames=16&size=96x128&sensor=0"), slice(10))
+    tour = open_tour("tour:300003?frames=16&size=96x128&sensor=0")
+    return in_memory(replace(tour, entries=tour.entries[:10], names_on_disk=tour.names_on_disk[:10]))
 
 
 @pytest.fixture(scope="module")
