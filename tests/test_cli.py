@@ -273,7 +273,7 @@ def test_other_weights_under_the_same_name_do_not_go_on(ufmstar, path, tmp_path,
     brightness.files[1].write_text("1.2")
     code, _, err = ufmstar(*words, "--resume")
     assert code == 2
-    assert "source.weights.1.sha256 was" in err
+    assert "source.files.1.sha256 was" in err
     assert ufmstar(*words)[0] == 2
     assert ufmstar(*words, "--overwrite")[0] == 0
 
