@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors.streams import StreamLandmarks
+from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.timing import StagedStep
 from ufmstar_torch.eval.engine.clock import synchronize
@@ -55,7 +56,8 @@ class MultiviewStep:
         anchors, T = None, torch.from_numpy(frame.T_world_cam)
         if self._landmarks is not None:
             K = torch.from_numpy(frame.intrinsics)
-            anchors = self._landmarks.update(image, T, K).moved(K, predicted.intrinsics).to(self._device)
+            anchors = self._landmarks.update(image, T, K, UfMStarConfig.rotation_tolerance)
+            anchors = anchors.moved(K, predicted.intrinsics).to(self._device)
         return self.estimator.update(predicted.to(self._device), T, anchors)
 
     def memory(self) -> dict[str, float]:
