@@ -36,21 +36,13 @@ Energies = Mapping[Part, Energy]
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is measured.
+    """How much is measured."""
 
-    Attributes:
-        frames: of the sequence that are timed, after ``warm_up``.
-        warm_up: frames before them, which are run but not counted.
-        threads: of torch and numba on the CPU; None = all cores that this process may use.
-        seconds: a window of energy lasts at least so long [s].
-        windows: of energy per part.
-    """
-
-    frames: int = 40
-    warm_up: int = 5
-    threads: int | None = None
-    seconds: float = 3.0
-    windows: int = 3
+    frames: int = 40  # of the sequence that are timed, after ``warm_up``
+    warm_up: int = 5  # frames before them, which are run but not counted
+    threads: int | None = None  # of torch and numba on the CPU; None = all cores that this process may use
+    seconds: float = 3.0  # shortest window of energy [s]
+    windows: int = 3  # of energy per part
 
 
 def measure(

@@ -32,23 +32,18 @@ class UfMConfig(Checked):
     "MC-dropout": the members in turn, or one stochastic pass. "Depth only": no variance, s^2 = 0. "Full": mean
     depth, A and E of several inferences.
 
-    Attributes:
-        max_points: points kept per stream; the paper's 100,000 at 224 x 224, 300,000 at 518 x 518. None = all.
-            With fewer than an image has pixels, points are dropped before they are seen again.
-        add_aleatoric: let A, where it is given, be part of s^2, the variance of a single observation.
-        add_epistemic: likewise E.
-        rotation_tolerance: max |R^T R - I| of a pose; less is removed by projection onto SO(3), more is a fault.
-        on_bad_frame: "raise" or "skip" (counted, NaN returned) for unusable poses and intrinsics.
-
     Raises:
         ValueError: an impossible value, or, from ``from_dict``, an unknown name.
     """
 
+    # Points kept per stream; the paper's 100,000 at 224 x 224, 300,000 at 518 x 518. None = all. With fewer than an
+    # image has pixels, points are dropped before they are seen again.
     max_points: int | None = 100_000
-    add_aleatoric: bool = True
-    add_epistemic: bool = True
+    add_aleatoric: bool = True  # A is part of s^2, the variance of a single observation
+    add_epistemic: bool = True  # likewise E
+    # max |R^T R - I| of a pose; less is removed by projection onto SO(3), more is a fault.
     rotation_tolerance: float = number(0.01, "", "1", 0.0, 0.1)
-    on_bad_frame: str = choice("raise", "skip")
+    on_bad_frame: str = choice("raise", "skip")  # of unusable poses and intrinsics; skipped frames are counted, NaN
 
     def __post_init__(self) -> None:
         super().__post_init__()
