@@ -115,3 +115,22 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tiny_suite import write_rooms
 
     return write_rooms(tmp_path_factory.mktemp("rooms"))
+
+
+@pytest.fixture(scope="session")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sequence to train on. Nobody may change it."""
+    from trainings import write_frames
+
+    return write_frames(tmp_path_factory.mktemp("frames") / "walk")
+
+
+@pytest.fixture(scope="module")
+def one_thread():
+    """One thread of torch's, restored afterwards."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
