@@ -23,9 +23,11 @@ from ufmstar_torch.eval.engine.estimators import Answer, Gaussians, make_estimat
 from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.ufmstar import UfMStar
 
 MULTIVIEW = "multiview"
 # ``Setting.anchors`` that are measured: the name of their source of landmarks.
@@ -51,14 +53,21 @@ class MultiviewStep:
             first: see above.
         """
         if first:
-            for part in (self.estimator.module, *([self._landmarks] if self._landmarks else [])):
-                part.reset()  # type: ignore[operator]
+            self._start()
         anchors, T = None, torch.from_numpy(frame.T_world_cam)
         if self._landmarks is not None:
             K = torch.from_numpy(frame.intrinsics)
             anchors = self._landmarks.update(image, T, K, UfMStarConfig.rotation_tolerance)
             anchors = anchors.moved(K, predicted.intrinsics).to(self._device)
         return self.estimator.update(predicted.to(self._device), T, anchors)
+
+    def _start(self) -> None:
+        """Forget all frames."""
+        module = self.estimator.module
+        assert isinstance(module, UfM | UfMStar)
+        module.reset()
+        if self._landmarks is not None:
+            self._landmarks.reset()
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points or components, with what anchors add; bytes of the map for smoothing."""

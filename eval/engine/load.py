@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.engine.maps import MapSource, own_depth
+from ufmstar_torch.eval.engine.maps import TRUTH, MapSource, own_depth
 from ufmstar_torch.eval.engine.network_checks import check_members, without_sampling
 from ufmstar_torch.eval.engine.networks import NetworkSource, stochastic
 from ufmstar_torch.eval.methods.method import BASES
@@ -23,7 +23,6 @@ from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained, read_info
 from ufmstar_torch.pipeline import NetworksInTurn
 
-TRUTH = "ground-truth"
 _FORM = "BASE=MODEL:FILE[,FILE...]"
 _CPU, _AS_USERS = torch.device("cpu"), Inference()
 _VERSION = 4  # of the digests: raise it where predictions from the same files change
@@ -106,9 +105,7 @@ class NetworkChoice:
             FileNotFoundError, ValueError: as :func:`load_members`, or as ``check_members``.
         """
         if self.model == TRUTH:
-            label = self.label or "ground truth"
-            identity: dict[str, Any] = {"model": TRUTH, "label": label, "size": self.size}
-            return own_depth(self.size, identity, label=label, digest=_digest(identity))
+            return own_depth(self.size, *([self.label] if self.label else []))
         try:
             members = load_members(self.model, self.weights, spec=self.spec, inference=inference, device=device)
         except ValueError as error:
@@ -183,7 +180,8 @@ def _source(
         **more,
     }
     nameless = {"label": None, "files": [file | {"name": None} for file in identity["files"]]}
-    digest = _digest({**identity, **nameless, "device": device.type, "version": _VERSION}) if stored else ""
+    content = json.dumps({**identity, **nameless, "device": device.type, "version": _VERSION}, sort_keys=True)
+    digest = hashlib.sha256(content.encode()).hexdigest() if stored else ""
     turns = NetworksInTurn(members, samples=samples, preprocess=members[0].preprocess)
     how: dict[str, Any] = {"precision": inference.precision, "label": identity["label"], "digest": digest}
     return NetworkSource(turns, device, identity, **how)
@@ -271,7 +269,3 @@ def _path(file: str) -> tuple[str, int | None]:
     if mark and path and number.isdecimal() and not Path(file).exists():
         return path, int(number)
     return file, None
-
-
-def _digest(values: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

@@ -4,6 +4,7 @@ depth."""
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrins
 from ufmstar_torch.eval.sequences.own_output import own_output
 from ufmstar_torch.prediction import DepthPrediction
 
+TRUTH = "ground-truth"
 # Depth [H, W] float32 [m] (0 = no prediction), variance [H, W] float32 [m^2] or None, intrinsics [3, 3] float64 [px].
 Maps = tuple[np.ndarray, np.ndarray | None, np.ndarray]
 
@@ -140,20 +142,15 @@ def _of_whole_image(file: Path, depth: np.ndarray, sequence: FrameSequence, K: n
         raise FrameError(file, f"{reason}whole image: give the intrinsics of the maps, --map-intrinsics") from error
 
 
-def own_depth(
-    size: Size | None = None, identity: Mapping[str, Any] | None = None, *, label: str = "", digest: str = ""
-) -> MapSource:
-    """The sequence's own depth as the prediction: what UfM* makes of perfect depth, the method's floor.
-
-    Args:
-        size, label, digest: see :class:`MapSource`.
-        identity: None = as ``ufmstar run`` writes it down.
-    """
+def own_depth(size: Size | None = None, label: str = "ground truth") -> MapSource:
+    """The sequence's own depth as the prediction: UfM* on perfect depth, the method's floor. ``size``, ``label``: see
+    :class:`MapSource`."""
 
     def read(frame: Frame) -> Maps:
         if frame.depth is None:
             raise FrameError(frame.name, "no depth map")
         return frame.depth, None, depth_camera(frame)
 
-    plain = {"maps": "the sequence's own depth", "size": size}
-    return MapSource(read, identity or plain, size=size, is_truth=True, label=label, digest=digest)
+    identity = {"model": TRUTH, "label": label, "size": size}
+    digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+    return MapSource(read, identity, size=size, is_truth=True, label=label, digest=digest)
