@@ -71,17 +71,6 @@ class DataOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalOpeningOptions(OpeningOptions):
-    """How the sequences are opened, all of them alike.
-
-    Attributes:
-        truth_scale: metres per unit of the sequences' own depth maps, instead of the layout's
-    """
-
-    truth_scale: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class EvalOutputOptions:
     """Output.
 
@@ -136,7 +125,7 @@ class EvalOptions:
     debug: bool = False
     what: SuiteOptions
     data: DataOptions
-    opening: EvalOpeningOptions
+    opening: OpeningOptions
     output: EvalOutputOptions
 
     def __post_init__(self) -> None:
@@ -196,10 +185,10 @@ def job_from(options: EvalOptions) -> EvalJob:
     networks = {choice.base: choice for choice in choices}
     if len(networks) < len(choices):
         raise ValueError(f"--network: every base once, got {', '.join(choice.base for choice in choices)}")
-    opening = options.opening.given()
+    opening = {name: value for name, value in options.opening.given().items() if name != "layout"}
     Options(**{name: value for name, value in opening.items() if name != "poses"})  # raises for impossible values
     only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
-    items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only)
+    items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, layout=options.opening.layout)
     return EvalJob(
         suite=suite.with_bases(networks),
         networks=networks,
