@@ -195,8 +195,7 @@ def _cameras(file: Path) -> dict[int, Lens]:
         if not 0 <= model < len(_MODELS):
             raise ValueError(f"{file}: unknown camera model {model}")
         name, focal, count = _MODELS[model]
-        values = stored.take(f"{focal + 2 + (count or 0)}d")
-        cameras[key] = _lens(file, name, (width, height), values)
+        cameras[key] = _lens(file, name, (width, height), stored.take(f"{focal + 2 + (count or 0)}d"))
     return cameras
 
 
