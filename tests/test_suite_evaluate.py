@@ -334,7 +334,10 @@ def test_frames_that_compare_nothing_are_counted(networks, sequence):
         replace(entry, T_world_cam=entry.T_world_cam + np.pad([[1e3 * number]] * 3, ((0, 1), (3, 0))))
         for number, entry in enumerate(sequence.entries)
     ]
-    rows = [row("UfM*-Ensemble"), row("UfM*-Ensemble", **{"segment.min_pixels": 10**6})]
+    rows = [
+        row("UfM*-Ensemble"),
+        row("UfM*-Ensemble", overrides={"segment.min_pixels": 10**6, "segment.prune": "either"}),
+    ]
     result = evaluate(replace(sequence, entries=tuple(entries)), rows, networks)
     counts = [[r.frames[f"without_{name}"] for name in ("segment", "match")] for r in result.values()]
     assert counts == [[0, len(sequence) - 1], [len(sequence), len(sequence) - 1]]

@@ -224,7 +224,7 @@ def _evaluate(options: EvalOptions) -> int:
 
     from ufmstar_torch import UfMStarConfig
     from ufmstar_torch.anchors.landmarks import DENSE
-    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals, warned_once
     from ufmstar_torch.eval.engine.warm_up import warm_up_command
     from ufmstar_torch.eval.methods.method import UFM_STAR
     from ufmstar_torch.eval.suite.shards import Slurm, evaluate_on_slurm, evaluate_suite
@@ -234,7 +234,7 @@ def _evaluate(options: EvalOptions) -> int:
     slurm = Slurm.parse(options.slurm) if options.slurm else None
     how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}
     how |= {"processes": options.processes, "threads": options.threads}
-    with Bars() as bars, stop_signals(bars.say) as stop:
+    with Bars() as bars, stop_signals(bars.say) as stop, warned_once():
         job = job_from(options)
         for base in job.unused:
             bars.say(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
