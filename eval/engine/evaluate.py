@@ -90,7 +90,7 @@ def evaluate_sequence(
     _check(sequence, rows, indices, judge.networks)
     expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
     sources = {(base, how): judge.networks[base].prepared(how) for base, how in expected}
-    anchors = anchor_sources(rows, sequence.folder)
+    anchors = anchor_sources(rows, sequence.folder, sequence.pose_scale)
     runners, judges = [], {}
     for row in rows:
         source = sources[row.method.base, row.setting.preprocess]

@@ -1,9 +1,9 @@
 """Figures against ground truth, as sinks of a stream: of a run, and of the rows of an evaluation.
 
 For the figure of NLL by error, the paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is
-confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, of every frame, the share
-``confident`` of the reference's pixels with the smallest variance. All rows on the same frames are judged on the same
-pixels.
+confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, the share ``confident``
+of the reference's pixels with the smallest variance, of every frame, and of all sequences with one threshold. All rows
+on the same frames are judged on the same pixels.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence with
 # Names of a run's figures: UfM*, beside it the network alone, and the posterior if there is one.
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Names of a row's sums.
-METRICS, BY_ERROR = "metrics", "nll_by_error"
+METRICS, BY_ERROR, BY_ERROR_OF_ALL = "metrics", "nll_by_error", "nll_by_error_of_all"
+# Of the sums with one threshold: variances within 60 % of each other share a level, errors within 11 % a bin.
+OF_ALL = {"levels": 60, "bins": 128}
 
 
 class SequenceError(Exception):
@@ -96,8 +98,8 @@ class RowFigures:
     curves: dict[str, Any]
     state: dict[str, float]
     ms: dict[str, float]
-    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and "nll_by_error:REFERENCE"
-    # (``NLLByError``), to be added up over sequences.
+    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``), "nll_by_error:REFERENCE"
+    # and "nll_by_error_of_all:REFERENCE" (``NLLByError``), to be added up over sequences.
     sums: dict[str, dict[str, Tensor]]
 
 
@@ -109,12 +111,29 @@ class RowJudge:
         self.row, self.named, self._bins = row, named, bins
         self._metrics: dict[str, SequenceMetrics] = {}
         self._by_error: dict[str, NLLByError] = {}
-        self._judged, self.reasons = 0, Counter[str]()
+        self._judged, self.reasons, self._idle = 0, Counter[str](), Counter[str]()
         self._ms: list[Mapping[str, float]] = []
         self._memory: list[Mapping[str, float]] = []
 
-    def add(self, result: RowResult, memory: Mapping[str, float], masks: Mapping[str, Tensor]) -> None:
-        """Add a frame. Pixels that the row leaves out are NaN, not masked, so that the metrics count them."""
+    def add(
+        self,
+        result: RowResult,
+        memory: Mapping[str, float],
+        masks: Mapping[str, Tensor],
+        rows: Mapping[str, RowResult],
+    ) -> None:
+        """Add a frame. Pixels that the row leaves out are NaN, not masked, so that the metrics count them.
+
+        Args:
+            result: of this row.
+            memory: of its estimator after the frame.
+            masks: confident pixels by reference.
+            rows: results of all rows by key.
+        """
+        if result.statistics is not None:
+            segments, matched = (int(count[0]) for count in (result.statistics.segments, result.statistics.matched))
+            # The first frame has nothing to match.
+            self._idle.update(without_segment=int(not segments), without_match=int(bool(self._ms) and not matched))
         self._ms.append(result.ms)
         self._memory.append(memory)
         if result.truth is None:
@@ -128,8 +147,13 @@ class RowJudge:
         how = {"with_variance": variance is not None, "bins": self._bins}
         metrics_of(self._metrics, METRICS, **how).update(depth, variance, target)
         for other, name in self.named.items() if variance is not None else ():
-            by_error = self._by_error.setdefault(name, NLLByError(sync_on_compute=False))
+            by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
             by_error.update(depth, variance, target, masks[other])
+            of_all = NLLByError(**OF_ALL, sync_on_compute=False)
+            of_all = self._by_error.setdefault(f"{BY_ERROR_OF_ALL}:{name}", of_all)
+            reference = rows[other]
+            assert reference.variance is not None
+            of_all.add_levels(depth, variance, target, torch.where(reference.valid, reference.variance, torch.nan))
 
     def figures(self) -> RowFigures:
         """The figures after the last frame. Raises SequenceError: no frame was judged."""
@@ -142,13 +166,15 @@ class RowJudge:
         curves: dict[str, Any] = metrics.curves()
         sums = {METRICS: metrics.state_dict()}
         for name, by_error in self._by_error.items():
-            curves |= {f"{curve}:{name}": values.tolist() for curve, values in by_error.compute().items()}
-            sums[f"{BY_ERROR}:{name}"] = by_error.state_dict()
+            kind, _, reference = name.partition(":")
+            if kind == BY_ERROR:
+                curves |= {f"{curve}:{reference}": values.tolist() for curve, values in by_error.compute().items()}
+            sums[name] = by_error.state_dict()
         stages = ("network", "anchors", "uncertainty")
         times = {stage: [ms[stage] for ms in self._ms if stage in ms] for stage in stages}
         return RowFigures(
             row=self.row,
-            frames={**frames, "reasons": reasons},
+            frames={**frames, **self._idle, "reasons": reasons},
             figures=metrics.compute(),
             curves=curves,
             state=self._state(),
@@ -183,12 +209,11 @@ class RowJudges(FrameSink):
         """Add a frame."""
         for key, reason in result.skipped.items():
             self._judges[key].reasons[reason] += 1
-        expected = {
-            other for key, row in result.rows.items() if row.truth is not None for other in self._judges[key].named
-        }
+        judged = [key for key, row in result.rows.items() if row.truth is not None]
+        expected = {other for key in judged for other in self._judges[key].named}
         masks = {other: confident_pixels(result.rows[other], self._confident) for other in expected}
         for key, row in result.rows.items():
-            self._judges[key].add(row, self._estimators[key].memory(), masks)
+            self._judges[key].add(row, self._estimators[key].memory(), masks, result.rows)
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:

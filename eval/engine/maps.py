@@ -104,7 +104,8 @@ def folder_source(
         file = maps.depth_files[number[frame.name]]
         depth, spread = maps[number[frame.name]]
         K = K_given if run is None or K_given is not None else run.intrinsics.get(file.stem)
-        return depth, spread, _of_whole_image(file, depth, sequence, frame.intrinsics) if K is None else K
+        size = sequence.image_size if frame.image is None else frame.image.shape[:2]
+        return depth, spread, _of_whole_image(file, depth, size, frame.intrinsics) if K is None else K
 
     if K_given is None and run is None:
         _check_first(sequence, maps)
@@ -127,17 +128,18 @@ def _check_first(sequence: FrameSequence, maps: DepthMaps) -> None:
     except FrameError:  # counted when its turn comes
         return
     try:
-        _of_whole_image(maps.depth_files[0], depth, sequence, sequence.intrinsics)
+        _of_whole_image(maps.depth_files[0], depth, sequence.image_size, sequence.intrinsics)
     except FrameError as error:
         raise ValueError(str(error)) from error
 
 
-def _of_whole_image(file: Path, depth: np.ndarray, sequence: FrameSequence, K: np.ndarray) -> np.ndarray:
-    """[3, 3] the camera of a map that shows the whole image, whose intrinsics are K. Raises FrameError: it does not."""
+def _of_whole_image(file: Path, depth: np.ndarray, size: Size | None, K: np.ndarray) -> np.ndarray:
+    """[3, 3] the camera of a map that shows a whole image of ``size`` (H, W) with intrinsics K. Raises FrameError: it
+    does not."""
     try:
-        return scale_intrinsics(K, sequence.image_size, depth.shape[:2])
+        return scale_intrinsics(K, size, depth.shape[:2])
     except ValueError as error:
-        height, width = sequence.image_size or (0, 0)
+        height, width = size or (0, 0)
         reason = f"the map is {depth.shape[1]}x{depth.shape[0]}, the images are {width}x{height}: it does not show the "
         raise FrameError(file, f"{reason}whole image: give the intrinsics of the maps, --map-intrinsics") from error
 

@@ -58,7 +58,7 @@ def evaluate_item(
     try:
         sequence = item.open()
         made_of = {"sequence": content_digest(sequence), "device": str(judge.device)}
-        landmarks = landmark_digests(job.suite.rows, sequence.folder)
+        landmarks = landmark_digests(job.suite.rows, sequence.folder, sequence.pose_scale)
     except (*BROKEN, OSError) as error:
         return folder.fail(item, error, missing)
     folder.require_same_sequence(item, made_of["sequence"], landmarks)
