@@ -146,7 +146,9 @@ class RowJudge:
         )  # fmt: skip
         how = {"with_variance": variance is not None, "bins": self._bins}
         metrics_of(self._metrics, METRICS, **how).update(depth, variance, target)
-        for other, name in self.named.items() if variance is not None else ():
+        if variance is None:
+            return
+        for other, name in self.named.items():
             by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
             by_error.update(depth, variance, target, masks[other])
             of_all = NLLByError(**OF_ALL, sync_on_compute=False)
