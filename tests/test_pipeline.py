@@ -16,7 +16,7 @@ from ufmstar_torch.models import Preprocess
 from ufmstar_torch.pipeline import NetworksInTurn, combine
 
 H, W = 30, 40
-CONFIG = UfMStarConfig(segment=SPGF)
+CONFIG = UfMStarConfig(segment=SPGF, unmeasured="paper")
 K = torch.tensor(scenes.intrinsics(H, W))
 POSES = [torch.tensor(T) for T in scenes.tour(30)[:9]]
 

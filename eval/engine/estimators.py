@@ -28,8 +28,8 @@ Answer = dict[str, Any]
 
 
 _OF_OUTPUT = (
-    "depth", "variance", "valid", "aleatoric", "epistemic", "disagreement", "anchored", "bias", "posterior_depth",
-    "posterior_variance", "statistics",
+    "depth", "variance", "valid", "aleatoric", "epistemic", "disagreement", "measured", "anchored", "bias",
+    "posterior_depth", "posterior_variance", "statistics",
 )  # fmt: skip
 
 

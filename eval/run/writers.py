@@ -1,11 +1,12 @@
 """The files of every frame of ``ufmstar run``: an npz and two 16-bit PNGs.
 
 ```
-OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2] float32 and valid bool, each [H, W]; with
-                      anchors also anchored [m^2] (B) and bias (r: depth (1 + r) is the depth corrected), with a
-                      posterior also posterior_depth [m] and posterior_variance [m^2]
+OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2], measured (the share of the disagreement that
+                      rests on two views or more) float32 and valid bool, each [H, W]; with anchors also anchored
+                      [m^2] (B) and bias (r: depth (1 + r) is the depth corrected), with a posterior also
+                      posterior_depth [m] and posterior_variance [m^2]
 OUT/depth/NAME.png    depth, 16 bit, 0 = invalid; metres per count in the PNG's text
-OUT/sigma/NAME.png    standard deviation, likewise
+OUT/sigma/NAME.png    standard deviation, likewise; the text "unmeasured" counts pixels that no two views compared
 ```
 Every file is complete or absent. Nothing here keeps more than one frame in memory.
 """
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch import unmeasured
 from ufmstar_torch.eval.run.files import write_together
 
 # Metres per count that a run may choose from, finest first: up to 65.5 m, 256 m (KITTI's), 655 m, 6.6 km.
@@ -80,8 +82,9 @@ class FrameWriter:
         paths, unit = self.paths(name), self.unit or fitting_unit(d[used])
         self.unit = unit
         sigma = np.sqrt(np.where(v >= 0, v, np.nan))
+        blind = np.count_nonzero(maps["measured"] < unmeasured.HALF) if "measured" in maps else 0
         depth_png, lost_d = encode_length_png(d, used, unit, quantity="depth")
-        sigma_png, lost_s = encode_length_png(sigma, used, unit / 10, quantity="sigma")
+        sigma_png, lost_s = encode_length_png(sigma, used, unit / 10, quantity="sigma", unmeasured=str(blind))
         write_together(
             {
                 paths["depth"]: lambda file: file.write(depth_png),
@@ -95,8 +98,7 @@ class FrameWriter:
 
 
 def read_frame(path: str | Path) -> dict[str, NDArray[Any]]:
-    """The maps of a frame's npz: depth [m], variance [m^2], disagreement [m^2], valid, each [H, W]; with anchors
-    also anchored [m^2] and bias, with a posterior its depth and variance."""
+    """The maps [H, W] of a frame's npz, by name."""
     with np.load(path, allow_pickle=False) as stored:
         return {name: stored[name] for name in stored.files}
 
@@ -112,15 +114,13 @@ def fitting_unit(depth: NDArray[Any]) -> float:
     return next((unit for unit in DEPTH_UNITS if far <= FULL * unit), DEPTH_UNITS[-1])
 
 
-def encode_length_png(
-    values: NDArray[Any], valid: NDArray[np.bool_], unit: float, *, quantity: str
-) -> tuple[bytes, int]:
+def encode_length_png(values: NDArray[Any], valid: NDArray[np.bool_], unit: float, **notes: str) -> tuple[bytes, int]:
     """Lengths [H, W] [m] as a 16-bit PNG with its scale ``unit`` [m per count] as text: the file's content, and the
     number of saturated pixels.
 
     count = round(value / unit), 0 = invalid or not finite. A valid value below half a unit becomes 1, so that it is not
     taken for invalid; one beyond the range becomes 65535. Text keys: ``depth_scale`` = metres per count (also for
-    sigma: it is a depth's), ``unit``, ``quantity`` (a note for the reader), ``invalid``, ``saturated``.
+    sigma: it is a depth's), ``unit``, ``invalid``, ``saturated``, and the ``notes`` for the reader.
     """
     import cv2
     from PIL.PngImagePlugin import PngInfo, putchunk
@@ -133,7 +133,7 @@ def encode_length_png(
     how = (cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP)
     pixels = cv2.imencode(".png", coded, how)[1].tobytes()
     text, content = PngInfo(), io.BytesIO()
-    entries = {"depth_scale": repr(float(unit)), "unit": "metres per count", "quantity": quantity}
+    entries = {"depth_scale": repr(float(unit)), "unit": "metres per count", **notes}
     for key, value in {**entries, "invalid": "0", "saturated": str(saturated)}.items():
         text.add_text(key, value)
     content.write(pixels[:_AFTER_HEADER])
