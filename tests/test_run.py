@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from layouts import truncate, write_depth_png, write_generic
+from PIL import Image
 from runs import CONFIG, Brightness, job_of, network_job, networks, outputs, own_depth_job, read_summary
 
 from ufmstar_torch import UncertainDepth, cli

@@ -270,7 +270,6 @@ def steps(config, streams, frames, device):
     return out, ufm
 
 
-@pytest.mark.filterwarnings("ignore:stream .*a frame has no segment")
 @pytest.mark.parametrize(
     ("streams", "settings"),
     [

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -16,7 +16,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension
 from ufmstar_torch.extensions import extensions_of
 from ufmstar_torch.fixed_order import apply
-from ufmstar_torch.frame import FrameInput, check_frame, raise_faults, without_segments
+from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
 from ufmstar_torch.kernels.select import LateStep, select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty, StepOutput, UfMStarOutput
@@ -25,6 +25,7 @@ from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
 from ufmstar_torch.step import Step
 from ufmstar_torch.step_parts import StepObserver
+from ufmstar_torch.stream_warnings import StreamWarnings
 from ufmstar_torch.warm_up import warm_up
 
 
@@ -45,8 +46,7 @@ class UfMStar(StatefulModule):
         dtype: of the state, torch.float32 or torch.float64.
         device: of the state until ``.to()``; it follows the first frame otherwise.
 
-    Attributes:
-        observer: follows the stages of every step, to time them (``ufmstar_torch.step_parts.StepObserver``), or None.
+    Attribute ``observer``: follows the stages of every step, to time them (``step_parts.StepObserver``), or None.
 
     Example::
 
@@ -60,7 +60,6 @@ class UfMStar(StatefulModule):
     CONFIG = UfMStarConfig
     config: UfMStarConfig
     observer: StepObserver | None = None
-    _warned: bool = False
     _kept_step: tuple[tuple[str, str], Step] | None = None
 
     def __init__(
@@ -77,7 +76,7 @@ class UfMStar(StatefulModule):
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
-        self._extensions = extensions_of(self.config, extensions)
+        self._extensions, self._warnings = extensions_of(self.config, extensions), StreamWarnings()
         self._empty = self._extensions.initial(0, self.config, dtype, device or "cpu")
         self.STATE = tuple(self._empty.tensors())
         self.ALWAYS_FLOAT64 = (*UfMStar.ALWAYS_FLOAT64, *self._extensions.always_float64)
@@ -99,15 +98,15 @@ class UfMStar(StatefulModule):
         """Process one predicted depth map per stream and return its variance.
 
         Args:
-            depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype; a tensor, or a
-                NumPy array, as all others too.
-                Accepted is [1e-6 m, 1e6 m], and at most ``config.segment.max_depth``: state the network's largest depth
-                there. Pixels beyond (``statistics.beyond``) or otherwise outside (``out_of_range``) are not valid, nor
-                are those that are NaN, infinite, zero or negative.
-            pose: [B, 4, 4] or [4, 4] (or [..., 3, 4]) camera-to-world (T_world_cam) [m], coordinates up to 1e9 m. Rotations off by at
-                most ``config.rotation_tolerance`` are projected onto SO(3) and reported.
-            intrinsics: [B, 3, 3] or [3, 3] (or [..., 4, 4], or fx, fy, cx, cy) in pixels of this depth map (not of the image: ``resize_intrinsics``), first
-                pixel's centre at (0, 0); a focal length of 0.01 to 1e7 px, and the principal point on the map.
+            depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype; this
+                and the others are tensors or NumPy arrays. Accepted is [1e-6 m, 1e6 m], and at most
+                ``config.segment.max_depth``: state the network's largest depth there. Pixels beyond
+                (``statistics.beyond``) or otherwise outside (``out_of_range``) are not valid, nor NaN or infinite ones.
+            pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m], or without its last row; coordinates up to
+                1e9 m. Rotations off by at most ``config.rotation_tolerance`` are projected onto SO(3) and reported.
+            intrinsics: [B, 3, 3] or [3, 3], or fx, fy, cx, cy, in pixels of this depth map (not of the image:
+                ``resize_intrinsics``), first pixel's centre at (0, 0); a focal length of 0.01 to 1e7 px, and the
+                principal point on the map.
             aleatoric: like ``depth``, the network's own variance A [m^2]; pixels where it does not lie in [0, 1e12] are
                 left out and counted.
             epistemic: likewise E [m^2].
@@ -115,18 +114,13 @@ class UfMStar(StatefulModule):
             features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed; of at most 1e12.
             **inputs: what an extension takes per frame, by the name of its section in the config; None = nothing.
 
-        Returns:
-            The variance and its parts.
-
         Raises:
             TypeError: wrong kind of argument or dtype.
             ValueError: wrong shape or device; another number of streams than before (:meth:`reset` first); a pose that
                 is not rigid, bad intrinsics (counted with ``on_bad_frame="skip"``); input of an extension that is off.
         """
-        depth, aleatoric, epistemic = (
-            as_tensor(name, value)
-            for name, value in (("depth", depth), ("aleatoric", aleatoric), ("epistemic", epistemic))
-        )
+        depth, aleatoric = as_tensor("depth", depth), as_tensor("aleatoric", aleatoric)
+        epistemic = as_tensor("epistemic", epistemic)
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         out, variance, further = self._observe(frame, inputs)
 
@@ -147,6 +141,9 @@ class UfMStar(StatefulModule):
             statistics=out.statistics,
             **{name: shaped(value) for name, value in further.items()},
         )
+
+    if TYPE_CHECKING:
+        __call__ = forward
 
     def mean_uncertainty(
         self,
@@ -193,8 +190,7 @@ class UfMStar(StatefulModule):
             streams: B.
             progress: is called with the number of stages done and of all.
 
-        Raises:
-            ValueError: a size or number of streams that is not positive.
+        Raises ValueError: a size or number of streams that is not positive.
         """
         twin = UfMStar(self.config, dtype=self.mean.dtype, device=self.mean.device)
         warm_up(twin, size, streams, progress)
@@ -259,6 +255,7 @@ class UfMStar(StatefulModule):
         with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
             old, b = self.state, self.mean.shape[0]
             if streams is None:
+                self._warnings.reset()
                 new = self._extensions.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
             else:
                 new = old.restarted(self._chosen(streams, b))
@@ -312,11 +309,10 @@ class UfMStar(StatefulModule):
             )
             state, out = extensions.after_frame(state, out, total)
             disagreement = extensions.disagreement(out.disagreement, chosen(frame.depth))
-            if not self._warned and (text := without_segments(frame, out.statistics, self.config)):
-                self._warned = True
-                warnings.warn(text, stacklevel=4)
+            out = replace(out, statistics=replace(out.statistics, single_view=(state.count == 1).sum(1)))
         variance, further = total(disagreement), extensions.outputs()
-        self._store(state.tensors())  # the last step: an error before it, or a warning that is one, changes nothing
+        self._store(state.tensors())  # last, so that an error before it, or a warning that is one, changes nothing
+        self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
         return out, variance, further
 
     def _stored(self) -> UfMStarState:
@@ -354,5 +350,4 @@ class UfMStar(StatefulModule):
         return state
 
     def extra_repr(self) -> str:
-        """Streams and components."""
         return f"streams={self.mean.shape[0]}, capacity={self.mean.shape[1]}, backend={self.config.backend!r}"
