@@ -101,7 +101,7 @@ class Extension:
         """Raise a ValueError unless the extension fits the config."""
 
     def require_state(self, state: Tensors) -> None:
-        """Raise a ValueError unless its tensors are such as a run can leave behind; shapes and finite values are checked
+        """Raise a ValueError unless its tensors are such as a run leaves behind; shapes and finite values are checked
         already."""
 
     def by_component(

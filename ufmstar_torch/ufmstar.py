@@ -53,7 +53,7 @@ class UfMStar(StatefulModule):
         ufm = UfMStar()
         for image, T_world_cam in video:
             out = ufm(network(image), T_world_cam, K)   # depth [B, H, W]
-            trust = out.std                              # [m]
+            trust = out.std  # [m]
     """
 
     STATE = UfMStarState.names()
@@ -186,11 +186,9 @@ class UfMStar(StatefulModule):
         """Compile all kernels, or load them from disk, by running two synthetic frames in a module of its own.
 
         Args:
-            size: (H, W) of the depth maps [px].
+            size: (H, W) of the depth maps [px], positive.
             streams: B.
             progress: is called with the number of stages done and of all.
-
-        Raises ValueError: a size or number of streams that is not positive.
         """
         twin = UfMStar(self.config, dtype=self.mean.dtype, device=self.mean.device)
         warm_up(twin, size, streams, progress)
@@ -216,7 +214,6 @@ class UfMStar(StatefulModule):
             raise ValueError("query needs a mixture: call the module on a frame first")
         if points.dim() != 3 or points.shape[0] != streams or points.shape[2] != 3:
             raise ValueError(f"points must be [{streams}, N, 3], got {tuple(points.shape)}")
-        # A neighbourhood's boxes are cut along the axes of the first camera here, of the present one in a frame.
         with torch.no_grad(), full_precision(points.device):
             local = points.detach()
             if frame == "world":

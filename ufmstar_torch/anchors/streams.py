@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -14,7 +15,8 @@ from ufmstar_torch.anchors.tracker import Landmarks
 from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.frame import FRAME_FAULTS, intrinsics_fault, pose_fault
 
-Given = str | Path | LandmarkSource
+# A file may be named by a str too; type checkers then find no misspelt word.
+Given = Literal["corners", "dense"] | Path | LandmarkSource
 _PARTS = ("pixel", "depth", "variance", "valid")
 
 
