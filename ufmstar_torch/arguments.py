@@ -4,7 +4,7 @@ and device, each with one wording."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeAlias, overload
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -18,17 +18,13 @@ ImageLike: TypeAlias = Any
 CameraLike: TypeAlias = Tensor | NDArray[Any] | Sequence[float]
 
 
-@overload
-def as_tensor(name: str, value: None) -> None: ...
-@overload
-def as_tensor(name: str, value: object) -> Tensor: ...
-def as_tensor(name: str, value: object) -> Tensor | None:
-    """The argument ``name`` as a tensor: a tensor itself, or a NumPy array of numbers; None stays None.
+def as_tensor(name: str, value: object) -> Tensor:
+    """The argument ``name`` as a tensor: a tensor itself, or a NumPy array of numbers.
 
     Raises:
         TypeError: something else.
     """
-    if value is None or isinstance(value, Tensor):
+    if isinstance(value, Tensor):
         return value
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "bfiu":
         kind = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__

@@ -261,7 +261,7 @@ def pose_fault(T: Tensor, deviation: Tensor, tolerance: float) -> Tensor:
     return _code({**dict(enumerate(checks, start=1)), 7: far})
 
 
-def intrinsics_fault(K: Tensor, size: tuple[int, ...]) -> Tensor:
+def intrinsics_fault(K: Tensor, size: tuple[float, ...]) -> Tensor:
     """[B] codes 5, 6, 8 and 9 for a depth map of ``size`` (H, W), on the intrinsics' own device."""
     off_diagonal = K[:, 0, 1].abs() + K[:, 1, 0].abs() + K[:, 2, :2].abs().sum(-1)
     shape = (off_diagonal != 0) | (K[:, 2, 2] != 1) | (K[:, 0, 0] <= 0) | (K[:, 1, 1] <= 0)

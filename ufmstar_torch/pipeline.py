@@ -426,7 +426,7 @@ class UncertainDepth(NetworksInTurn):
             x, K = self.prepare(image, K_image.expand(len(image), 3, 3))
             self._warn_of_size(x)
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
-        H = as_tensor("features", features)
+        H = None if features is None else as_tensor("features", features)
         if H is None and self.ufm.config.features == 1:
             if prediction.aleatoric_variance is None:
                 raise ValueError(

@@ -32,7 +32,8 @@ class DepthPrediction:
 
     def __post_init__(self) -> None:
         for name in ("depth", "aleatoric_variance", "epistemic_variance"):
-            object.__setattr__(self, name, as_tensor(name, getattr(self, name)))
+            if (value := getattr(self, name)) is not None or name == "depth":
+                object.__setattr__(self, name, as_tensor(name, value))
         if self.depth.dim() != 3 or not torch.is_floating_point(self.depth):
             raise ValueError(
                 f"depth must be a floating-point tensor [B, H, W], got {self.depth.dtype} {tuple(self.depth.shape)}"

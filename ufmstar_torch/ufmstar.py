@@ -119,9 +119,9 @@ class UfMStar(StatefulModule):
             ValueError: wrong shape or device; another number of streams than before (:meth:`reset` first); a pose that
                 is not rigid, bad intrinsics (counted with ``on_bad_frame="skip"``); input of an extension that is off.
         """
-        depth, aleatoric = as_tensor("depth", depth), as_tensor("aleatoric", aleatoric)
-        epistemic = as_tensor("epistemic", epistemic)
-        frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
+        depth = as_tensor("depth", depth)
+        a, e = (None if v is None else as_tensor(n, v) for n, v in (("aleatoric", aleatoric), ("epistemic", epistemic)))
+        frame = self._checked(depth, pose, intrinsics, a, e, valid, features)
         out, variance, further = self._observe(frame, inputs)
 
         def shaped(value: Tensor) -> Tensor:
@@ -131,8 +131,8 @@ class UfMStar(StatefulModule):
             depth=depth,
             variance=shaped(variance),
             disagreement=shaped(out.disagreement),
-            aleatoric=aleatoric,
-            epistemic=epistemic,
+            aleatoric=a,
+            epistemic=e,
             features=out.features,
             measured=shaped(out.measured),
             valid=shaped(frame.valid),
