@@ -147,10 +147,10 @@ def test_a_warning_about_the_config_that_is_an_error_changes_nothing():
     before = snapshot(model)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(UserWarning, match="eta was 0.4, is 0.5"):
+        with pytest.raises(UserWarning, match=r"eta was 0\.4, is 0\.5"):
             model.ufm.load_state_dict(other.ufm.state_dict())
         assert unchanged(model, before)
-        with pytest.raises(UserWarning, match="eta was 0.4, is 0.5"):
+        with pytest.raises(UserWarning, match=r"eta was 0\.4, is 0\.5"):
             model.load_state_dict(other.state_dict())
         assert unchanged(model, before)
     with pytest.warns(UserWarning, match="eta was"):
