@@ -86,7 +86,11 @@ def test_a_run_equals_a_loop_by_hand(scene, tmp_path):
         assert np.abs(target.numpy() - preprocess.apply_depth(torch.from_numpy(depth)).numpy()).max() < 1e-3
         ours.update(result.depth[0], result.variance[0], target)
         alone.update(result.depth[0], 0.02 * result.depth[0], target)
+        np.testing.assert_array_equal(stored["T_world_cam"], frame.T_world_cam)
+        np.testing.assert_allclose(stored["intrinsics"][0, 2], frame.intrinsics[0, 2] / 2 - 0.25)
         disagreements.append(result.disagreement.double().mean().item())
+    lines = [json.loads(line) for line in (tmp_path / "out" / "frames.jsonl").read_text().splitlines()]
+    np.testing.assert_array_equal([line["T_world_cam"] for line in lines], [e.T_world_cam for e in sequence.entries])
     expected = json.loads(json.dumps(ours.compute()))
     assert summary["metrics"] == pytest.approx(expected, rel=1e-12, nan_ok=True)
     assert summary["network_alone"]["nll"] == pytest.approx(alone.compute()["nll"], rel=1e-6)

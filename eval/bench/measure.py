@@ -22,6 +22,7 @@ from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, 
 from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, Part, TimedParts, inference_of, time_parts
 from ufmstar_torch.eval.bench.timing import pinned_threads
 from ufmstar_torch.eval.engine.clock import paired_ratio, spread, synchronize
+from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.files import write_json_atomic
@@ -119,7 +120,8 @@ def measure(
 
 
 def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
-    """Measure the rows on the sequences of an evaluation, and write their means to OUT/efficiency.json.
+    """Measure the rows on the sequences of an evaluation, and write their means to OUT/efficiency.json, those of the
+    job's further architectures under "further".
 
     UfM and UfM* run on the CPU, as the paper's do, the networks on the job's device. Sequences may have fewer frames
     than the plan; its windows of energy are divided among them.
@@ -130,8 +132,14 @@ def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
     """
     plan = plan or Plan()
     plan = replace(plan, windows=-(-plan.windows // max(1, len(job.items))))
+    first, *further = (_over_items(job, plan, choices) for choices in (job.networks, *job.further))
+    write_json_atomic(job.out / EFFICIENCY, first | ({"further": further} if further else {}))
+
+
+def _over_items(job: EvalJob, plan: Plan, choices: Mapping[str, NetworkChoice]) -> dict[str, Any]:
+    """The means of one architecture over the sequences. Raises ValueError, see :func:`measure_job`."""
     device = device_of(job.device, 0)
-    networks = timed_networks(job.load(torch.device(device)), job.suite.rows)
+    networks = timed_networks(job.load(torch.device(device), choices), job.suite.rows)
     measured: dict[tuple[str, str], dict[str, Any]] = {}
     failed = []
     for item in job.items:
@@ -145,7 +153,7 @@ def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
             failed.append(f"{item.label}: {error}")
     if not measured:
         raise ValueError(f"no sequence can be measured: {'; '.join(failed[:3])}")
-    write_json_atomic(job.out / EFFICIENCY, over_sequences(measured))
+    return over_sequences(measured)
 
 
 def over_sequences(measured: Mapping[tuple[str, str], Mapping[str, Any]]) -> dict[str, Any]:

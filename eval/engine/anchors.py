@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
-from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, LandmarkSource, landmark_source
+from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, LandmarkMap, LandmarkSource, landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import Landmarks, TrackerConfig
 from ufmstar_torch.config import UfMStarConfig
@@ -153,9 +153,10 @@ class AnchorSource:
         return np.random.default_rng([self._setting.seed, index, what])
 
 
-def landmarks_of(value: str | bool, folder: Path | None) -> LandmarkSource:
+def landmarks_of(value: str | bool, folder: Path | None, scale: float = 1.0) -> LandmarkSource:
     """The source of landmarks of a sequence; True, "corners" and "tracked" mean tracked corners, other values are as
-    ``landmark_source`` takes them. A file of landmarks lies in the sequence's folder or the working folder.
+    ``landmark_source`` takes them. A file of landmarks lies in the sequence's folder or the working folder; its lengths
+    are in the unit of the recording's poses, of ``scale`` metres.
 
     Raises:
         FileNotFoundError: no such file.
@@ -163,18 +164,21 @@ def landmarks_of(value: str | bool, folder: Path | None) -> LandmarkSource:
     """
     word = CORNERS if value in (True, TRACKED) else str(value)
     is_file = Path(word).suffix.lower() in FILE_TYPES
-    return landmark_source(resolve(folder or Path(), word) if is_file else word)
+    source = landmark_source(resolve(folder or Path(), word) if is_file else word)
+    if isinstance(source, LandmarkMap) and scale != 1:
+        return LandmarkMap(scale * source.points_world, scale * source.sigma)
+    return source
 
 
-def landmark_digests(rows: Iterable[Row], folder: Path | None) -> dict[str, str]:
+def landmark_digests(rows: Iterable[Row], folder: Path | None, scale: float = 1.0) -> dict[str, str]:
     """Digests of the landmarks of those rows that have them from a file, by the rows' slugs. Raises FileNotFoundError,
     ValueError, as :func:`landmarks_of`."""
     files = {row.slug: row.setting.anchors for row in rows if row.setting.anchors not in ("", TRACKED, DENSE, TRUTH)}
-    identities = {file: landmarks_of(file, folder).identity for file in set(files.values())}
+    identities = {file: landmarks_of(file, folder, scale).identity for file in set(files.values())}
     return {slug: identities[file]["landmarks"] for slug, file in files.items() if "landmarks" in identities[file]}
 
 
-def anchor_sources(rows: Iterable[Row], folder: Path | None = None) -> dict[Row, AnchorSource]:
+def anchor_sources(rows: Iterable[Row], folder: Path | None = None, scale: float = 1.0) -> dict[Row, AnchorSource]:
     """The source of every row with anchors; rows of the same images and poses share a tracker. Raises
     FileNotFoundError, ValueError, as :func:`landmarks_of`."""
     tracks: dict[tuple[object, ...], Tracks] = {}
@@ -186,6 +190,6 @@ def anchor_sources(rows: Iterable[Row], folder: Path | None = None) -> dict[Row,
         elif setting.anchors:
             key = (setting.anchors, setting.skip, setting.pose_noise)
             if key not in tracks:
-                tracks[key] = Tracks(landmarks_of(setting.anchors, folder))
+                tracks[key] = Tracks(landmarks_of(setting.anchors, folder, scale))
             sources[row] = AnchorSource(setting, tracks[key])
     return sources

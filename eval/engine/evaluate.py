@@ -54,8 +54,8 @@ class RowFigures:
     curves: dict[str, Any]
     state: dict[str, float]
     ms: dict[str, float]
-    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and "nll_by_error:REFERENCE"
-    # (``NLLByError``), to be added up over sequences.
+    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``), "nll_by_error:REFERENCE"
+    # and "nll_by_error_of_all:REFERENCE" (``NLLByError``), to be added up over sequences.
     sums: dict[str, dict[str, Tensor]]
 
 
@@ -112,7 +112,7 @@ def evaluate_sequence(
     _check(sequence, rows, indices, judge.networks)
     expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
     sources = {(base, how): judge.networks[base].prepared(how) for base, how in expected}
-    anchors = anchor_sources(rows, sequence.folder)
+    anchors = anchor_sources(rows, sequence.folder, sequence.pose_scale)
     runners = []
     for row in rows:
         source = sources[row.method.base, row.setting.preprocess]
@@ -170,6 +170,7 @@ class _Accounts(FrameSink):
     def begin(self, stream: FrameStream) -> None:
         self._rows = {row.key: row for row in stream.rows}
         self._reasons: dict[str, Counter[str]] = {key: Counter() for key in self._rows}
+        self._idle: dict[str, Counter[str]] = {}
         self._ms: dict[str, list[Mapping[str, float]]] = {key: [] for key in self._rows}
         self._memory: dict[str, list[Mapping[str, float]]] = {key: [] for key in self._rows}
 
@@ -177,6 +178,11 @@ class _Accounts(FrameSink):
         for key, reason in result.skipped.items():
             self._reasons[key][reason] += 1
         for key, row in result.rows.items():
+            if row.statistics is not None:
+                segments, matched = (int(count[0]) for count in (row.statistics.segments, row.statistics.matched))
+                # The first frame has nothing to match.
+                now = {"without_segment": not segments, "without_match": not matched and bool(self._ms[key])}
+                self._idle.setdefault(key, Counter(dict.fromkeys(now, 0))).update(now)
             self._ms[key].append(row.ms)
             self._memory[key].append(self._rows[key].estimator.memory())
 
@@ -185,7 +191,7 @@ class _Accounts(FrameSink):
         reasons, done = self._reasons[key], len(self._ms[key])
         skipped = sum(reasons.values())
         counts = {"selected": done + skipped, "done": done, "judged": judged, "skipped": skipped}
-        return {**counts, "reasons": dict(sorted(reasons.items()))}
+        return {**counts, **self._idle.get(key, {}), "reasons": dict(sorted(reasons.items()))}
 
     def state(self, key: str) -> dict[str, float]:
         """The size of the method's state over the sequence, as ``Record`` has it."""

@@ -1,9 +1,9 @@
 """Figures against ground truth, as sinks of a stream: of a run, and of the rows of an evaluation.
 
 For the figure of NLL by error, the paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is
-confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, of every frame, the share
-``confident`` of the reference's pixels with the smallest variance. All rows on the same frames are judged on the same
-pixels.
+confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, the share ``confident``
+of the reference's pixels with the smallest variance, of every frame, and of all sequences with one threshold. All rows
+on the same frames are judged on the same pixels.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence with
 # Of a run: UfM*, beside it the network alone, and the posterior where there is one.
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Of a row's sums.
-METRICS, BY_ERROR = "metrics", "nll_by_error"
+METRICS, BY_ERROR, BY_ERROR_OF_ALL = "metrics", "nll_by_error", "nll_by_error_of_all"
+# Of the sums with one threshold: variances within 60 % of each other share a level, errors within 11 % a bin.
+OF_ALL = {"levels": 60, "bins": 128}
 
 
 def metrics_of(metrics: dict[str, SequenceMetrics], key: str, **how: Any) -> SequenceMetrics:
@@ -103,11 +105,12 @@ class RowMetrics(FrameSink):
         expected = {other for key in targets for other in self._references[key]}
         masks = {other: confident_pixels(result.rows[other], targets[other], self._confident) for other in expected}
         for key, target in targets.items():
-            self._judge(key, result.rows[key], target, masks)
+            self._judge(key, result, target, masks)
 
-    def _judge(self, key: str, row: RowResult, target: Tensor, masks: Mapping[str, Tensor]) -> None:
+    def _judge(self, key: str, result: FrameResult, target: Tensor, masks: Mapping[str, Tensor]) -> None:
         from ufmstar_torch.eval.metrics import NLLByError
 
+        row = result.rows[key]
         self.judged[key] += 1
         depth = torch.where(row.valid, row.depth, torch.nan)
         metrics = metrics_of(self._metrics, key, with_variance=row.variance is not None, bins=self._bins)
@@ -116,8 +119,12 @@ class RowMetrics(FrameSink):
             return
         binned = self._by_error.setdefault(key, {})
         for other, name in self._references[key].items():
-            by_error = binned.setdefault(name, NLLByError(sync_on_compute=False))
+            by_error = binned.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
             by_error.update(depth, row.variance, target, masks[other])
+            of_all = binned.setdefault(f"{BY_ERROR_OF_ALL}:{name}", NLLByError(**OF_ALL, sync_on_compute=False))
+            reference = result.rows[other]
+            assert reference.variance is not None
+            of_all.add_levels(depth, row.variance, target, torch.where(reference.valid, reference.variance, torch.nan))
 
     def figures(self, key: str) -> dict[str, float]:
         """``SequenceMetrics.compute`` of a judged row."""
@@ -126,14 +133,16 @@ class RowMetrics(FrameSink):
     def curves(self, key: str) -> dict[str, Any]:
         """``SequenceMetrics.curves`` of a judged row, and its NLL and error by reference."""
         curves: dict[str, Any] = self._metrics[key].curves()
-        for reference, by_error in self._by_error.get(key, {}).items():
-            curves |= {f"{name}:{reference}": curve.tolist() for name, curve in by_error.compute().items()}
+        for name, by_error in self._by_error.get(key, {}).items():
+            kind, _, reference = name.partition(":")
+            if kind == BY_ERROR:
+                curves |= {f"{curve}:{reference}": values.tolist() for curve, values in by_error.compute().items()}
         return curves
 
     def sums(self, key: str) -> dict[str, dict[str, Tensor]]:
-        """States of a judged row's metrics on the CPU by name: "metrics" and "nll_by_error:REFERENCE"."""
-        named: dict[str, Any] = {METRICS: self._metrics[key]}
-        named |= {f"{BY_ERROR}:{reference}": binned for reference, binned in self._by_error.get(key, {}).items()}
+        """States of a judged row's metrics on the CPU by name: "metrics", "nll_by_error:REFERENCE" and
+        "nll_by_error_of_all:REFERENCE"."""
+        named: dict[str, Any] = {METRICS: self._metrics[key], **self._by_error.get(key, {})}
         return {name: {entry: value.cpu() for entry, value in m.state_dict().items()} for name, m in named.items()}
 
 

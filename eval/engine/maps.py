@@ -106,7 +106,8 @@ def folder_source(
         if run is not None and file.stem in run.intrinsics:
             return depth, spread, run.intrinsics[file.stem]
         try:
-            K = scale_intrinsics(frame.intrinsics, sequence.image_size, depth.shape[:2])
+            size = sequence.image_size if frame.image is None else frame.image.shape[:2]
+            K = scale_intrinsics(frame.intrinsics, size, depth.shape[:2])
         except ValueError as error:
             raise FrameError(file, _cropped(sequence, depth)) from error
         return depth, spread, K

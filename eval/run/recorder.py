@@ -59,12 +59,15 @@ class FrameRecorder(FrameSink):
 
     def _record(self, result: FrameResult) -> dict[str, Any]:
         """The frame's line of frames.jsonl, once its maps are written."""
-        about = {"index": result.index, "name": result.name}
+        about: dict[str, Any] = {"index": result.index, "name": result.name}
+        if result.frame is not None and result.frame.timestamp is not None:
+            about["timestamp"] = result.frame.timestamp
         if UFM not in result.rows:
             return {**about, "state": "skipped", "reason": result.skipped[UFM]}
         row, before = result.rows[UFM], perf_counter()
         maps = {name: getattr(row, name) for name in _MAPS}
-        saturated = {"saturated": self._folder.writer.write(result.name, valid=row.valid, **maps)}
+        camera = {"T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
+        saturated = {"saturated": self._folder.writer.write(result.name, valid=row.valid, camera=camera, **maps)}
         times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
         return {**about, "state": "done", **_figures(row), **saturated, **times, **_anchor_figures(row)}
 
@@ -79,6 +82,7 @@ def _figures(row: RowResult) -> dict[str, Any]:
     return {
         "size": list(row.size),
         "intrinsics": [K[0][0], K[1][1], K[0][2], K[1][2]],
+        "T_world_cam": row.T_world_cam,
         "member": row.member,
         **{count: int(getattr(statistics, count)[0]) for count in _COUNTS},
         "rotation_deviation": float(statistics.rotation_deviation[0]),

@@ -48,6 +48,7 @@ def write_summary(
         "state": state,
         "reason": reason,
         "sequence": _sequence(job.sequence),
+        **_scale(job),
         "frames": _frames(records, len(job.indices)),
         "source": job.source_identity,
         "runtime": job.source.runtime,
@@ -96,6 +97,15 @@ def _sequence(sequence: FrameSequence) -> dict[str, Any]:
         "without_depth": len(sequence.without_depth),
         "left_out": dict(Counter(frame.reason for frame in sequence.skipped)),
     }
+
+
+def _scale(job: RunJob) -> dict[str, Any]:
+    """Where the unit of the poses comes from, if not from the recording: a network's error of scale is then in the
+    poses and in the anchors too, which show the shape of its error alone."""
+    if job.scale is None:
+        return {} if job.sequence.pose_scale == 1 else {"scale_from": "--pose-scale"}
+    scale = {"metres_per_unit": job.scale.metres, "spread": job.scale.spread, "frames": job.scale.frames}
+    return {"scale_from": "network", "scale": scale, "anchors_show": "shape only"}
 
 
 def _frames(records: Sequence[Mapping[str, Any]], selected: int) -> dict[str, Any]:

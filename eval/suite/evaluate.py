@@ -63,7 +63,7 @@ def evaluate_item(
     try:
         sequence = item.open()
         digest = content_digest(sequence)
-        landmarks = landmark_digests(rows, sequence.folder)
+        landmarks = landmark_digests(rows, sequence.folder, sequence.pose_scale)
     except (*BROKEN, OSError) as error:
         return folder.fail(item, error, missing)
     folder.require_same_sequence(item, digest, landmarks)
