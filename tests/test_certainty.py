@@ -24,7 +24,7 @@ from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.models import Ensemble, wrap_network
 from ufmstar_torch.models.alignment import AlignedNetwork, Alignment
-from ufmstar_torch.pipeline import NetworksInTurn
+from ufmstar_torch.networks_in_turn import NetworksInTurn
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.stateful import flat
 

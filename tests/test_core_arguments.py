@@ -11,7 +11,7 @@ from torch import nn
 
 from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.models import Preprocess, wrap_network
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.recalibrate import Recalibration
 
 DEPTH, POSE, _ = frame(0)

@@ -13,7 +13,7 @@ from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDept
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.models import Preprocess
-from ufmstar_torch.pipeline import NetworksInTurn, combine
+from ufmstar_torch.networks_in_turn import NetworksInTurn, combine
 
 H, W = 30, 40
 CONFIG = UfMStarConfig(segment=SPGF, unmeasured="paper")

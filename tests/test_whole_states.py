@@ -80,7 +80,7 @@ def test_a_frame_that_raises_leaves_everything_as_it_was(kind):
     warner = model.ufm._extensions.each[-1]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(ValueError, match="pose"):
+        with pytest.raises(ValueError, match="stream 0: pose holds NaN"):
             model(image, broken, intrinsics)
         assert unchanged(model, before)
         warner.loud = True
@@ -137,7 +137,7 @@ def test_a_damaged_state_is_refused_as_a_whole(kind, name, damage, message):
         model.load_state_dict(saved | {name: damage(saved[name])})
     assert unchanged(model, before)
     model.load_state_dict(saved)
-    assert float(model.networks[0].factor) == 2
+    assert model.networks[0].factor.tolist() == [2]
     assert model._next == 4
 
 

@@ -105,7 +105,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     from ufmstar_torch.eval.sequences.frame import in_memory
     from ufmstar_torch.eval.tour import make_tour, tour_sequence
     from ufmstar_torch.models.trained import load_trained, read_info
-    from ufmstar_torch.pipeline import NetworksInTurn
+    from ufmstar_torch.networks_in_turn import NetworksInTurn
 
     started = perf_counter()
     device = torch.zeros((), device=options.device).device

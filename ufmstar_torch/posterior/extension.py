@@ -69,7 +69,9 @@ class PosteriorExtension(Extension):
     def require_state(self, state: Tensors) -> None:
         """See :meth:`Extension.require_state`."""
         assert self._config.posterior is not None
-        Running.of(state["posterior"], self._config.posterior).require()
+        packed = state["posterior"]
+        started = torch.cat([packed[:, :1].clamp_min(1), packed[:, 1:]], 1)  # what is stored, not the start
+        Running.of(torch.where(packed.any(1, keepdim=True), started, packed), self._config.posterior).require()
 
     def of_frame(
         self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool

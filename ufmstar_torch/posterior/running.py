@@ -21,7 +21,7 @@ FEATURES = 4  # 1, log d - m_0, u and v from -1 to 1
 _MATRIX = FEATURES * FEATURES
 # Beyond what any run reaches: of m_0, the log of the largest depth that is accepted (``frame.DEPTH_RANGE``); of the
 # others, which count anchors and frames or are squares of logs.
-LARGEST_LOG, LARGEST_SUM = 14.0, 1e9
+LARGEST_LOG, LARGEST = 14.0, 1e9
 
 
 class Ratio(NamedTuple):
@@ -92,14 +92,14 @@ class Running:
 
     def require(self) -> None:
         """Raise a ValueError unless anchors can have taught these numbers."""
-        values = torch.stack([*self.above.values(), *self.below.values(), self.frames])
-        scale = self.covariance.abs().amax((1, 2)).clamp_min(1e-300)
+        sums = torch.stack([*self.above.values(), *self.below.values(), self.frames])
+        scale = self.covariance.abs().amax((1, 2)).clamp(1e-300, 1e300)
         low = torch.linalg.eigvalsh(self.covariance / scale[:, None, None])[:, 0]
         wrong = {
-            "sums": (values < 0) | (values > LARGEST_SUM),
-            "m_0": self.mean.abs() > LARGEST_LOG,
-            "coefficients": self.coefficients.abs() > LARGEST_SUM,
-            "covariance": (low < -1e-6) | (scale > LARGEST_SUM),
+            f"values beyond {LARGEST:g}": self.packed().abs() > LARGEST,
+            "negative sums": sums < 0,
+            "a mean of logs that no depth has": self.mean.abs() > LARGEST_LOG,
+            "a covariance that is none": low < -1e-6,
         }
         if names := [name for name, bad in wrong.items() if bool(bad.any())]:
             raise ValueError(f"posterior holds impossible values: {', '.join(names)}")
