@@ -39,7 +39,7 @@ from ufmstar_torch.eval.run.colours import colour_table
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import make_tour, render, tour_sequence
 from ufmstar_torch.models import NetworkSpec, save_trained
-from ufmstar_torch.pipeline import NetworksInTurn
+from ufmstar_torch.networks_in_turn import NetworksInTurn
 
 CPU = torch.device("cpu")
 FRAMES, SEED = 7, 5

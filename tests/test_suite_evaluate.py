@@ -20,7 +20,7 @@ from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.models import load_trained
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction
 
 SKIP = UfMStarConfig(on_bad_frame="skip")

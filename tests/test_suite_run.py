@@ -42,7 +42,7 @@ def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
     results = load_results(job.out)
     assert len(results.records) == 12
     assert not results.missing
-    assert results.merged["rooms", job.suite.rows[3]].sequences == 3
+    assert ("rooms", job.suite.rows[3]) in results.merged
 
 
 def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):

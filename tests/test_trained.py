@@ -34,7 +34,7 @@ from ufmstar_torch.models import (
 )
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.trained import load_for_training
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.networks_in_turn import combine
 
 SPECS = {
     "depth": {},

@@ -21,7 +21,7 @@ from ufmstar_torch.models.ensemble import Ensemble, LazyMember
 from ufmstar_torch.models.heads import DepthOnlyNetwork, UncertaintyNetwork
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.models.onnx_network import OnnxNetwork
-from ufmstar_torch.pipeline import NetworksInTurn
+from ufmstar_torch.networks_in_turn import NetworksInTurn
 from ufmstar_torch.prediction import DepthPrediction, infer
 
 DEPTH, ONCE, EVERY = "depth", "once", "every"

@@ -156,7 +156,7 @@ def _networks(weights: Path | None, device: torch.device) -> tuple[NetworkSource
     from ufmstar_torch.eval.engine.load import sha256
     from ufmstar_torch.eval.engine.networks import NetworkSource
     from ufmstar_torch.models.trained import load_trained, read_info
-    from ufmstar_torch.pipeline import NetworksInTurn
+    from ufmstar_torch.networks_in_turn import NetworksInTurn
 
     with _weights(weights) as file:
         info, members, digest = read_info(file), load_trained(file), sha256(file)

@@ -25,8 +25,8 @@ from ufmstar_torch.recalibrate import Recalibration
 # The maps of an answer [1, h, w] on the estimator's device, by the names of ``RowResult``; "statistics" of UfM*.
 Answer = dict[str, Any]
 _OF_OUTPUT = (
-    "depth", "variance", "valid", "aleatoric", "epistemic", "disagreement", "anchored", "bias", "posterior_depth",
-    "posterior_variance", "statistics",
+    "depth", "variance", "valid", "aleatoric", "epistemic", "disagreement", "measured", "anchored", "bias",
+    "posterior_depth", "posterior_variance", "statistics",
 )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from ufmstar_torch.models.inference import Inference, runtime_of
 from ufmstar_torch.models.load import DIRECTORIES, load_network, network_names
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained, read_info
-from ufmstar_torch.pipeline import NetworksInTurn
+from ufmstar_torch.networks_in_turn import NetworksInTurn
 
 _FORM = "BASE=MODEL:FILE[,FILE...]"
 _CPU, _AS_USERS = torch.device("cpu"), Inference()

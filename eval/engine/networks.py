@@ -21,7 +21,7 @@ from ufmstar_torch.models.ensemble import LazyMember
 from ufmstar_torch.models.inference import BF16, runtime_of
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.pipeline import NetworksInTurn
+from ufmstar_torch.networks_in_turn import NetworksInTurn
 
 # Sample n of frame i is seeded by i + 1,000,003 n: another seed for every pair as long as a sequence has fewer
 # frames than that, and below 2^32, the largest seed of torch's generator on the CPU.

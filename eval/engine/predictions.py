@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction
 
 _SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
