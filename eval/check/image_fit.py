@@ -119,7 +119,7 @@ def _followed(sequence: FrameSequence, first: int, last: int) -> list[FollowedCo
     position = start
     for index in range(first + 1, last + 1):
         following = _gray(sequence, index)
-        if following is None or len(start) < _FEWEST:
+        if following is None or following.shape != image.shape or len(start) < _FEWEST:
             break
         position, alive = follow(image, following, position, _BACK)
         start, position, image = start[alive], position[alive], following
@@ -138,26 +138,25 @@ def _gray(sequence: FrameSequence, index: int) -> np.ndarray | None:
         image = None if entry.load_image is None else entry.load_image()
     except FrameError:
         return None
-    if image is None or sequence.image_size not in (None, image.shape[:2]):
+    if image is None or (entry.image_size or sequence.image_size) not in (None, image.shape[:2]):
         return None
-    return checked(image, entry.T_world_cam, sequence.intrinsics)[0]
+    return checked(image, entry.T_world_cam, sequence.intrinsics_of(entry))[0]
 
 
-def image_fit(sequence: FrameSequence, tracks: Sequence[FollowedCorners]) -> ImageFit | None:
+def image_fit(sequence: FrameSequence, corners: Sequence[FollowedCorners]) -> ImageFit | None:
     """The fit of a sequence's poses and intrinsics to corners in its images; None where no corner moves, or without
     poses."""
-    if not tracks or not sequence.posed:
+    if not corners or not sequence.posed:
         return None
-    T = np.array([entry.T_world_cam for entry in sequence.entries])
     others = [Reading(poses=name) for name in CONVENTIONS if name != OURS] + [Reading(late=n) for n in _LATE]
     others += [Reading(factor=float(factor)) for factor in _FACTORS]
-    near = list({one.first: one for one in reversed(tracks)}.values())
-    far = list({one.first: one for one in tracks}.values())
+    near = list({one.first: one for one in reversed(corners)}.values())
+    far = list({one.first: one for one in corners}.values())
     reading = GIVEN
-    best = error = _error(near, T, sequence.intrinsics, GIVEN)
+    best = error = _error(sequence, near, GIVEN)
     for pairs in (near, far):
-        given = _error(pairs, T, sequence.intrinsics, GIVEN)
-        errors = [_error(pairs, T, sequence.intrinsics, other) for other in others]
+        given = _error(sequence, pairs, GIVEN)
+        errors = [_error(sequence, pairs, other) for other in others]
         least = min(errors)
         if reading == GIVEN and given > _HALVES * least and given - least > _APART:
             reading, error, best = others[errors.index(least)], given, least
@@ -175,29 +174,32 @@ def _with_problem(fit: ImageFit, text: str) -> ImageFit:
     return ImageFit(fit.pairs, fit.motion, fit.error, fit.reading, fit.best_error, f"{fit.words}: {text}")
 
 
-def _error(tracks: Iterable[FollowedCorners], T: np.ndarray, K: np.ndarray, reading: Reading) -> float:
+def _error(sequence: FrameSequence, corners: Iterable[FollowedCorners], reading: Reading) -> float:
     """Median over pairs of the median distance [px]; inf where no pair has poses."""
-    convert, scaled = CONVENTIONS[reading.poses].convert, K * np.array([[reading.factor], [reading.factor], [1.0]])
-    distances = []
-    for one in tracks:
-        first, last = one.first + reading.late, one.last + reading.late
-        if first >= 0 and last < len(T):
-            distances.append(np.median(_beside(one, convert(T[first]), convert(T[last]), scaled)[0]))
+    last = len(sequence) - 1
+    inside = (one for one in corners if one.first + reading.late >= 0 and one.last + reading.late <= last)
+    distances = [np.median(_beside(sequence, one, reading)[0]) for one in inside]
     return float(np.median(distances)) if distances else float("inf")
 
 
-def _beside(tracks: FollowedCorners, T_a: np.ndarray, T_b: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, ...]:
+def _beside(sequence: FrameSequence, corners: FollowedCorners, reading: Reading = GIVEN) -> tuple[np.ndarray, ...]:
     """[N] distance of corners from their half lines [px], how far along these they lie [px], and the inverse depth
     [1/unit of the poses] in the first image that this means."""
+    convert, entries, late = CONVENTIONS[reading.poses].convert, sequence.entries, reading.late
+    T_a, T_b = (convert(entries[at + late].T_world_cam) for at in (corners.first, corners.last))
+    K_a, K_b = (
+        sequence.intrinsics_of(entries[at]) * np.array([[reading.factor], [reading.factor], [1.0]])
+        for at in (corners.first, corners.last)
+    )
     T_b_a = np.linalg.inv(T_b) @ T_a
-    rays = np.column_stack([tracks.start, np.ones(len(tracks.start))]) @ np.linalg.inv(K).T
-    infinite, shift = rays @ (K @ T_b_a[:3, :3]).T, K @ T_b_a[:3, 3]
+    rays = np.column_stack([corners.start, np.ones(len(corners.start))]) @ np.linalg.inv(K_a).T
+    infinite, shift = rays @ (K_b @ T_b_a[:3, :3]).T, K_b @ T_b_a[:3, 3]
     ahead = infinite[:, 2] > 1e-3
     z = np.where(ahead, infinite[:, 2], 1.0)
     origin = infinite[:, :2] / z[:, None]
     speed = (shift[:2] - origin * shift[2]) / z[:, None]  # d x / d rho at rho = 0
     length = np.maximum(np.linalg.norm(speed, axis=1), 1e-12)
-    offset = tracks.end - origin
+    offset = corners.end - origin
     along = (offset * speed).sum(1) / length
     across = np.abs(offset[:, 0] * speed[:, 1] - offset[:, 1] * speed[:, 0]) / length
     distance = np.where(along > 0, across, np.linalg.norm(offset, axis=1))
@@ -208,22 +210,21 @@ def _beside(tracks: FollowedCorners, T_a: np.ndarray, T_b: np.ndarray, K: np.nda
 
 def depth_fit(
     sequence: FrameSequence,
-    tracks: Iterable[FollowedCorners],
+    corners: Iterable[FollowedCorners],
     depth_at: Callable[[int, np.ndarray], np.ndarray | None],
 ) -> DepthFit | None:
     """Compare depth with that of corners by parallax, in the unit of the poses.
 
     Args:
-        sequence, tracks: as :func:`image_fit`, whose outcome is without a problem.
+        sequence, corners: as :func:`image_fit`, whose outcome is without a problem.
         depth_at: of a frame's index and pixels [N, 2] of its image: depth [N], not positive = none; or None.
 
     Returns:
         The comparison, None with too little parallax or depth.
     """
     ratios, orders = [], []
-    for one in tracks:
-        T_a, T_b = (sequence.entries[index].T_world_cam for index in (one.first, one.last))
-        distance, along, rho = _beside(one, T_a, T_b, sequence.intrinsics)
+    for one in corners:
+        distance, along, rho = _beside(sequence, one)
         depth = depth_at(one.first, one.start)
         if depth is None:
             continue

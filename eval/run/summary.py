@@ -54,6 +54,7 @@ def write_summary(
         "state": state,
         "reason": reason,
         "sequence": _sequence(job.sequence),
+        **_scale(job),
         "frames": _frames(records, len(job.indices)),
         "source": job.source_identity,
         "runtime": job.source.runtime,
@@ -81,14 +82,14 @@ def write_summary(
 
 def _depth_fit(job: RunJob, folder: RunFolder, done: Sequence[Mapping[str, Any]]) -> DepthFit | None:
     """The maps of finished frames beside the depth of corners tracked in their images."""
-    records, K_image = {record["index"]: record for record in done}, job.sequence.intrinsics
+    records, sequence = {record["index"]: record for record in done}, job.sequence
 
     def depth_at(index: int, pixel: np.ndarray) -> np.ndarray | None:
         if index not in records:
             return None
         record = records[index]
         stored = read_frame(folder.writer.paths(record["name"])["frames"])
-        to_map = pinhole(*record["intrinsics"]) @ np.linalg.inv(K_image)
+        to_map = pinhole(*record["intrinsics"]) @ np.linalg.inv(sequence.intrinsics_of(sequence.entries[index]))
         u, v, _ = np.rint(to_map @ np.vstack([pixel.T, np.ones(len(pixel))])).astype(int)
         height, width = stored["depth"].shape
         inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
@@ -136,6 +137,15 @@ def _sequence(sequence: FrameSequence) -> dict[str, Any]:
     }
 
 
+def _scale(job: RunJob) -> dict[str, Any]:
+    """Where the unit of the poses comes from, if not from the recording: a network's error of scale is then in the
+    poses and in the anchors too, which show the shape of its error alone."""
+    if job.scale is None:
+        return {} if job.sequence.pose_scale == 1 else {"scale_from": "--pose-scale"}
+    scale = {"metres_per_unit": job.scale.metres, "spread": job.scale.spread, "frames": job.scale.frames}
+    return {"scale_from": "network", "scale": scale, "anchors_show": "shape only"}
+
+
 def _frames(records: Sequence[Mapping[str, Any]], selected: int) -> dict[str, Any]:
     skipped = [record for record in records if record["state"] == "skipped"]
     return {
@@ -164,6 +174,8 @@ def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "units": "disagreement m^2, sigma m",
         # Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component, where the prior is 0.
         "near_zero_share": sum(record["near_zero"] for record in done) / pixels if pixels else None,
+        # The valid pixels that no two views compared; their M is ``UfMStarConfig.unmeasured``.
+        "unmeasured_share": sum(record["unmeasured"] for record in done) / pixels if pixels else None,
         "valid_pixels": pixels,
         "saturated_png_pixels": saturated,
     }
