@@ -30,7 +30,7 @@ _LATE, _FACTORS = (-3, -2, -1, 1, 2, 3), 2.0 ** np.arange(-2, 2.01, 0.125)
 _FACTORS = _FACTORS[np.abs(np.log2(_FACTORS)) > 0.3]
 # Another reading is better that halves the distance, by so many pixels at least. On eight rendered tours right input is
 # at .2 to .4 px and no reading halves it; one frame late is at 1.1 px or more and four times as far as the right one.
-_HALVES, _APART = 2.0, 0.3
+_HALVES, _APART = 2.0, 0.2
 _FINE = 1.0  # [px] as messages state it
 _LARGEST = 0.005  # share of the width: a distance that contradicts the poses under whatever reading
 # Depth against that of the corners: pairs and corners of each, their least shift along the line [px], the factor from
