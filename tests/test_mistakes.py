@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from shared_data import require_shared
 
 import scenes
@@ -149,17 +150,57 @@ def problems(name, change=same, spoil=same):
     return "" if depths is None else depths.problem
 
 
-@pytest.mark.parametrize("name", [*RECORDINGS, TOURS[0]])
+@pytest.mark.parametrize("name", [*RECORDINGS, *(pytest.param(tour, marks=pytest.mark.slow) for tour in TOURS)])
 def test_right_input_raises_no_alarm(name):
     assert problems(name) == ""
 
 
-@pytest.mark.parametrize("name", [RECORDINGS[0], TOURS[0]])
+@pytest.mark.parametrize("name", [RECORDINGS[0], pytest.param(TOURS[0], marks=pytest.mark.slow)])
 def test_each_mistake_is_named(name):
     missed = [
         m for m, (change, spoil, words) in MISTAKES.items() if not re.search(words, problems(name, change, spoil))
     ]
     assert [one for one in missed if name == RECORDINGS[0] or one not in LATE] == []
+
+
+def rigid(R, t):
+    """[4, 4] of a rotation and a position."""
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = R, t
+    return out
+
+
+def noisy(T, rng, degrees):
+    """The pose turned about a random axis."""
+    turn = Rotation.from_rotvec(np.radians(degrees) * rng.normal(size=3)).as_matrix()
+    return rigid(T[:3, :3] @ turn, T[:3, 3])
+
+
+def wxyz(T):
+    """The pose whose quaternion was read in the other order."""
+    return rigid(Rotation.from_quat(np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), 1)).as_matrix(), T[:3, 3])
+
+
+CORRUPTED = {
+    "shuffled": lambda poses, rng: rng.permutation(poses),
+    "of the other direction": lambda poses, rng: poses[::-1],
+    "turned by 3 degrees": lambda poses, rng: [noisy(T, rng, 3) for T in poses],
+    "quaternions of another order": lambda poses, rng: [wxyz(T) for T in poses],
+    "transposed rotations": lambda poses, rng: [rigid(T[:3, :3].T, T[:3, 3]) for T in poses],
+}
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 10))])
+@pytest.mark.parametrize("kind", CORRUPTED)
+def test_corrupted_poses_are_named(kind, seed):
+    def change(sequence):
+        poses = np.array([entry.T_world_cam for entry in sequence.entries])
+        poses = CORRUPTED[kind](poses, np.random.default_rng(seed))
+        spoilt = (replace(e, T_world_cam=np.array(T)) for e, T in zip(sequence.entries, poses, strict=True))
+        return replace(sequence, entries=tuple(spoilt))
+
+    for name in RECORDINGS:
+        assert "poses disagree with the images" in problems(name, change), name
 
 
 @pytest.mark.slow
