@@ -55,9 +55,6 @@ def image(batch=2):
     return torch.rand(batch, 3, 8, 10, generator=torch.Generator().manual_seed(0))
 
 
-# ---- all members at once ----
-
-
 def test_an_ensemble_is_the_mixture_of_its_members():
     networks = [Gain(1.0), Gain(1.5), Gain(3.0)]
     mixture = Ensemble(networks)(image())
@@ -67,9 +64,6 @@ def test_an_ensemble_is_the_mixture_of_its_members():
     torch.testing.assert_close(mixture.aleatoric_variance, 0.01 * mean)
     torch.testing.assert_close(mixture.epistemic_variance, (depths**2).sum(0) / 3 - mean**2)
     assert Ensemble(networks).preprocess == INPUT
-
-
-# ---- lazy members ----
 
 
 def test_only_the_members_in_turn_are_loaded_each_once():

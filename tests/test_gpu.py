@@ -81,15 +81,6 @@ def test_the_graph_equals_the_step():
         assert same(ufm.state_dict()[name], value)
 
 
-def test_gpu_equals_cpu_over_a_walk():
-    config = UfMStarConfig(segment=SPGF)
-    gpu, cpu = UfMStar(config), UfMStar(config)
-    for depth, pose, K, _ in walks(4, 8):
-        a, b = gpu(depth.cuda(), pose.cuda(), K.cuda()), cpu(depth, pose, K)
-        assert torch.equal(a.labels.cpu(), b.labels)
-        torch.testing.assert_close(a.variance.cpu(), b.variance, rtol=1e-6, atol=1e-9, equal_nan=True)
-
-
 @pytest.mark.parametrize("size", [(224, 224), (518, 518)])
 def test_large_images(size):
     depths, poses, K = scenes.sequence(3, *size, 0.03)
