@@ -7,12 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from landmark_runs import long_walks, run, surprise, walk
 from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors.dense import DenseEvidence
+from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.sequences.open import open_sequence
 
 
 @pytest.fixture(scope="module")
@@ -87,3 +90,39 @@ def test_blank_and_noisy_images_give_no_anchors(tour, value):
     assert sum(len(f.depth) for f in run(DenseEvidence(), tour, images=blank)) == 0
     noise = [rng.integers(0, 255, (180, 240, 3)).astype(np.uint8) for _ in tour]
     assert sum(len(f.depth) for f in run(DenseEvidence(), tour, images=noise)) < 10
+
+
+def test_video_without_noise_leaves_finite_estimates_and_anchors():
+    frames = list(open_sequence("tour:5?frames=14&size=120x160&sensor=0"))
+    evidence, counts = DenseEvidence(), []
+    for frame in [*frames, *frames[::-1]] * 3:
+        counts.append(len(evidence.update(frame.image, frame.T_world_cam, frame.intrinsics).depth))
+        assert all(np.isfinite(value.numpy()).all() for value in evidence.state().values())
+    assert np.median(counts[-14:]) > 20
+
+
+@pytest.mark.parametrize("name", ["pose_left", "pose_variance", "camera_covariance", "landmark_point", "pose", "depth"])
+def test_a_state_that_is_not_finite_is_refused(tour, name):
+    evidence = DenseEvidence()
+    run(evidence, tour[:4])
+    before = evidence.state()
+    with pytest.raises(ValueError, match=f"{name}.*must be finite"):
+        evidence.load_state(before | {name: before[name] * np.nan})
+    assert all(torch.equal(value, before[key]) for key, value in evidence.state().items())
+
+
+def test_images_of_another_size_are_refused_however_small():
+    """A frame that UfM* refuses is forgotten, with its size: only then may another size follow."""
+    K, sizes = np.eye(3), [(1, 1), (2, 1), (1, 2), (8, 8)]
+    for first, other in itertools.permutations(sizes, 2):
+        streams = StreamLandmarks("dense")
+        image = {size: torch.zeros(1, 3, *size, dtype=torch.uint8) for size in sizes}
+        pose, camera = torch.eye(4, dtype=torch.float64), torch.from_numpy(K)
+        for _ in range(3):
+            streams.update(image[first], pose, camera)
+        with pytest.raises(ValueError, match="of the size and camera of the images before"):
+            streams.update(image[other], pose, camera)
+        streams.reset()
+        streams.update(image[first], pose, camera)
+        streams.undo()
+        streams.update(image[other], pose, camera)

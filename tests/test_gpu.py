@@ -1,6 +1,6 @@
 """What only a CUDA device can show: no synchronisation, many streams, flat memory, the graph. ``pytest -m gpu``.
 
-The kernels themselves are in ``test_triton.py``, which runs on the device as well.
+The kernels themselves are in the tests of ``conftest.backend``, which run on the device as well.
 """
 
 from __future__ import annotations

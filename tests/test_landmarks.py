@@ -292,6 +292,24 @@ def test_a_skipped_frame_is_forgotten_by_its_source(tour):
     assert int(model.state_dict()["landmarks.0.view"]) == -1
 
 
+@pytest.mark.parametrize("kind", ["corners", "dense"])
+@pytest.mark.parametrize(
+    ("argument", "change"), [(1, lambda T: T * torch.nan), (2, lambda K: K * torch.nan), (2, lambda K: -K)]
+)
+def test_a_bad_frame_of_one_stream_stops_neither_it_nor_the_others(tour, kind, argument, change):
+    model, clean = wrapped([kind, kind]), wrapped([kind, kind])
+    for i, (image, T, K) in enumerate(pictures(tour)):
+        both = [image[None].expand(2, -1, -1, -1), T.expand(2, 4, 4), K.expand(2, 3, 3)]
+        expected = clean(*both)
+        if i == 3:
+            both[argument] = torch.stack([change(both[argument][0]), both[argument][1]])
+        out = model(*both)
+        assert (out.ufm.statistics.fault > 0).tolist() == [i == 3, False]
+        torch.testing.assert_close(out.variance[1], expected.variance[1], rtol=1e-6, atol=1e-9)
+        assert model.landmarks.last[0].none.startswith(("pose", "intrinsics") if i == 3 else ("no ", "poses"))
+    assert bool(out.variance[0].isfinite().all())
+
+
 def test_a_source_needs_the_anchored_configuration():
     with pytest.raises(ValueError, match="AnchorConfig"):
         UncertainDepth(Brightness(), anchors="corners")

@@ -405,6 +405,14 @@ def test_malformed_names_raise_with_what_was_expected(name, expected):
         open_sequence(name)
 
 
+def test_a_pan_turns_in_place_and_a_blank_home_is_plain():
+    poses = np.stack([frame.T_world_cam for frame in open_sequence("tour:2?frames=12&size=16x24&pan=1&style=blank")])
+    assert np.ptp(poses[:, :3, 3], axis=0).max() < 2 * 0.04  # the sway of a hand
+    turned = poses[0, :3, :3].T @ poses[-1, :3, :3]
+    assert np.degrees(np.arccos((np.trace(turned) - 1) / 2)) > 30
+    assert set(HOME_TEXTURES) - set(make_tour(2, "blank").style.textures) >= {"wood", "tiles", "bricks", "plaster"}
+
+
 def test_options_of_folders_are_none_of_a_tour():
     with pytest.raises(ValueError, match="takes no fps"):
         open_sequence("tour:1", fps=30.0)

@@ -53,7 +53,6 @@ def test_bits_of_matches():
     assert set_bits == expected.match.sum()
 
 
-@pytest.mark.filterwarnings("ignore:stream .*a frame has no segment")
 def test_late_growth():
     """Every output is the CPU's, except for the map that was regressed while components waited for slots."""
     config = UfMStarConfig(segment=SPGF, initial_capacity=2)

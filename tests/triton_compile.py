@@ -1,4 +1,4 @@
-"""Every Triton kernel compiled for an H100 without one: a program of its own, started by tests/test_triton_compile.py.
+"""Every Triton kernel compiled for an H100 without one: a program of its own, started by tests/test_kernels.py.
 
 The Python functions run on CPU tensors, with launches replaced by compilation: a kernel is compiled for the very
 arguments that it would be launched with. Nothing runs, so the results hold no values.

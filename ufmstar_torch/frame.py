@@ -16,8 +16,6 @@ from torch import Tensor
 from ufmstar_torch.arguments import require_float, require_mask
 from ufmstar_torch.camera import POLAR_STEPS as POLAR_STEPS
 from ufmstar_torch.camera import focal_and_centre, nearest_rotation, rotation_deviation
-from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.output import FrameStatistics
 
 # Index = code. Each text finishes the sentence "stream b: ...".
 FRAME_FAULTS = (
@@ -205,23 +203,6 @@ def raise_faults(frame: FrameInput) -> None:
     bad = [f"stream {b}: {FRAME_FAULTS[code]}" for b, code in enumerate(faults) if code]
     if bad:
         raise ValueError("; ".join(bad))
-
-
-def without_segments(frame: FrameInput, statistics: FrameStatistics, config: UfMStarConfig) -> str:
-    """A warning where a stream had depth but no segment, else ""; on the CPU only, elsewhere it would have to wait."""
-    if frame.depth.device.type != "cpu" or all(statistics.segments.tolist()):
-        return ""
-    pixels = statistics.valid_pixels + frame.beyond + frame.out_of_range
-    empty = (pixels > 0) & (statistics.segments == 0)
-    if not bool(empty.any()):
-        return ""
-    b = int(empty.nonzero()[0])
-    return (
-        f"stream {b}: a frame has no segment, so nothing is compared between views: of {int(pixels[b])} pixels "
-        f"{int(frame.beyond[b])} lie beyond segment.max_depth = {config.segment.depth_limit} m and "
-        f"{int(frame.out_of_range[b])} outside the accepted ranges. Is the depth in metres, smooth, and the "
-        "intrinsics the depth map's? (said once)"
-    )
 
 
 def _features(features: Tensor | None, count: int, plain: Tensor) -> Tensor | None:

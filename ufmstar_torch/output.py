@@ -29,6 +29,8 @@ class FrameStatistics:
             ranges that ``UfMStar.forward`` states.
         unmeasured: of the pixels used (with a subset, of those regressed), where M rests by less than half on surfaces
             seen from two views or more; what they get is ``config.unmeasured``.
+        single_view: components that one frame alone has seen. Close to all of ``components`` after some frames: hardly
+            anything is compared between views, and the logger ``ufmstar_torch`` has named likely causes.
         fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
         rotation_deviation: max |R^T R - I| of the pose, removed by projection onto SO(3).
         anchors: with ``config.anchors``, given and usable; 0 for a standing camera, say. None without.
@@ -52,6 +54,7 @@ class FrameStatistics:
     unmeasured: Tensor
     fault: Tensor
     rotation_deviation: Tensor
+    single_view: Tensor | None = None
     anchors: Tensor | None = None
     anchors_used: Tensor | None = None
     calibration: Tensor | None = None

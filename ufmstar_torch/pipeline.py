@@ -384,7 +384,9 @@ class UncertainDepth(NetworksInTurn):
         if self.landmarks is not None:
             if anchors is not None:
                 raise ValueError("anchors come from the source that UncertainDepth was made with: give none")
-            anchors = self.landmarks.update(image, pose, intrinsics)
+            config = self.ufm.config
+            tolerance = config.rotation_tolerance if config.on_bad_frame == "skip" else None
+            anchors = self.landmarks.update(image, pose, intrinsics, tolerance)
         try:
             moved = anchors is not None and self.preprocess is not None
             yield require_anchors(anchors).moved(intrinsics, K) if moved else anchors

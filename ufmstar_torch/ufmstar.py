@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 import torch
@@ -16,7 +16,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension
 from ufmstar_torch.extensions import extensions_of
 from ufmstar_torch.fixed_order import apply
-from ufmstar_torch.frame import FrameInput, check_frame, raise_faults, without_segments
+from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
 from ufmstar_torch.kernels.select import LateStep, select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty, StepOutput, UfMStarOutput
@@ -25,6 +25,7 @@ from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
 from ufmstar_torch.step import Step
 from ufmstar_torch.step_parts import StepObserver
+from ufmstar_torch.stream_warnings import StreamWarnings
 from ufmstar_torch.warm_up import warm_up
 
 
@@ -59,7 +60,6 @@ class UfMStar(StatefulModule):
     CONFIG = UfMStarConfig
     config: UfMStarConfig
     observer: StepObserver | None = None
-    _warned: bool = False
     _kept_step: tuple[tuple[str, str], Step] | None = None
 
     def __init__(
@@ -76,7 +76,7 @@ class UfMStar(StatefulModule):
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
-        self._extensions = extensions_of(self.config, extensions)
+        self._extensions, self._warnings = extensions_of(self.config, extensions), StreamWarnings()
         self._empty = self._extensions.initial(0, self.config, dtype, device or "cpu")
         self.STATE = tuple(self._empty.tensors())
         self.ALWAYS_FLOAT64 = (*UfMStar.ALWAYS_FLOAT64, *self._extensions.always_float64)
@@ -253,6 +253,7 @@ class UfMStar(StatefulModule):
         with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
             old, b = self.state, self.mean.shape[0]
             if streams is None:
+                self._warnings.reset()
                 new = self._extensions.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
             else:
                 new = old.restarted(self._chosen(streams, b))
@@ -304,10 +305,9 @@ class UfMStar(StatefulModule):
             )
             state, out = extensions.after_frame(state, out, total)
             disagreement = extensions.disagreement(out.disagreement, chosen(frame.depth))
+            out = replace(out, statistics=replace(out.statistics, single_view=(state.count == 1).sum(1)))
             self._store(state.tensors())
-            if not self._warned and (text := without_segments(frame, out.statistics, self.config)):
-                self._warned = True
-                warnings.warn(text, stacklevel=4)
+            self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
         return out, total(disagreement), extensions.outputs()
 
     def _stored(self) -> UfMStarState:

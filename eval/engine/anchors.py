@@ -18,6 +18,7 @@ from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, LandmarkSource, landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import Landmarks, TrackerConfig
+from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED, TRUTH, Setting
@@ -69,7 +70,8 @@ class Tracks:
             return None
         image = None if frame.image is None else image_tensor(frame)
         started = perf_counter()
-        self._streams.update(image, torch.from_numpy(T_world_cam), torch.from_numpy(frame.intrinsics))
+        pose, K = torch.from_numpy(T_world_cam), torch.from_numpy(frame.intrinsics)
+        self._streams.update(image, pose, K, UfMStarConfig.rotation_tolerance)  # rows skip what has a fault
         self._last = frame, self._streams.last[0], 1000 * (perf_counter() - started)
         return self._last[1:]
 

@@ -141,10 +141,9 @@ class DenseEvidence(SavedState):
             ModuleNotFoundError: OpenCV is not installed.
         """
         gray, T, K = checked(image, T_world_cam, K)
-        if not self._size.any():
-            self._size, self._K = np.array(gray.shape), K
-        elif gray.shape != tuple(self._size) or not np.array_equal(K, self._K):
+        if self._size.any() and (gray.shape != tuple(self._size) or not np.array_equal(K, self._K)):
             raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
+        self._size, self._K = np.array(gray.shape), K
         small, scale = _reduced(gray, self.config.width)
         result = self._measured(small, scale, T, scale @ K)
         if self._contradicted >= _JUMPED:

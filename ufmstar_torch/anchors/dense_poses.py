@@ -142,6 +142,8 @@ class PoseErrors(SavedState):
             shown = Shown(on_line / speed[..., None], value, own, across_change, across, across_variance)
             solution = solved(shown, *before)
             rho = measured.rho + solution.rho
+        if not np.isfinite(solution.covariance).all():  # nothing is stored that is not a number
+            return Fit(measured.rho, np.full(len(pixel), np.inf))
         self._learn_poses(solution, shares, K, depth)
         if trusted:
             self._learn_camera(solution, views.image.shape[2])
@@ -189,7 +191,7 @@ class PoseErrors(SavedState):
     ) -> None:
         if len(residual) < _ENOUGH:
             return
-        left = (_medians(beside, shows) / _MEDIAN_SQUARE - _medians(noise, shows)).clip(0)
+        left = (_medians(beside, shows) / _MEDIAN_SQUARE - _medians(noise, shows)).clip(_LEAST**2)
         for share, each, count in zip(shares, left, shows.sum(0), strict=True):
             if count >= _ENOUGH:
                 self._left[share] = self._faded(self._left[share], each)

@@ -27,13 +27,15 @@ class SavedState:
         """Continue where :meth:`state` was taken.
 
         Raises:
-            ValueError: an array of another shape; nothing has changed then.
+            ValueError: an array of another shape, or a value that is not finite; nothing has changed then.
         """
         values: dict[str, Any] = {}
         for attribute, name in self.HELD.items():
             value, expected = np.array(state[name].numpy()), np.shape(getattr(self, attribute))
             if value.shape != expected:
                 raise ValueError(f"state[{name!r}] must have shape {expected}, got {value.shape}")
+            if not np.isfinite(value).all():
+                raise ValueError(f"state[{name!r}] must be finite: the state is damaged, start with reset()")
             values[attribute] = value if value.ndim else value.item()
         for attribute, value in values.items():
             setattr(self, attribute, value)

@@ -11,6 +11,8 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.landmarks import LandmarkSource, landmark_source
 from ufmstar_torch.anchors.tracker import Landmarks
+from ufmstar_torch.camera import rotation_deviation
+from ufmstar_torch.frame import FRAME_FAULTS, intrinsics_fault, pose_fault
 
 Given = str | Path | LandmarkSource
 _PARTS = ("pixel", "depth", "variance", "valid")
@@ -37,13 +39,17 @@ class StreamLandmarks:
         self.needs_image = any(source.needs_image for source in self._sources)
         self.last: list[Landmarks] = []
 
-    def update(self, image: Tensor | None, pose: Tensor, intrinsics: Tensor) -> Anchors:
+    def update(
+        self, image: Tensor | None, pose: Tensor, intrinsics: Tensor, rotation_tolerance: float | None = None
+    ) -> Anchors:
         """Anchors of the next image of every stream, in its pixels. Where it raises, no source has changed.
 
         Args:
             image: [B, 3, H, W] RGB, uint8, or floating-point in [0, 1]; None: the sources need none.
             pose: [B, 4, 4] or [4, 4] camera-to-world [m].
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px].
+            rotation_tolerance: a stream whose pose or intrinsics have a fault (``frame.FRAME_FAULTS``) skips the image:
+                it has no anchors and its source stays as it is. None = the source raises.
 
         Returns:
             [B, N], padded and masked, on the image's device.
@@ -58,11 +64,16 @@ class StreamLandmarks:
         pictures = None if image is None else _bytes(image).permute(0, 2, 3, 1).contiguous().cpu().numpy()
         T = pose.detach().double().expand(b, 4, 4).cpu().numpy()
         K = intrinsics.detach().double().expand(b, 3, 3).cpu()
-        before = self._states()
+        before, faults = self._states(), [0] * b
+        if rotation_tolerance is not None:
+            size = (torch.inf, torch.inf) if pictures is None else pictures.shape[1:3]
+            faults = _faults(torch.from_numpy(T), K, size, rotation_tolerance)
         try:
             result = [
-                source.update(None if pictures is None else pictures[i], T[i], K[i].numpy())
-                for i, source in enumerate(self._sources)
+                Landmarks.skipped(FRAME_FAULTS[fault])
+                if fault
+                else source.update(None if pictures is None else pictures[i], T[i], K[i].numpy())
+                for i, (source, fault) in enumerate(zip(self._sources, faults, strict=True))
             ]
         except BaseException:
             self._restore(before, range(b))
@@ -114,6 +125,12 @@ class StreamLandmarks:
     def _restore(self, states: Sequence[Mapping[str, Tensor]], streams: Sequence[int]) -> None:
         for i in streams:
             self._sources[i].load_state(states[i])
+
+
+def _faults(pose: Tensor, K: Tensor, size: tuple[float, ...], tolerance: float) -> list[int]:
+    """Indices into ``FRAME_FAULTS`` of poses [B, 4, 4] and intrinsics [B, 3, 3] of images of a size (H, W)."""
+    of_pose = pose_fault(pose, rotation_deviation(pose[:, :3, :3]), tolerance)
+    return torch.where(of_pose > 0, of_pose, intrinsics_fault(K, size)).tolist()
 
 
 def _bytes(image: Tensor) -> Tensor:

@@ -95,6 +95,11 @@ class Landmarks:
     tracked: int
     none: str = "no parallax, or no earlier view that agrees"
 
+    @classmethod
+    def skipped(cls, fault: str) -> Landmarks:
+        """None, of an image whose pose or intrinsics have a fault."""
+        return cls(np.zeros((0, 2)), np.zeros(0), np.zeros(0), 0, none=fault)
+
     def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
         """As UfM* takes them, for one stream whose depth map has its own size and intrinsics.
 

@@ -189,7 +189,8 @@ def _measure(image, pixel, keys, H, b, noise, numbers, rho, variance, agreed, co
             if out[5] < least_score:
                 continue
             # Of the normalised window: G along and across the line; the variance of a pixel from what is left over.
-            g_ee, g_ep, g_pp, pixel_noise = out[1], out[2], out[3], match * 2 * (1 - out[5]) / (COUNT - 4)
+            g_ee, g_ep, g_pp = out[1], out[2], out[3]
+            pixel_noise = match * 2 * max(1 - out[5], 0.0) / (COUNT - 4)  # rounding puts a ZNCC above 1
             slope = g_ep / g_ee
             schur = g_pp - g_ep * slope
             along = pixel_noise / g_ee + LEAST_MATCH
