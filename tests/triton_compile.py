@@ -68,7 +68,7 @@ K = torch.tensor(scenes.intrinsics(*SIZE)).expand(2, 3, 3)
 def cases() -> dict[str, Callable[[], object]]:
     """Calls that launch every kernel once, on small inputs."""
     from ufmstar_torch.kernels import step_device
-    from ufmstar_torch.kernels.triton import append, check, correspond, distribute, fuse, regress, segment
+    from ufmstar_torch.kernels.triton import append, check, correspond, fuse, regress, segment
 
     m = mixture(2, 40, 3, features=1)
     current = mixture(2, 20, 4, features=1)
@@ -110,8 +110,6 @@ def cases() -> dict[str, Callable[[], object]]:
         "correspond": lambda: correspond.correspond(m, current, K, SIZE, config),
         "bits": bits,
         "fuse": lambda: fuse.fuse(m, current, pairs, config.replace(overlap_weighted=True)),
-        "smooth": lambda: regress.smooth(depth, depth, 0.5),
-        "distribute": lambda: distribute.distribute(m, m.mean, m.covariance[..., 0], config),
         "check": lambda: check.check_values(
             FrameMaps(depth, depth, depth, depth[:, None], depth > 0),
             torch.eye(4).double().expand(2, 4, 4),
