@@ -6,6 +6,7 @@ import copy
 import pickle
 import threading
 from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -327,19 +328,14 @@ def test_a_copy_or_pickle_has_its_own_selection():
 def test_threads_do_not_mix_members():
     _, ensemble = tiny()
     x = images()
-    expected = [ensemble.member(n)(x).depth for n in range(N)]
-    wrong, barrier = [], threading.Barrier(N)
+    expected, barrier = [ensemble.member(n)(x).depth for n in range(N)], threading.Barrier(N)
 
-    def work(n):
+    def right(n):
         barrier.wait()
-        wrong.extend(n for _ in range(30) if not torch.equal(ensemble.member(n)(x).depth, expected[n]))
+        return all(torch.equal(ensemble.member(n)(x).depth, expected[n]) for _ in range(30))
 
-    threads = [threading.Thread(target=work, args=(n,)) for n in range(N)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert wrong == []
+    with ThreadPoolExecutor(N) as pool:
+        assert all(pool.map(right, range(N)))
 
 
 def test_an_error_ends_the_selection():

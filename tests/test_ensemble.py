@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -119,14 +120,6 @@ def test_a_copy_loads_anew(copied):
     assert "loaded=True" in repr(other)
 
 
-def in_threads(count, work):
-    threads = [threading.Thread(target=work) for _ in range(count)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-
-
 def test_threads_load_a_member_once():
     barrier, started = threading.Barrier(4), []
 
@@ -135,13 +128,9 @@ def test_threads_load_a_member_once():
         threading.Event().wait(0.05)
         return Gain(1.0)
 
-    member, depths = LazyMember(slow, INPUT), []
-
-    def work():
-        barrier.wait()
-        depths.append(member(image()).depth)
-
-    in_threads(4, work)
+    member = LazyMember(slow, INPUT)
+    with ThreadPoolExecutor(4) as pool:
+        depths = list(pool.map(lambda _: (barrier.wait(), member(image()).depth)[1], range(4)))
     assert len(started) == 1
     assert len(depths) == 4
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,19 +89,14 @@ def test_seam_of_the_gpu_kernels(monkeypatch):
 def test_several_threads_at_once():
     """Streams in several Python threads give what one gives alone."""
 
-    def run(out: list) -> None:
+    def run(_: int) -> list[torch.Tensor]:
         ufm = UfMStar()
-        out.extend(ufm(*input_frame(i)).variance for i in range(6))
+        return [ufm(*input_frame(i)).variance for i in range(6)]
 
-    results: list[list] = [[] for _ in range(4)]
-    run(results[0])
-    threads = [threading.Thread(target=run, args=(out,)) for out in results[1:]]
-    for t in threads:
-        t.start()
-    for t in threads:
-        t.join()
-    for out in results[1:]:
-        assert all(same(mine, theirs) for mine, theirs in zip(out, results[0], strict=True))
+    alone = run(0)
+    with ThreadPoolExecutor(3) as pool:
+        for out in pool.map(run, range(3)):
+            assert all(same(mine, theirs) for mine, theirs in zip(out, alone, strict=True))
 
 
 def test_importing_the_package_leaves_the_warnings_alone():
