@@ -93,7 +93,7 @@ def test_reference_partitions(name, backend):
             b.spgf(depth, K, r.config, before_pruning=True)[1] for b in (backend, make_backend("numba"))
         )
         assert torch.equal(labels, expected)
-        assert labels.max() > 2
+        assert labels.max() > 1
         return
     mixture, labels = backend.spgf(r.depth, r.intrinsics, r.config, before_pruning=True)
     jittered = 0
