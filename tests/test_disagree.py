@@ -99,7 +99,7 @@ def test_perfect_depth_has_a_far_lower_floor_than_w2():
     depths, poses, K = scenes.sequence(20, 96, 128, 0.0)
     mean = {}
     for kind in ("w2", "overlap"):
-        ufm = UfMStar(UfMStarConfig(segment=SPGF, disagreement=kind))
+        ufm = UfMStar(UfMStarConfig(segment=SPGF, unmeasured="paper", disagreement=kind))
         for depth, T in zip(depths, poses, strict=True):
             output = ufm(torch.tensor(depth)[None], torch.tensor(T), torch.tensor(K))
         mean[kind] = float(output.disagreement[output.valid].mean())

@@ -13,10 +13,10 @@ from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDept
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.models import Preprocess
-from ufmstar_torch.pipeline import NetworksInTurn, combine
+from ufmstar_torch.networks_in_turn import NetworksInTurn, combine
 
 H, W = 30, 40
-CONFIG = UfMStarConfig(segment=SPGF)
+CONFIG = UfMStarConfig(segment=SPGF, unmeasured="paper")
 K = torch.tensor(scenes.intrinsics(H, W))
 POSES = [torch.tensor(T) for T in scenes.tour(30)[:9]]
 
@@ -131,7 +131,7 @@ def test_the_preprocessed_intrinsics_reach_the_networks_that_take_them(mode):
     if mode == "full":
         expected = (expected + half.apply_image(x)[:, 0]) / 2
     torch.testing.assert_close(model(x, POSES[0], K).depth, expected)
-    source = NetworkSource(NetworksInTurn(ByFocal(), preprocess=half), torch.device("cpu"), {}, seeding=None)
+    source = NetworkSource(NetworksInTurn(ByFocal(), preprocess=half), torch.device("cpu"), {})
     picture = (x[0] * 255).byte()
     frame = Frame(0, "0", picture.permute(1, 2, 0).numpy(), None, POSES[0].numpy(), K.numpy())
     depth = source.one(frame, 0).maps.depth
@@ -205,7 +205,7 @@ def test_inference_mode_leaves_loadable_buffers():
     assert model(image(1), POSES[1], K).member == 0
 
 
-def test_the_variance_of_a_prediction():
+def test_the_networks_own_variance_is_a_and_e():
     both = DepthPrediction(torch.ones(1, 2, 2), torch.ones(1, 2, 2), 2 * torch.ones(1, 2, 2))
     assert torch.equal(both.variance, torch.full((1, 2, 2), 3.0))
     assert DepthPrediction(torch.ones(1, 2, 2)).variance is None

@@ -30,8 +30,8 @@ ON_CPU = pytest.mark.parametrize("backend", ["torch", "numba"], indirect=True)
 
 # Settings of UfM*, and the oracle's words for them.
 VARIANTS = {
-    "default": (UfMStarConfig(segment=SPGF, features=2, initial_capacity=8), {}),
-    "overlap": (UfMStarConfig(segment=SPGF, disagreement="overlap"), {"disagreement": "overlap"}),
+    "default": (UfMStarConfig(segment=SPGF, unmeasured="paper", features=2, initial_capacity=8), {}),
+    "overlap": (UfMStarConfig(segment=SPGF, unmeasured="paper", disagreement="overlap"), {"disagreement": "overlap"}),
     "relative": (
         UfMStarConfig(segment=SPGF, unmeasured="relative", unmeasured_relative=0.2),
         {"unmeasured": "relative", "unmeasured_relative": 0.2},

@@ -55,7 +55,7 @@ def test_bits_of_matches():
 
 def test_late_growth():
     """Every output is the CPU's, except for the map that was regressed while components waited for slots."""
-    config = UfMStarConfig(segment=SPGF, initial_capacity=2)
+    config = UfMStarConfig(segment=SPGF, unmeasured="paper", initial_capacity=2)
     modules = [make_backend(name).module(config) for name in ("triton", "numba")]
     late = []
     for i, (depth, pose, K, _) in enumerate(walks(1, 4)):

@@ -20,6 +20,7 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.setting import TRACKED, Setting
 from ufmstar_torch.eval.run.run_folder import Checkpoint
+from ufmstar_torch.eval.run.scale import NetworkScale
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
@@ -41,6 +42,7 @@ class RunJob:
     sheet: bool = True  # whether to make contact_sheet.png
     # makes the source of the anchors, in its initial state; for ``config.anchors``.
     landmarks: Callable[[], LandmarkSource] = LandmarkTracker
+    scale: NetworkScale | None = None  # of the poses, where it is the network's own; anchors then show shape alone
 
     def row(self, checkpoint: Checkpoint) -> RowRunner:
         """UfM* on the source, in the state of a checkpoint."""
@@ -76,6 +78,8 @@ class RunJob:
         for index in self.indices:
             entry = sequence.entries[index]
             digest.update(entry.name.encode() + entry.T_world_cam.tobytes())
+            if entry.intrinsics is not None:
+                digest.update(entry.intrinsics.tobytes())
         return {
             "sequence": {
                 "name": sequence.name,

@@ -48,6 +48,7 @@ def write_summary(
         "state": state,
         "reason": reason,
         "sequence": _sequence(job.sequence),
+        **_scale(job),
         "frames": _frames(records, len(job.indices)),
         "source": job.source_identity,
         "runtime": job.source.runtime,
@@ -98,6 +99,15 @@ def _sequence(sequence: FrameSequence) -> dict[str, Any]:
     }
 
 
+def _scale(job: RunJob) -> dict[str, Any]:
+    """Where the unit of the poses comes from, if not from the recording: a network's error of scale is then in the
+    poses and in the anchors too, which show the shape of its error alone."""
+    if job.scale is None:
+        return {} if job.sequence.pose_scale == 1 else {"scale_from": "--pose-scale"}
+    scale = {"metres_per_unit": job.scale.metres, "spread": job.scale.spread, "frames": job.scale.frames}
+    return {"scale_from": "network", "scale": scale, "anchors_show": "shape only"}
+
+
 def _frames(records: Sequence[Mapping[str, Any]], selected: int) -> dict[str, Any]:
     skipped = [record for record in records if record["state"] == "skipped"]
     return {
@@ -126,6 +136,8 @@ def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "units": "disagreement m^2, sigma m",
         # Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component, where the prior is 0.
         "near_zero_share": sum(record["near_zero"] for record in done) / pixels if pixels else None,
+        # The valid pixels that no two views compared; their M is ``UfMStarConfig.unmeasured``.
+        "unmeasured_share": sum(record["unmeasured"] for record in done) / pixels if pixels else None,
         "valid_pixels": pixels,
         "saturated_png_pixels": saturated,
     }

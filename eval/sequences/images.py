@@ -163,6 +163,16 @@ def depth_loader(path: Path | None, scale: float | None, default_scale: float = 
     return None if path is None else partial(read_depth, path, scale, default_scale=default_scale)
 
 
+def within(load: Loader | None, most: float) -> Loader | None:
+    """The loader of a depth map without the depths beyond ``most`` [m] (None stays None)."""
+    return None if load is None else partial(_within, load, most)
+
+
+def _within(load: Loader, most: float) -> np.ndarray:
+    depth = load()
+    return np.where(depth <= most, depth, np.float32(0))
+
+
 def check_scale(depth_scale: float | None) -> None:
     """Raises ValueError unless metres per unit is a positive number of at most 1, or None."""
     if depth_scale is not None and not 0 < depth_scale <= 1:
