@@ -62,14 +62,15 @@ def test_agrees_with_the_oracle(backend, seed, eta, eta_occl):
 
 def test_any_number_of_pairs(backend):
     """More than the kernels' lists and words hold at first, and many hidden members."""
-    many = mixture(1, 70 if backend.slow else 120, 3, empty=0)
+    count = 34 if backend.slow else 120
+    many = mixture(1, count, 3, empty=0)
     many = many.replace(
         mean=many.mean * 0.01 + torch.tensor([0.0, 0.0, 3.0]), covariance=many.covariance[:, :1] + 0 * many.covariance
     )
     for eta, eta_occl in ((0.01, 1.0), (0.3, 0.4)):
         config = UfMStarConfig(eta=eta, eta_occlusion=eta_occl)
         expected = correspond(many, many, K[None], SIZE, config).match
-        assert expected.sum() > 64
+        assert expected.sum() >= count
         assert torch.equal(backend.kernels.correspond(many, many, K[None], SIZE, config).match, expected)
 
 
