@@ -15,7 +15,7 @@ from ufmstar_torch import DepthPrediction, PosteriorConfig, SPGFConfig, UfMStar,
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.gaussian import barycenter
 from ufmstar_torch.models import Preprocess
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.segment import spgf
 
 pytestmark = pytest.mark.numerics
