@@ -8,14 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 from modules import CONFIG, POSES, SPGF, H, K, W, frame, same, snapshot, unchanged
-from torch import Tensor, nn
+from torch import Tensor
 
 import scenes
-from ufmstar_torch import DepthPrediction, PosteriorConfig, SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import PosteriorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.gaussian import barycenter
-from ufmstar_torch.models import Preprocess
-from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.segment import spgf
 
 pytestmark = pytest.mark.numerics
@@ -23,10 +21,6 @@ pytestmark = pytest.mark.numerics
 INF, NAN = torch.inf, torch.nan
 DEPTH, POSE, CAMERA = frame(0)
 D, K1 = torch.ones(2, 5, 6), torch.tensor([[5.0, 0, 3], [0, 5, 2], [0, 0, 1]]).expand(2, 3, 3)
-
-
-def call(depth=DEPTH, pose=POSE, intrinsics=CAMERA, config=CONFIG, **options) -> object:
-    return UfMStar(config)(depth, pose, intrinsics, **options)
 
 
 def begun() -> UfMStar:
@@ -40,30 +34,9 @@ def mean(**options) -> object:
     return begun().mean_uncertainty(*frame(1), **options)
 
 
-def pipeline(networks: object = None, image: Tensor | None = None, **options) -> object:
-    """Made, and called where there is an image."""
-    made = UncertainDepth(nn.Identity() if networks is None else networks, CONFIG, **options)  # type: ignore[arg-type]
-    return made if image is None else made(image, POSE, CAMERA)
-
-
 settings, segment = UfMStarConfig.from_dict, SPGFConfig.from_dict
+# Of arguments that are no frame's: those are in test_core_arguments.py.
 REFUSALS: list[tuple[Callable[[], object], str]] = [
-    (lambda: call(DEPTH[0]), "depth must be"),
-    (lambda: call(DEPTH[:, None, None]), "depth must be"),
-    (lambda: call(DEPTH[:, :0]), "depth must be"),
-    (lambda: call(DEPTH.long()), "depth must have a floating"),
-    (lambda: call(DEPTH.numpy()), "depth must be a torch.Tensor"),
-    (lambda: call(pose=POSE[:, :3]), "pose must be"),
-    (lambda: call(pose=POSE.expand(3, 4, 4)), "pose must have depth's 1 streams"),
-    (lambda: call(intrinsics=CAMERA[:, :2]), "intrinsics must be"),
-    (lambda: call(aleatoric=DEPTH[:, 1:]), "aleatoric must have"),
-    (lambda: call(aleatoric=DEPTH.to("meta")), "aleatoric must lie on"),
-    (lambda: call(epistemic=DEPTH.int()), "epistemic must have"),
-    (lambda: call(valid=DEPTH), "valid must be"),
-    (lambda: call(valid=DEPTH[:, 1:] > 0), "valid must have"),
-    (lambda: call(features=DEPTH[:, None]), "features must have shape"),
-    (lambda: call(config=CONFIG.replace(features=1)), "features must be given"),
-    (lambda: begun()(DEPTH.expand(2, H, W), POSE, CAMERA), "call reset"),
     (lambda: begun().reset([7]), "7"),
     (lambda: begun().reset(torch.tensor([True, False])), "mask"),
     (lambda: begun().query(torch.zeros(2, 5, 3)), "points"),
@@ -77,8 +50,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: mean(fraction=1.5), "fraction"),
     (lambda: mean(pixels=5, fraction=0.5), "pixels or fraction"),
     (lambda: UfMStar().warm_up((0, 4)), "size and streams must be positive"),
-    (lambda: UfMStar({"eta": 0.5}), "UfMStarConfig"),  # type: ignore[arg-type]
-    (lambda: UfMStar(dtype=torch.float16), "dtype"),
     (lambda: settings({"eta": 0.0}), "eta"),
     (lambda: settings({"eta": 1.5}), "eta"),
     (lambda: settings({"eta_occlusion": -1.0}), "eta_occlusion"),
@@ -125,20 +96,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: spgf(D, K1, compute_dtype=torch.float16), "compute_dtype .* got torch.float16"),
     (lambda: resize_intrinsics(K1, (0, 4), (5, 6)), "positive sizes"),
     (lambda: barycenter(torch.zeros(2, 3), torch.eye(3).expand(2, 3, 3), -torch.ones(2)), "weight must be non-neg"),
-    (lambda: combine([]), "empty"),
-    (lambda: DepthPrediction(D[0]), "depth must be"),
-    (lambda: DepthPrediction(D, D[..., 1:]), "aleatoric_variance must have"),
-    (lambda: pipeline([]), "networks"),
-    (lambda: pipeline(mode="all"), "mode"),
-    (lambda: pipeline(mode="full"), "mode|samples"),
-    (lambda: pipeline(samples=10), "samples"),
-    (lambda: pipeline([nn.Identity(), nn.Identity()], mode="full", samples=10), "samples"),
-    (lambda: pipeline(image=D[:1]), r"image must be \[B, 3, H, W\]"),
-    (lambda: pipeline(image=DEPTH.expand(1, 3, H, W)), r"DepthPrediction, got Tensor: wrap .*wrap_network\(network\)"),
-    (lambda: pipeline(call), r"got a function; wrap a function with .*wrap_network\(function\)"),
-    (lambda: pipeline([call]), r"got a function; wrap a function with .*wrap_network\(function\)"),
-    (lambda: pipeline(3), "sequence of them, got a int$"),
-    (lambda: Preprocess((224, 224)), r"resize_height is one number, .*Preprocess\(size=\(224, 224\)\)"),  # type: ignore[arg-type]
 ]
 
 
