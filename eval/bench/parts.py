@@ -73,8 +73,8 @@ class MultiviewStep:
         """Bytes and number of the points or components, with what anchors add; bytes of the map for smoothing."""
         memory = self.estimator.memory()
         landmarks = {} if self._landmarks is None else self._landmarks.state()
-        kept = memory["bytes"] + sum(value.nbytes for value in landmarks.values())
-        return {"bytes_end": kept, "count_end": memory["count"], "smoothing_bytes": memory["smoothing_bytes"]}
+        state_bytes = memory["bytes"] + sum(value.nbytes for value in landmarks.values())
+        return {"bytes_end": state_bytes, "count_end": memory["count"], "smoothing_bytes": memory["smoothing_bytes"]}
 
 
 class TimedParts:
