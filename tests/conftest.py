@@ -112,6 +112,25 @@ def ufmstar(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
 @pytest.fixture(scope="session")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three sequences of 4 frames. Nobody may change them."""
-    from suite_runs import write_rooms
+    from tiny_suite import write_rooms
 
     return write_rooms(tmp_path_factory.mktemp("rooms"))
+
+
+@pytest.fixture(scope="session")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sequence to train on. Nobody may change it."""
+    from trainings import write_frames
+
+    return write_frames(tmp_path_factory.mktemp("frames") / "walk")
+
+
+@pytest.fixture(scope="module")
+def one_thread():
+    """One thread of torch's, restored afterwards."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

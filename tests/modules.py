@@ -10,7 +10,7 @@ from ufmstar_torch import UfMStarConfig
 
 H, W = 30, 40
 
-CONFIG = UfMStarConfig(segment=SPGF)
+CONFIG = UfMStarConfig(segment=SPGF, unmeasured="paper")
 
 DEPTHS, POSES, K_ = scenes.sequence(8, H, W, 0.05)
 

@@ -27,7 +27,7 @@ from ufmstar_torch.models import (
 )
 from ufmstar_torch.models.batch_ensemble import converted_layers
 from ufmstar_torch.models.batch_layer import BatchLayer, Selection
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.networks_in_turn import combine
 
 N = 3
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from dataclasses import replace
 
@@ -16,14 +17,16 @@ from walks import SPGF, oracle_settings
 import oracle
 from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.config import PAPER
 from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.models import Ensemble, wrap_network
 from ufmstar_torch.models.alignment import AlignedNetwork, Alignment
-from ufmstar_torch.pipeline import NetworksInTurn
+from ufmstar_torch.networks_in_turn import NetworksInTurn
 from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.stateful import flat
 
 pytestmark = pytest.mark.numerics
 
@@ -120,7 +123,7 @@ def test_declared_ranges_reach_the_pipeline_and_the_evaluation():
     assert AlignedNetwork(network, Alignment("inverse", 1.0, 0.0, max_depth=5.0)).max_depth == 5.0
     assert UfMStarConfig().within(7.0).segment == SPGFConfig(max_depth=7.0)
     assert UfMStarConfig().segment.depth_limit == 20.0
-    source = NetworkSource(NetworksInTurn(network), torch.device("cpu"), {}, seeding=None)
+    source = NetworkSource(NetworksInTurn(network), torch.device("cpu"), {})
     assert source.max_depth == 7.0
     made = make_estimator(Row(Method.parse("UfM*-DepthOnly")), torch.device("cpu"), source.max_depth)
     assert made.ufm.config.segment.max_depth == 7.0
@@ -189,7 +192,7 @@ def test_a_first_frame_reads_as_chosen(backend):
 
 def test_a_point_far_from_everything_reads_as_chosen():
     far = torch.full((1, 1, 3), 500.0)
-    for choice, expected in (("paper", 0.0), ("nan", float("nan"))):
+    for choice, expected in (("paper", 0.0), ("relative", float("nan")), ("nan", float("nan"))):
         ufm = UfMStar(CONFIG.replace(unmeasured=choice, **CHOICES[choice]))
         for i in range(2):
             ufm(*frame(i))
@@ -234,9 +237,9 @@ def test_what_was_not_measured_does_not_make_the_next_frame_certain(choice):
 
 
 def test_depth_alone_through_the_pipeline_is_never_certain_unasked():
-    """First frame, a point far from every Gaussian, and a later frame: a choice other than the paper's leaves no 0."""
+    """First frame, a point far from every Gaussian, and a later frame: only the paper's choice leaves a 0."""
     network = wrap_network(lambda x: DEPTHS_OF[int(x[0, 0, 0, 0] * 255)])
-    model = UncertainDepth(network, CONFIG.replace(unmeasured="relative"))
+    model = UncertainDepth(network, UfMStarConfig(segment=SPGF))
     for i in range(3):
         image = torch.zeros(1, 3, H, W) + i / 255
         out = model(image, torch.tensor(POSES[i]), K)
@@ -245,6 +248,17 @@ def test_depth_alone_through_the_pipeline_is_never_certain_unasked():
     out = paper(torch.zeros(1, 3, H, W), torch.tensor(POSES[0]), K)
     assert float(out.variance[out.ufm.valid].max()) == 0
     assert int(out.ufm.statistics.unmeasured[0]) == int(out.ufm.valid.sum())
+
+
+def test_views_of_different_places_are_not_certain():
+    """Ten views 50 m apart, as of poses in millimetres: nothing is compared, and sigma is a share of the depth."""
+    ufm = UfMStar(UfMStarConfig(segment=SPGF))
+    for i in range(10):
+        depth, pose, intrinsics = frame(0)
+        pose[:, 0, 3] += 50 * i
+        out = ufm(depth, pose, intrinsics)
+        assert int(out.statistics.unmeasured[0]) == int(out.statistics.valid_pixels[0])
+        np.testing.assert_allclose(out.std[out.valid].numpy(), 0.2 * depth[out.valid].numpy(), rtol=1e-4)
 
 
 def test_a_frame_without_a_segment_warns_once(caplog):
@@ -268,10 +282,12 @@ def test_the_papers_configuration():
     # SPGF's own t = a z^2 / f at the paper's 224 x 224, whatever the camera; the same in metres at 518 x 518.
     assert paper.segment.scaled_to(224, 224).slope(123.0) == pytest.approx(2.4 / 123)
     assert paper.segment.scaled_to(518, 518).slope(123.0 * 518 / 224) == pytest.approx(2.4 / 123)
-    changed = {"segment", "regression"}
-    ours, theirs = UfMStarConfig().to_dict(), paper.to_dict()
-    assert {name for name in ours if ours[name] != theirs[name]} == changed
-    assert UfMStarConfig.from_dict(theirs) == paper
+    ours, theirs = flat(UfMStarConfig().to_dict()), flat(paper.to_dict())
+    assert {name: theirs[name] for name in ours if ours[name] != theirs[name]} == dict(PAPER)
+    told = inspect.getdoc(UfMStarConfig.paper)
+    assert told is not None
+    assert [name for name in PAPER if name.removeprefix("segment") not in told] == []
+    assert UfMStarConfig.from_dict(paper.to_dict()) == paper
 
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])

@@ -421,4 +421,4 @@ def test_a_directory_is_identified_by_its_visible_files(broken, metric):
     (broken / "config.json").rename(broken / "config2.json")
     assert sha256(broken) != sha256(metric)
     identity = network_source("depth_anything", [metric]).identity
-    assert identity["weights"] == [{"name": "metric", "sha256": sha256(metric)}]
+    assert identity["files"] == [{"name": "metric", "sha256": sha256(metric), "member": None}]

@@ -98,7 +98,7 @@ def test_a_surface_seen_edge_on_stays_finite():
 def test_a_sequence_agrees_with_the_oracle():
     depths, poses, K = scenes.sequence(6, HEIGHT, WIDTH, 0.04)
     judge = oracle.Oracle(oracle_settings(SPGF), disagreement="overlap")
-    config = UfMStarConfig(segment=SPGF, regression="exact", disagreement="overlap")
+    config = UfMStarConfig(segment=SPGF, unmeasured="paper", regression="exact", disagreement="overlap")
     tiers = [UfMStar(config.replace(backend=backend), dtype=torch.float64) for backend in ("torch", "numba")]
     for depth, T in zip(depths, poses, strict=True):
         expected, _ = judge.step(depth, T, K)
@@ -112,7 +112,7 @@ def test_perfect_depth_has_a_far_lower_floor_than_w2():
     depths, poses, K = scenes.sequence(20, 96, 128, 0.0)
     mean = {}
     for kind in ("w2", "overlap"):
-        ufm = UfMStar(UfMStarConfig(segment=SPGF, disagreement=kind))
+        ufm = UfMStar(UfMStarConfig(segment=SPGF, unmeasured="paper", disagreement=kind))
         for depth, T in zip(depths, poses, strict=True):
             output = ufm(torch.tensor(depth)[None], torch.tensor(T), torch.tensor(K))
         mean[kind] = float(output.disagreement[output.valid].mean())

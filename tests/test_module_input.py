@@ -106,36 +106,6 @@ def test_bad_intrinsics(bad):
         UfMStar(CONFIG)(depth, pose, torch.tensor(bad))
 
 
-def test_wrong_shapes_and_dtypes_name_the_argument():
-    depth, pose, intrinsics = frame(0)
-    ufm = UfMStar(CONFIG)
-    cases = [
-        ((depth[0], pose, intrinsics), {}, ValueError, "depth must be"),
-        ((depth[:, None, None], pose, intrinsics), {}, ValueError, "depth must be"),
-        ((depth[:, :0], pose, intrinsics), {}, ValueError, "depth must be"),
-        ((depth.long(), pose, intrinsics), {}, TypeError, "depth must have a floating"),
-        ((depth.numpy(), pose, intrinsics), {}, TypeError, "depth must be a torch.Tensor"),
-        ((depth, pose[:, :3], intrinsics), {}, ValueError, "pose must be"),
-        ((depth, pose.expand(3, 4, 4), intrinsics), {}, ValueError, "pose must have depth's 1 streams"),
-        ((depth, pose, intrinsics[:, :2]), {}, ValueError, "intrinsics must be"),
-        ((depth, pose, intrinsics), {"aleatoric": depth[:, 1:]}, ValueError, "aleatoric must have"),
-        ((depth, pose, intrinsics), {"epistemic": depth.int()}, TypeError, "epistemic must have"),
-        ((depth, pose, intrinsics), {"valid": depth}, TypeError, "valid must be"),
-        ((depth, pose, intrinsics), {"valid": depth[:, 1:] > 0}, ValueError, "valid must have"),
-        ((depth, pose, intrinsics), {"features": depth[:, None]}, ValueError, "features must have shape"),
-        ((depth, pose, intrinsics), {"aleatoric": depth.to("meta")}, ValueError, "aleatoric must lie on"),
-    ]
-    for arguments, options, error, message in cases:
-        with pytest.raises(error, match=message):
-            ufm(*arguments, **options)
-    assert ufm.mean.shape[0] == 0
-    ufm(depth, pose, intrinsics)
-    with pytest.raises(ValueError, match="call reset"):
-        ufm(depth.expand(2, H, W), pose, intrinsics)
-    with pytest.raises(ValueError, match="features must be given"):
-        UfMStar(CONFIG.replace(features=1))(depth, pose, intrinsics)
-
-
 def test_bad_pixels_are_left_out_and_counted():
     depth, pose, intrinsics = frame(0)
     depth = depth.nan_to_num(2.0)

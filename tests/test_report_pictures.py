@@ -239,7 +239,9 @@ class TestProjection:
 
 def snapshot(frame: str, mean: list[list[float]], m: list[float], sigma: float = 0.3) -> Snapshot:
     covariance = np.eye(3)[None].repeat(len(m), 0) * sigma**2
-    return Snapshot(frame, np.array(mean).reshape(-1, 3), covariance, np.array(m), np.eye(4), np.zeros((1, 3)))
+    return Snapshot(
+        frame, np.array(mean).reshape(-1, 3), covariance, np.array(m), np.full(len(m), 2), np.eye(4), np.zeros((1, 3))
+    )
 
 
 class TestRooms:
@@ -279,9 +281,16 @@ class TestRooms:
         for half in halves_:
             assert (np.abs(half - expected).max(-1) <= 2).sum() > 300
 
+    def test_what_was_seen_once_is_grey(self, tmp_path: Path) -> None:
+        one = snapshot("f", [[0, 0.2, 2], [2, 0.2, 2]], [0.25, 0.0])
+        assert self.pixels(tmp_path / "r.png", [one], 0.0) > 300
+        assert self.pixels(tmp_path / "r.png", [replace(one, count=np.array([2, 1]))], 0.0) == 0
+        assert self.pixels(tmp_path / "r.png", [replace(one, count=np.array([2, 1]))], np.nan) > 300
+
     def test_snapshots_are_found_in_order(self, tmp_path: Path) -> None:
         (tmp_path / "room").mkdir()
         maps = {"mean_world": np.zeros((0, 3)), "covariance_world": np.zeros((0, 3, 3)), "disagreement": np.zeros(0)}
+        maps["count"] = np.zeros(0)
         for name in ("UfMstar-Ensemble_frame_10", "UfMstar-Ensemble_frame_9", "UfMstar-MCD@ab_frame_1"):
             np.savez(tmp_path / "room" / f"{name}.npz", **maps, T_world_cam=np.eye(4))
         rooms = find_rooms(tmp_path)

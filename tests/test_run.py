@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from layouts import truncate, write_depth_png, write_generic
+from PIL import Image
 from runs import CONFIG, Brightness, job_of, network_job, networks, outputs, own_depth_job, read_summary
 
 from ufmstar_torch import UncertainDepth, cli
@@ -69,7 +70,7 @@ def test_a_run_equals_a_loop_by_hand(scene, tmp_path):
     sequence, preprocess = open_sequence(path), Preprocess(size=(24, 32))
     pipeline = UncertainDepth(Brightness(spread=0.02), CONFIG, preprocess=preprocess)
     ours, alone = SequenceMetrics(), SequenceMetrics()
-    disagreements = []
+    disagreements, unmeasured = [], []
     for frame, depth in zip(sequence, truth.depths, strict=True):
         image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
         result = pipeline(image, torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None])
@@ -77,6 +78,10 @@ def test_a_run_equals_a_loop_by_hand(scene, tmp_path):
         np.testing.assert_array_equal(stored["depth"], result.depth[0].numpy())
         np.testing.assert_array_equal(stored["variance"], result.variance[0].numpy())
         np.testing.assert_array_equal(stored["disagreement"], result.disagreement[0].numpy())
+        np.testing.assert_array_equal(stored["measured"], result.ufm.measured[0].numpy())
+        unmeasured.append(int(result.ufm.statistics.unmeasured[0]))
+        with Image.open(tmp_path / "out" / "sigma" / f"{frame.name}.png") as picture:
+            assert picture.info["unmeasured"] == str(unmeasured[-1])
         target = preprocess.apply_depth(torch.from_numpy(frame.depth))
         assert np.abs(target.numpy() - preprocess.apply_depth(torch.from_numpy(depth)).numpy()).max() < 1e-3
         ours.update(result.depth[0], result.variance[0], target)
@@ -90,6 +95,8 @@ def test_a_run_equals_a_loop_by_hand(scene, tmp_path):
     assert summary["metrics"] == pytest.approx(expected, rel=1e-12, nan_ok=True)
     assert summary["network_alone"]["nll"] == pytest.approx(alone.compute()["nll"], rel=1e-6)
     assert summary["uncertainty"]["mean_disagreement"] == pytest.approx(np.mean(disagreements), rel=1e-12)
+    assert unmeasured[0] == 24 * 32 > unmeasured[-1]
+    assert summary["uncertainty"]["unmeasured_share"] == sum(unmeasured) / summary["uncertainty"]["valid_pixels"]
     assert summary["mixture"]["components"] == int(pipeline.ufm.mixture.components)
     assert summary["mixture"]["components_over_time"][-1] == summary["mixture"]["components"]
     counts = summary["mixture"]

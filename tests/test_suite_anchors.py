@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_suite import Biased, base_network, evaluate, in_memory, row, unbatched, write_network
+from tiny_suite import Biased, base_network, evaluate, row, unbatched, write_network
 
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.anchors import Anchors
@@ -19,6 +19,7 @@ from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.data import setting_of
+from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.sequence import open_tour
 
@@ -30,7 +31,8 @@ FIGURES = ("delta1", "rmse", "nll", "ece_delta", "ece_q", "spearman")
 @pytest.fixture(scope="module")
 def tour():
     """Ten decoded frames: rendering them again for every test would take most of the time."""
-    return in_memory(open_tour("tour:300003?frames=16&size=96x128&sensor=0"), slice(10))
+    tour = open_tour("tour:300003?frames=16&size=96x128&sensor=0")
+    return in_memory(replace(tour, entries=tour.entries[:10], names_on_disk=tour.names_on_disk[:10]))
 
 
 @pytest.fixture(scope="module")
@@ -173,9 +175,9 @@ def test_truth_is_exact_at_random_pixels_and_more_hold_the_fewer(tour):
 
     def drawn(count, seed=0):
         source = AnchorSource(Setting(anchors="truth", anchor_count=count, seed=seed), None)
-        result = source.of(frame, frame.T_world_cam, p, truth)
-        assert result.ms is None
-        return result.anchors
+        _, anchors, ms = source.of(frame, frame.T_world_cam, p, truth)
+        assert ms is None
+        return anchors
 
     few, many, default = drawn(20), drawn(300), drawn(None)
     assert [a.depth.shape[1] for a in (few, many, default)] == [20, 300, 100]
@@ -196,10 +198,10 @@ def test_track_noise_has_the_size_that_the_tracker_states_for_it(tour):
         pair = []
         for size, own in zip((0.0, 0.5), tracks, strict=True):
             source = AnchorSource(Setting(anchors="tracked", track_noise=size), own)
-            result = source.of(frame, frame.T_world_cam, p, None)
-            assert isinstance(result.anchors, Anchors)
-            assert result.ms > 0
-            pair.append(result.anchors)
+            _, anchors, ms = source.of(frame, frame.T_world_cam, p, None)
+            assert isinstance(anchors, Anchors)
+            assert ms > 0
+            pair.append(anchors)
         assert torch.equal(pair[0].variance, pair[1].variance), "the tracker does not know of the noise"
         clean.append(torch.cat([pair[0].pixel, pair[0].depth[..., None]], -1)[0])
         noisy.append(torch.cat([pair[1].pixel, pair[1].depth[..., None]], -1)[0])

@@ -12,7 +12,7 @@ from layouts import truncate, write_generic, write_tum
 from tiny_suite import CPU, base_network, evaluate, row, same, unbatched, write_networks
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.eval.engine.evaluate import SequenceError
+from ufmstar_torch.eval.engine.judge import SequenceError
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
@@ -20,7 +20,7 @@ from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.models import load_trained
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction
 
 SKIP = UfMStarConfig(on_bad_frame="skip")

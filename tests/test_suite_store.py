@@ -13,7 +13,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from layouts import write_seven_scenes
-from suite_runs import NAMES, go, job_on, write_rooms
+from tiny_suite import NAMES, go, job_on, write_rooms
 
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting

@@ -34,7 +34,7 @@ from ufmstar_torch.models import (
 )
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.trained import load_for_training
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.networks_in_turn import combine
 
 SPECS = {
     "depth": {},
@@ -362,7 +362,7 @@ def test_a_run_with_all_members_of_two_files(ufmstar, scene, tmp_path, mode, met
         depths(tmp_path / "out"), by_hand(scene, [ready(m) for m in members_of(networks)], mode)
     )
     source = read_summary(tmp_path / "out")["source"]
-    assert [file["name"] for file in source["weights"]] == ["a.safetensors", "b.safetensors"]
+    assert [file["name"] for file in source["files"]] == ["a.safetensors", "b.safetensors"]
     assert (source["mode"], source["samples"]) == (mode, None)
 
 

@@ -30,7 +30,7 @@ class Teacher:
 
     def __init__(self, clip: int, max_depth: float | None = None) -> None:
         self._clip = clip
-        self._ufm = UfMStar(UfMStarConfig(on_bad_frame="skip").within(max_depth))
+        self._ufm = UfMStar(UfMStarConfig(on_bad_frame="skip", unmeasured="paper").within(max_depth))
 
     def __call__(self, depth: Tensor, T_world_cam: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
         """V of every frame, from it and the frames of its clip before it.

@@ -190,7 +190,7 @@ class MeanUncertainty:
             NaN with fewer than two pixels.
         pixels: number of pixels averaged.
         measured: share in [0, 1] of the sampled pixels whose M rests on surfaces seen from two views or more; about 0
-            in a first view, whose mean does not measure disagreement. NaN without a valid pixel.
+            in a first view, whose mean is that of ``config.unmeasured``. NaN without a valid pixel.
         statistics: per-stream counts of this frame; ``unmeasured`` are the other sampled pixels.
     """
 

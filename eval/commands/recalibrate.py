@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ufmstar_torch.eval.commands.options import UsageError, option, parse, positional
+from ufmstar_torch.eval.commands.options import UsageError, option, positional, reader
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.methods.row import Row
@@ -39,9 +39,7 @@ class RecalibrateOptions:
     debug: bool = False
 
 
-def read(words: Sequence[str]) -> RecalibrateOptions:
-    """The options of a command line; errors as :func:`parse`."""
-    return parse(RecalibrateOptions, words, "ufmstar recalibrate")
+read = reader(RecalibrateOptions, "ufmstar recalibrate")
 
 
 def main(options: RecalibrateOptions) -> int:

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.metrics.pixel_sums import HIGH, LOW
 from ufmstar_torch.recalibrate import ISOTONIC, SCALAR, Recalibration
 
 Array = NDArray[np.float64]
-# Of |z| of a standard normal variable: the levels at which errors are compared with it. The outer tenth is left out:
+# Levels of |z| of a standard normal variable at which errors are compared with it. The outer tenth is left out:
 # gross errors of the depth would set the variance of all other pixels.
 LEVELS = np.arange(0.1, 0.91, 0.1)
 GROUPS = 32

@@ -148,7 +148,7 @@ def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequenc
     counts = " then ".join(str(len(snapshot.mean)) for snapshot in snapshots)
     caption = (
         "Each Gaussian is an ellipse as large as the patch it stands for. What lies above the camera (the ceiling) is "
-        "left out. Black: seen from one view only, or no disagreement. Blue: the camera's path."
+        "left out. Grey: seen from one view only. Black: no disagreement. Blue: the camera's path."
     )
     title = f"{sequence}: the Gaussians of {label}"
     alt = f"{title}: {counts} Gaussians, coloured by disagreement from 0 to {scale.high:.2g} m"
@@ -195,10 +195,15 @@ def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Pictu
         maps = example.rows[row]
         parts = [
             Panel(None if part is None else scales.length.rgb(maps.root(part)), absent="none")
-            for part in (maps.aleatoric, maps.epistemic, maps.disagreement)
+            for part in (maps.aleatoric, maps.epistemic)
         ]
+        views = None if maps.disagreement is None else maps.striped(scales.length.rgb(maps.root(maps.disagreement)))
         error, sigma, nll = _judged(example, row, scales)
-        body.append(GridRow(example.label(row), figures_of(example, row), [*parts, sigma, error, nll]))
+        body.append(
+            GridRow(
+                example.label(row), figures_of(example, row), [*parts, Panel(views, absent="none"), sigma, error, nll]
+            )
+        )
     captions = ("√A, aleatoric", "√E, epistemic", "√M, between views", "σ = √V, V = A + E + M", "|error|", "NLL")
     body[0] = body[0].captioned(captions)
     bars = [Bar("√A, √E, √M, σ and |error| [m]", scales.length, 0, span=5), Bar("NLL [nats]", NLL_SCALE, 5)]
@@ -222,8 +227,8 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
     maps = {
         "image": example.image,
         f"|error| of {example.label(ufm_star)}": scales.length.rgb(example.error(ufm_star)),
-        f"σ, {example.label(ufm)}": scales.length.rgb(old),
-        f"σ, {example.label(ufm_star)}": scales.length.rgb(new),
+        f"σ, {example.label(ufm)}": example.rows[ufm].striped(scales.length.rgb(old)),
+        f"σ, {example.label(ufm_star)}": example.rows[ufm_star].striped(scales.length.rgb(new)),
         "difference of σ": signed.rgb(difference),
     }
     boxes = [_scaled(box, old.shape, picture.shape) for picture in maps.values()]
@@ -268,7 +273,8 @@ def _scaled(box: Box, shape: tuple[int, ...], picture: tuple[int, ...]) -> Box:
 
 def _judged(example: Example, row: str, scales: PanelScales) -> tuple[Panel, Panel, Panel]:
     """|error|, sigma and NLL of a row."""
-    error, sigma = scales.length.rgb(example.error(row)), scales.length.rgb(example.rows[row].sigma)
+    maps = example.rows[row]
+    error, sigma = scales.length.rgb(example.error(row)), maps.striped(scales.length.rgb(maps.sigma))
     return Panel(error), Panel(sigma), Panel(NLL_SCALE.rgb(example.nll(row)))
 
 

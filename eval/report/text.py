@@ -130,6 +130,11 @@ def run_table(summary: Mapping[str, Any]) -> str:
     else:
         sigma = number(uncertainty["mean_sigma"])
         lines.append(f"no metrics: {summary['metrics_reason']}; mean sigma {sigma} m")
+    if uncertainty["unmeasured_share"]:
+        lines.append(
+            f"not compared: {uncertainty['unmeasured_share']:.0%} of the pixels show what one view alone has seen; "
+            "there M is that of --ufm.unmeasured, and sigma is striped in the pictures"
+        )
     mixture, time = summary["mixture"], summary["time"]
     stages = ", ".join(f"{s} {ms:.1f}" for s, ms in time["median_ms"].items() if ms is not None)
     rate = time["frames_per_second"]

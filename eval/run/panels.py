@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch import unmeasured
 from ufmstar_torch.eval.run import colours
 from ufmstar_torch.eval.run.colours import FAINT, INK, ColourScale
 
@@ -96,7 +97,8 @@ def draw_grid(
 
     grey = (colours.INVALID_GREY / 255,) * 3
     figure.add_artist(Rectangle((_MARGIN, bottom), 0.12, _BAR, color=grey, transform=figure.dpi_scale_trans))
-    say(figure, _MARGIN + 0.18, bottom + _BAR / 2, "no value, no truth", size=7.5, color=FAINT, va="center")
+    words = "no value, no truth;\nstripes: not compared"
+    say(figure, _MARGIN + 0.18, bottom + _BAR / 2, words, size=7.5, color=FAINT, va="center", linespacing=1.2)
     colours.save_png(figure, path)
 
 
@@ -186,7 +188,8 @@ class FramePanel:
     """One frame to be shown: its image [H, W, 3] uint8 RGB of any size, and its maps [h, w] [m], NaN where unknown.
 
     ``maps`` has names of ``MAPS``: "depth" and "sigma" always, "error" with ground truth, "anchored" (the part of
-    sigma that is due to anchors) and those of the posterior of a run with them. ``note`` ("K = 31") stands beside the
+    sigma that is due to anchors) and those of the posterior of a run with them. "measured", the share of the
+    disagreement that rests on two views or more, has no column: it stripes sigma. ``note`` ("K = 31") stands beside the
     name.
 
     Raises:
@@ -226,8 +229,12 @@ class MapColumn(NamedTuple):
     field: str
 
     def rgb(self, panel: FramePanel) -> NDArray[np.uint8] | None:
-        """[h, w, 3] the coloured map, None if the panel has none."""
-        return self.scale.rgb(panel.maps[self.field]) if self.field in panel.maps else None
+        """[h, w, 3] the coloured map, sigma striped where no two views were compared; None if the panel has none."""
+        if self.field not in panel.maps:
+            return None
+        rgb = self.scale.rgb(panel.maps[self.field])
+        measured = panel.maps.get("measured") if self.field == "sigma" else None
+        return rgb if measured is None else colours.striped(rgb, measured < unmeasured.HALF)
 
 
 def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:

@@ -136,6 +136,8 @@ def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "units": "disagreement m^2, sigma m",
         # Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component, where the prior is 0.
         "near_zero_share": sum(record["near_zero"] for record in done) / pixels if pixels else None,
+        # The valid pixels that no two views compared; their M is ``UfMStarConfig.unmeasured``.
+        "unmeasured_share": sum(record["unmeasured"] for record in done) / pixels if pixels else None,
         "valid_pixels": pixels,
         "saturated_png_pixels": saturated,
     }

@@ -1,12 +1,13 @@
 """The files of every frame of ``ufmstar run``: an npz and 16-bit PNGs.
 
 ```
-OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2] float32 and valid bool, each [H, W]; with
-                      anchors also anchored [m^2] (B) and bias (r: depth (1 + r) is the depth corrected), with a
-                      posterior also posterior_depth [m] and posterior_variance [m^2]; T_world_cam [4, 4] camera-to-
-                      world [m] and intrinsics [3, 3] of the maps [px]
+OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2], measured (the share of the disagreement that
+                      rests on two views or more) float32 and valid bool, each [H, W]; with anchors also anchored
+                      [m^2] (B) and bias (r: depth (1 + r) is the depth corrected), with a posterior also
+                      posterior_depth [m] and posterior_variance [m^2]; T_world_cam [4, 4] camera-to-world [m] and
+                      intrinsics [3, 3] of the maps [px]
 OUT/depth/NAME.png    depth, the posterior's if there is one; 16 bit, 0 = invalid; metres per count in the PNG's text
-OUT/sigma/NAME.png    its standard deviation, likewise
+OUT/sigma/NAME.png    its standard deviation, likewise; the text "unmeasured" counts pixels that no two views compared
 OUT/network_depth/NAME.png, OUT/network_sigma/NAME.png   with a posterior: those before it
 ```
 Every file is complete or absent. Nothing here keeps more than one frame in memory.
@@ -25,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch import unmeasured
 from ufmstar_torch.eval.run.files import write_together
 
 # Metres per count that a run may choose from, finest first: up to 65.5 m, 256 m (KITTI's), 655 m, 6.6 km.
@@ -93,10 +95,14 @@ class FrameWriter:
         self.unit = unit
         files: dict[Path, Callable[[BinaryIO], object]] = {}
         saturated = {}
+        blind = np.count_nonzero(maps["measured"] < unmeasured.HALF) if "measured" in maps else 0
+        notes = {"depth": {}, "sigma": {"unmeasured": str(blind)}}
         for prefix, (depth, variance) in pairs.items():
             sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
             for kind, values, counts in (("depth", depth, unit), ("sigma", sigma, unit / 10)):
-                content, saturated[prefix + kind] = encode_length_png(values, used, counts, quantity=kind)
+                content, saturated[prefix + kind] = encode_length_png(
+                    values, used, counts, quantity=kind, **notes[kind]
+                )
                 folder = self.out_dir / (prefix + kind)
                 folder.mkdir(exist_ok=True)
                 files[folder / paths[kind].name] = partial(_write, content)
@@ -130,15 +136,13 @@ def fitting_unit(depth: NDArray[Any]) -> float:
     return next((unit for unit in DEPTH_UNITS if far <= FULL * unit), DEPTH_UNITS[-1])
 
 
-def encode_length_png(
-    values: NDArray[Any], valid: NDArray[np.bool_], unit: float, *, quantity: str
-) -> tuple[bytes, int]:
+def encode_length_png(values: NDArray[Any], valid: NDArray[np.bool_], unit: float, **notes: str) -> tuple[bytes, int]:
     """Lengths [H, W] [m] as a 16-bit PNG with its scale ``unit`` [m per count] as text: the file's content, and the
     number of saturated pixels.
 
     count = round(value / unit), 0 = invalid or not finite. A valid value below half a unit becomes 1, so that it is not
     taken for invalid; one beyond the range becomes 65535. Text keys: ``depth_scale`` = metres per count (also for
-    sigma: it is a depth's), ``unit``, ``quantity`` (a note for the reader), ``invalid``, ``saturated``.
+    sigma: it is a depth's), ``unit``, ``invalid``, ``saturated``, and the ``notes`` for the reader.
     """
     import cv2
     from PIL.PngImagePlugin import PngInfo, putchunk
@@ -151,7 +155,7 @@ def encode_length_png(
     how = (cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP)
     pixels = cv2.imencode(".png", coded, how)[1].tobytes()
     text, content = PngInfo(), io.BytesIO()
-    entries = {"depth_scale": repr(float(unit)), "unit": "metres per count", "quantity": quantity}
+    entries = {"depth_scale": repr(float(unit)), "unit": "metres per count", **notes}
     for key, value in {**entries, "invalid": "0", "saturated": str(saturated)}.items():
         text.add_text(key, value)
     content.write(pixels[:_AFTER_HEADER])

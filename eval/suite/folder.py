@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import RowFigures
+from ufmstar_torch.eval.engine.judge import RowFigures
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.metrics.packed_sums import pack
-from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.files import remove_temporaries, write_atomic, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, hold, remover
 from ufmstar_torch.eval.suite.record import FORMAT, Record
 from ufmstar_torch.eval.suite.work_items import ALL, Shard, WorkItem
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from filelock import BaseFileLock
 
 FAILED, CACHE = "failed.json", "cache"
-# What a report leaves; removed by --overwrite.
+# Files of a report; --overwrite removes them.
 _REPORT: tuple[str, ...] = ("efficiency.json", "results.json", "results.csv", "report.html")
 _REPORT += ("tables/*.md", "tables/*.tex", "figures/*.png", "figures/*.svg", "figures/*.json")
 _OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz", "room/*.npz")
@@ -56,20 +56,24 @@ class EvalFolder:
             raise FolderError(f"--out {out}: another process is evaluating shard {shard} there now")
         return cls(out, lock)
 
-    def close(self) -> None:
-        """Release the shard."""
-        if self._lock is not None:
-            self._lock.release()
-
     def __enter__(self) -> EvalFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        """Release the shard."""
+        if self._lock is not None:
+            self._lock.release()
 
     def place(self, item: WorkItem) -> Path:
         """The folder of a sequence."""
         return self.path / "records" / item.folder
+
+    def begin(self, item: WorkItem, rows: Iterable[Row]) -> list[Row]:
+        """Make the folder of a sequence, remove files that a killed process had begun, and return the missing rows."""
+        place = self.place(item)
+        place.mkdir(parents=True, exist_ok=True)
+        remove_temporaries(path for pattern in (".*.tmp", "*/.*.tmp") for path in place.glob(pattern))
+        return self.missing(item, rows)
 
     def is_finished(self, item: WorkItem, rows: Iterable[Row]) -> bool:
         """Whether every row has a record, or the sequence has failed."""

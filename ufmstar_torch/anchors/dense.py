@@ -23,6 +23,7 @@ from ufmstar_torch.anchors.dense_poses import PoseErrors
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.tracker import Landmarks, checked
 from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.optional import optional
 
 if TYPE_CHECKING:
     from ufmstar_torch.kernels.dense_cpu import Search, Views
@@ -225,7 +226,7 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
     """An image no wider than ``width``, and [3, 3] its pixels from those of ``gray``."""
     if gray.shape[1] <= width:
         return gray, np.eye(3)
-    import cv2
+    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
 
     size = (width, max(round(gray.shape[0] * width / gray.shape[1]), 1))
     small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -14,7 +15,8 @@ from ufmstar_torch.anchors.tracker import Landmarks
 from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.frame import FRAME_FAULTS, intrinsics_fault, pose_fault
 
-Given = str | Path | LandmarkSource
+# A file may be named by a str too; type checkers then find no misspelt word.
+Given = Literal["corners", "dense"] | Path | LandmarkSource
 _PARTS = ("pixel", "depth", "variance", "valid")
 
 
@@ -40,7 +42,13 @@ class StreamLandmarks:
         self.last: list[Landmarks] = []
 
     def update(
-        self, image: Tensor | None, pose: Tensor, intrinsics: Tensor, rotation_tolerance: float | None = None
+        self,
+        image: Tensor | None,
+        pose: Tensor,
+        intrinsics: Tensor,
+        rotation_tolerance: float | None = None,
+        *,
+        skip: bool = True,
     ) -> Anchors:
         """Anchors of the next image of every stream, in its pixels. Where it raises, no source has changed.
 
@@ -48,14 +56,15 @@ class StreamLandmarks:
             image: [B, 3, H, W] RGB, uint8, or floating-point in [0, 1]; None: the sources need none.
             pose: [B, 4, 4] or [4, 4] camera-to-world [m].
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px].
-            rotation_tolerance: a stream whose pose or intrinsics have a fault (``frame.FRAME_FAULTS``) skips the image:
-                it has no anchors and its source stays as it is. None = the source raises.
+            rotation_tolerance: of poses; None = the sources check them.
+            skip: a stream whose pose or intrinsics have a fault (``frame.FRAME_FAULTS``) skips the image: it has no
+                anchors and its source stays as it is. Otherwise a fault is an error.
 
         Returns:
             [B, N], padded and masked, on the image's device.
 
         Raises:
-            ValueError: another number of streams than sources, an image of another kind, or as
+            ValueError: another number of streams than sources, an image of another kind, a fault, or as
                 :meth:`LandmarkSource.update`.
         """
         b = len(self._sources) if image is None else len(image)
@@ -68,6 +77,8 @@ class StreamLandmarks:
         if rotation_tolerance is not None:
             size = (torch.inf, torch.inf) if pictures is None else pictures.shape[1:3]
             faults = _faults(torch.from_numpy(T), K, size, rotation_tolerance)
+        if not skip and (bad := [f"stream {i}: {FRAME_FAULTS[fault]}" for i, fault in enumerate(faults) if fault]):
+            raise ValueError("; ".join(bad))
         try:
             result = [
                 Landmarks.skipped(FRAME_FAULTS[fault])
