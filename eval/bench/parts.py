@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.landmarks import landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
@@ -41,7 +42,7 @@ class MultiviewStep:
     def __init__(self, row: Row, device: torch.device) -> None:
         self.estimator, self._device = make_estimator(row, device), device
         anchors = ANCHORS[row.setting.anchors]
-        self._landmarks = None if anchors is None else StreamLandmarks(anchors)
+        self._landmarks = None if anchors is None else StreamLandmarks(landmark_source(anchors))
 
     def __call__(self, image: Tensor | None, frame: Frame, predicted: Predicted, *, first: bool = False) -> Answer:
         """Move a frame's maps to the device, and run the step; the ``first`` one begins with an empty state.
