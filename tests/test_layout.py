@@ -79,7 +79,7 @@ EVAL_ORDER = (
     ("engine",),
     ("run",),
     ("suite",),
-    ("bench", "report"),
+    ("bench", "reconstruct", "report"),
     ("commands",),
 )
 

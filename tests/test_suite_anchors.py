@@ -157,7 +157,8 @@ def test_no_anchors_at_most_is_plain_ufm_star(tour, networks):
 
 
 def test_ground_truth_helps_a_network_whose_views_agree_on_what_is_wrong(tour):
-    rows = [row(NAME), row(NAME, anchors="truth"), row(NAME, anchors="truth", corrected=True)]
+    kinds = ({}, {"anchors": "truth"}, {"anchors": "truth", "corrected": True})
+    rows = [row(NAME, overrides={"unmeasured": "paper"}, **kind) for kind in kinds]
     plain, anchored, corrected = (r.figures for r in evaluate(tour, rows, {"depth_only": Biased()}).values())
     assert anchored["nll"] < 3 < plain["nll"]
     assert anchored["ece_delta"] < 0.75 * plain["ece_delta"]
