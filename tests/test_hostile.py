@@ -115,7 +115,8 @@ def configuration(rng):
     return UfMStarConfig(
         segment=SPGFConfig(
             min_pixels=int(rng.choice([1, 20])), min_rows=1, prune=str(rng.choice(["both", "none"])),
-            max_depth=[None, 20.0][rng.integers(2)], scale_with_image=bool(rng.integers(2)),
+            scale_with_image=bool(rng.integers(2)),
+            **[{}, {"max_depth": 20.0}, {"max_depth": 1e6, "min_gaussian_length": 112.0}][rng.integers(3)],
         ),
         aleatoric_in_moments=bool(rng.integers(2)),
         disagreement=str(rng.choice(["w2", "overlap"])),
@@ -152,8 +153,22 @@ def assert_in_order(ufm, session):
         raise AssertionError(f"session {session}: {error}") from error
 
 
-def assert_sound(out, config, session):
-    """No NaN where a pixel was used, unless it was asked for; no value below 0."""
+def assert_sound(out, given, config, session):
+    """The pixels used are those of the accepted ranges, every other is counted; no NaN where a pixel was used, unless
+    it was asked for; no value below 0."""
+    depth, fine = given["depth"], (out.statistics.fault == 0)[:, None, None]
+    depth = depth if depth.dtype == torch.float64 else depth.float()
+    mask = given.get("valid", torch.ones_like(depth, dtype=torch.bool)) & fine
+    use = mask & (depth >= 1e-6) & (depth <= config.segment.depth_limit)
+    for name in ("aleatoric", "epistemic"):
+        value = given.get(name, torch.zeros_like(depth)).to(depth.dtype)
+        use &= (value >= 0) & (value <= 1e12)
+    if config.features:
+        use &= (given["features"].to(depth.dtype).abs() <= 1e12).all(1)
+    counts = out.statistics
+    assert torch.equal(out.valid, use), session
+    positive = (mask & (depth > 0) & depth.isfinite()).sum((1, 2))
+    assert torch.equal(counts.valid_pixels + counts.beyond + counts.out_of_range, positive), session
     values = out.variance[out.valid]
     assert bool(out.variance[~out.valid].isnan().all()), session
     assert not bool(values.isinf().any()), session
@@ -182,7 +197,8 @@ def run_session(session):
             continue
         taken += 1
         assert_in_order(ufm, session)
-        assert_sound(out, config, session)
+        if not spoilt:
+            assert_sound(out, given, config, session)
         compared = compared and not spoilt  # an optional argument that was left out is taken in, but by one of them
         if compared:
             beside = twin(**batch([other, watched], names))

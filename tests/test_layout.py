@@ -79,7 +79,7 @@ EVAL_ORDER = (
     ("engine",),
     ("run",),
     ("suite",),
-    ("bench", "check", "report"),
+    ("bench", "check", "reconstruct", "report"),
     ("commands",),
 )
 

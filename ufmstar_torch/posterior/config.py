@@ -64,5 +64,5 @@ class PosteriorConfig(Checked):
 
     @property
     def prior_variance(self) -> tuple[float, float, float, float]:
-        """Of the coefficients b before the first anchor."""
+        """The variances of the coefficients b before the first anchor."""
         return (self.prior_sigma**2, self.prior_sigma**2, self.tilt_sigma**2, self.tilt_sigma**2)

@@ -70,7 +70,7 @@ STEPS = (0.7548776662466927, 0.5698402909980532)
 
 @dataclass(frozen=True)
 class Posterior:
-    """Of B streams.
+    """The posterior of B streams.
 
     Attributes:
         depth: [B, H, W] [m]; as predicted before the first anchor. NaN where not valid.
