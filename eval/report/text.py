@@ -94,7 +94,7 @@ def demo_explanation(summary: Mapping[str, Any]) -> str:
         "Better: a high delta1, a low NLL, ECE and AUSE, and a sigma that equals the RMSE beside it.",
     ]
     hints = {
-        SHEET: f"the last four columns share a scale, so sigma can be compared with the error; {unseen} rooms below",
+        SHEET: f"sigma and the error beside it share a scale, so that they can be compared; {unseen} rooms below",
         CURVES: "nearer to the diagonal is better; on the left, a curve below it is over-confident",
         PLY: f"the mixture, brighter = views disagree more; for splat viewers ({ELLIPSOIDS}: MeshLab, Blender)",
     }
