@@ -323,7 +323,7 @@ class TestWritePictures:
     def test_all_kinds_with_their_words(self, evaluation: Path, tmp_path: Path) -> None:
         sequence = KITCHEN[1]  # no name for a folder
         pictures = [draw() for _, draw in pictures_of(load_results(evaluation, with_sums=False), tmp_path)]
-        assert [p.file.partition("_")[0] for p in pictures] == [STRIP, BREAKDOWN, COMPARE, ROOM]
+        assert [p.file.partition("-")[0] for p in pictures] == [STRIP, BREAKDOWN, COMPARE, ROOM]
         assert all((evaluation / "figures" / p.file).is_file() for p in pictures)
         folder = evaluation / "records" / WorkItem(*KITCHEN, path="", layout="").folder
         nll = mean_nll(find_examples(folder)[0], "Ensemble")

@@ -174,7 +174,7 @@ def test_a_damaged_header_of_an_array_is_a_frame_error(tmp_path, kind, suffix):
 
 
 def test_an_array_that_expands_has_a_bound(tmp_path, monkeypatch):
-    """Of a member, no more is read than its entry states, and no more than the limit is allocated."""
+    """No more of a member is read than its entry states, and no more than the limit is allocated."""
     file = tmp_path / "a.npz"
     np.savez_compressed(file, depth=np.zeros((2000, 5000), np.float32))
     monkeypatch.setattr(array_files, "LARGEST", 1_000_000)

@@ -198,17 +198,11 @@ def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Pictu
     body = []
     for row in rows:
         maps = example.rows[row]
-        parts = [
-            Panel(None if part is None else scales.length.rgb(maps.root(part)), absent="none")
-            for part in (maps.aleatoric, maps.epistemic)
-        ]
-        views = None if maps.disagreement is None else maps.striped(scales.length.rgb(maps.root(maps.disagreement)))
+        parts = (maps.aleatoric, maps.epistemic, maps.disagreement)
+        a, e, m = (None if part is None else scales.length.rgb(maps.root(part)) for part in parts)
+        panels = [Panel(rgb, absent="none") for rgb in (a, e, None if m is None else maps.striped(m))]
         error, sigma, nll = _judged(example, row, scales)
-        body.append(
-            GridRow(
-                example.label(row), figures_of(example, row), [*parts, Panel(views, absent="none"), sigma, error, nll]
-            )
-        )
+        body.append(GridRow(example.label(row), figures_of(example, row), [*panels, sigma, error, nll]))
     captions = ("√A, aleatoric", "√E, epistemic", "√M, between views", "σ = √V, V = A + E + M", "|error|", "NLL")
     body[0] = body[0].captioned(captions)
     bars = [Bar("√A, √E, √M, σ and |error| [m]", scales.length, 0, span=5), Bar("NLL [nats]", NLL_SCALE, 5)]

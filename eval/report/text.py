@@ -22,7 +22,7 @@ NLL_OF_FEW = 100.0
 _CALIBRATION = {"nll": "NLL", "ece_delta": "ECE_delta", "ece_q": "ECE_q"}
 _DEMO_COLUMNS = {"delta1": "delta1", **_CALIBRATION, "ause_rmse": "AUSE [m]"}
 _RUN_COLUMNS = {"delta1": "delta1", "abs_rel": "AbsRel", "rmse": "RMSE [m]", **_CALIBRATION, "spearman": "Spearman"}
-# What the counts of a frame's anchors mean, by their source: how many have a depth there, and of how many.
+# The counts of a frame's anchors by their source: how many have a depth, and of how many.
 _FOUND = {
     "tracked": ("triangulated", "tracked"),
     "landmarks": ("in view", "in the map"),

@@ -42,7 +42,7 @@ def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> R
     if pictures not in KINDS:
         raise ValueError(f"figures must be {' or '.join(KINDS)}, got {pictures!r}")
     results = load_results(out, with_sums=figures)
-    # What a killed report has left; eval.json and the records are those of `ufmstar eval`.
+    # Remains of a killed report; eval.json and the records belong to `ufmstar eval`.
     for pattern in ("tables/.*.tmp", "figures/.*.tmp", ".results.*.tmp", ".table.*.tmp", ".report.*.tmp"):
         remove_temporaries(out.glob(pattern))
     files = [*write_tidy(results), *write_tables(results)]
