@@ -144,7 +144,7 @@ class TestFindExamples:
         with pytest.raises(ValueError, match=r"a@Ensemble\.npz must hold depth"):
             find_examples(folder)
         (folder / "examples" / "a@Ensemble.npz").write_bytes(b"nothing")
-        with pytest.raises(ValueError, match=r"a@Ensemble\.npz is not a readable npz"):
+        with pytest.raises(ValueError, match=r"a@Ensemble\.npz is no readable \.npz"):
             find_examples(folder)
 
 

@@ -97,8 +97,8 @@ def draw_grid(
 
     grey = (colours.INVALID_GREY / 255,) * 3
     figure.add_artist(Rectangle((_MARGIN, bottom), 0.12, _BAR, color=grey, transform=figure.dpi_scale_trans))
-    words = "no value, no truth;\nstripes: not compared"
-    say(figure, _MARGIN + 0.18, bottom + _BAR / 2, words, size=7.5, color=FAINT, va="center", linespacing=1.2)
+    legend = "no value, no truth;\nstripes: not compared"
+    say(figure, _MARGIN + 0.18, bottom + _BAR / 2, legend, size=7.5, color=FAINT, va="center", linespacing=1.2)
     colours.save_png(figure, path)
 
 
