@@ -24,7 +24,7 @@ _DEMO_COLUMNS = {"delta1": "delta1", **_CALIBRATION, "ause_rmse": "AUSE [m]"}
 _RUN_COLUMNS = {"delta1": "delta1", "abs_rel": "AbsRel", "rmse": "RMSE [m]", **_CALIBRATION, "spearman": "Spearman"}
 _CALIBRATED = 4.0  # mean z^2 of held-out anchors, and its inverse: sigma is right to a factor of two
 _UNSUPPORTED = "mean sigma not shown: neither truth nor held-out anchors (--posterior) support it"
-# What the counts of a frame's anchors mean, by their source: how many have a depth there, and of how many.
+# The counts of a frame's anchors by their source: how many have a depth, and of how many.
 _FOUND = {
     "tracked": ("triangulated", "tracked"),
     "landmarks": ("in view", "in the map"),
