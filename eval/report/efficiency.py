@@ -10,10 +10,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from ufmstar_torch.eval.bench.energy import CPU, GPU, NOT_MEASURABLE
-from ufmstar_torch.eval.bench.measure import NETWORK
-from ufmstar_torch.eval.bench.networks import DEPTH
-from ufmstar_torch.eval.bench.parts import MULTIVIEW
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.data import setting_of
@@ -21,7 +17,10 @@ from ufmstar_torch.eval.report.names import row_labels
 from ufmstar_torch.eval.report.paper import PaperTable, paper_tables
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table
 
-GROSS, NOT_SEPARABLE = "gross", "not separable"
+# Keys and words of ``efficiency.json``, as eval/bench writes them.
+DEPTH, NETWORK, MULTIVIEW = "depth", "network_uncertainty", "multiview"
+CPU, GPU, GROSS = "cpu", "gpu", "gross"
+NOT_MEASURABLE, NOT_SEPARABLE = "not measurable here", "not separable"
 UNITS = {GPU: "GPU", CPU: "CPU"}
 _SMALLEST = 0.01  # less prints as "<0.01"
 
