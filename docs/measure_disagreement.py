@@ -21,8 +21,9 @@ from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.methods.ufm import UfM
 
 COLUMNS = ("rms", "delta1", "ece_delta", "overconfidence", "ece_q", "spearman", "ause_rmse", "nll_left_out_share")
-LITERAL = {"segment": {"min_pixels": 2000, "min_rows": 32, "prune": "either"}}
-PROGRAM = {"segment": {"min_pixels": 2000, "min_rows": 32}}
+PAPERS = UfMStarConfig(unmeasured="paper")  # the disagreement alone, nothing where none was measured
+LITERAL = {"unmeasured": "paper", "segment": {"min_pixels": 2000, "min_rows": 32, "prune": "either"}}
+PROGRAM = {"unmeasured": "paper", "segment": {"min_pixels": 2000, "min_rows": 32}}
 NOISE_FLOOR = 0.08  # [m] of SPGF: segments resolve nothing finer
 BORDER = 16  # [px]
 EDGE = 0.1  # relative change of depth between neighbouring pixels
@@ -45,7 +46,7 @@ def shuffled(variance: Map, known: NDArray[np.bool_]) -> Map:
 def variances(clip: Clip) -> Iterator[tuple[str, Map]]:
     """UfM and UfM*, and variances that know nothing; "scaled" ones have the mean of that of UfM*."""
     known, d2 = clip.known, clip.depth.astype(np.float64) ** 2
-    ufm, star = estimate(clip, UfM()), estimate(clip, UfMStar())
+    ufm, star = estimate(clip, UfM()), estimate(clip, UfMStar(PAPERS))
     mean = float(star[known].mean(dtype=np.float64))
     yield "UfM-100K", ufm
     yield "UfM-100K, scaled", scaled_to(mean, ufm, known)
@@ -100,7 +101,7 @@ def places(clip: Clip) -> dict[str, NDArray[np.bool_]]:
 
 def regions(clip: Clip, _: int) -> None:
     """By place: share of the pixels, RMSE, and mean squared error over mean variance (1 = calibrated)."""
-    squared, ufm, star = _squared(clip), estimate(clip, UfM()), estimate(clip, UfMStar())
+    squared, ufm, star = _squared(clip), estimate(clip, UfM()), estimate(clip, UfMStar(PAPERS))
     for name, mask in places(clip).items():
         mse = squared[mask].mean()
         ratios = (mse / v[mask].mean(dtype=np.float64) for v in (ufm, star))
@@ -118,7 +119,7 @@ def floors(clip: Clip, _: int) -> None:
         "noise_floor^2/3": np.full_like(d, NOISE_FLOOR**2 / 3),
         "(.1 d)^2": (0.1 * d) ** 2,
     }
-    for method, variance in (("UfM-100K", estimate(clip, UfM())), ("UfM*", estimate(clip, UfMStar()))):
+    for method, variance in (("UfM-100K", estimate(clip, UfM())), ("UfM*", estimate(clip, UfMStar(PAPERS)))):
         v = variance[known].astype(np.float64)
         for name, floor in choices.items():
             raised = np.maximum(v, floor)

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch import DepthPrediction, UfMStar
+from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig
 from ufmstar_torch.eval.metrics import NLL, RMSE, Delta1
 from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.sequences import Frame, open_sequence
@@ -104,7 +104,7 @@ def score_pool(members: Sequence[DepthNetwork], pool: Sequence[View], pixels: in
     Raises:
         ValueError: a network that predicts no aleatoric variance.
     """
-    ufm = UfMStar()
+    ufm = UfMStar(UfMStarConfig(unmeasured="paper"))  # V counts measured disagreement alone
     scores: dict[str, list[float]] = {name: [] for name in ("ufmstar", "aleatoric", "disagreement", "oracle")}
     for i, view in enumerate(pool):
         p = predict(members, view, i)

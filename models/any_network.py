@@ -10,12 +10,14 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.arguments import as_tensor
 from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.outputs import METRIC, OutputSpec, ProgramSpec
+from ufmstar_torch.models.outputs import METRIC, OutputSpec, ProgramSpec, Spread
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction, infer
 from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
@@ -65,9 +67,9 @@ def wrap_network(
     scale: float = 1.0,
     inverse: bool = False,
     aleatoric: str | int | None = None,
-    aleatoric_kind: str = "variance",
+    aleatoric_kind: Spread = "variance",
     epistemic: str | int | None = None,
-    epistemic_kind: str = "variance",
+    epistemic_kind: Spread = "variance",
     resize: bool = False,
     focal: float | None = None,
     max_depth: float | None = None,
@@ -78,7 +80,7 @@ def wrap_network(
 
     Args:
         network: takes an image [B, 3, H, W]; returns metric depth [B, 1, H, W] or [B, H, W], a mapping or
-            an object with named tensors, a tuple of tensors, or a ``DepthPrediction``.
+            an object with named tensors, a tuple of tensors, or a ``DepthPrediction``; NumPy arrays are as good.
         output: which of several outputs is depth: a name, or a position in a tuple.
         scale: [m] length of one unit of depth.
         inverse: declares inverse or relative depth, which is refused.
@@ -193,13 +195,14 @@ def _existing(path: str | Path) -> str:
 
 
 def _named(result: Any) -> dict[str | int, Tensor]:
-    """The tensors of whatever a network returned, by name or position."""
-    if isinstance(result, Tensor):
-        return {"depth": result}
+    """The tensors (or NumPy arrays) of whatever a network returned, by name or position."""
+    if isinstance(result, Tensor | np.ndarray):
+        return {"depth": as_tensor("the network's output", result)}
     if isinstance(result, (tuple, list)):
         result = dict(enumerate(result))
     elif not isinstance(result, Mapping):
         if not hasattr(result, "__dict__"):
             raise ValueError(f"a network must return tensors or a DepthPrediction, got {type(result).__name__}")
         result = vars(result)
-    return {name: value for name, value in result.items() if isinstance(value, Tensor)}
+    arrays = {name: value for name, value in result.items() if isinstance(value, Tensor | np.ndarray)}
+    return {name: as_tensor(f"the network's output {name!r}", value) for name, value in arrays.items()}

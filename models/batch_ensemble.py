@@ -22,7 +22,7 @@ from ufmstar_torch.models.batch_layer import BatchLayer, Selection
 from ufmstar_torch.models.distribution import DepthDistribution, split_batch
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction
 
 INITS = ("normal", "sign")

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ufmstar_torch.models.distribution import DepthDistribution, split_batch
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction, infer
 
 SAMPLES = 10  # passes of the paper's multi-inference baseline

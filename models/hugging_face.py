@@ -24,6 +24,7 @@ from ufmstar_torch.models.checkpoints import DAMAGE, CheckpointError, some
 from ufmstar_torch.models.network import DepthNetwork, require_image
 from ufmstar_torch.models.outputs import METRIC, as_map
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.optional import optional
 from ufmstar_torch.prediction import DepthPrediction
 
 _LINEAR, _CUBIC = 2, 3  # Pillow's numbers, which the configurations use
@@ -240,6 +241,7 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
     """The configuration of a checkpoint; arguments as :func:`from_hugging_face`. Raises FileNotFoundError: a directory
     is missing, or lacks config.json; CheckpointError: config.json or preprocessor_config.json cannot be read; OSError:
     the hub cannot be reached, or has nothing of that name; ModuleNotFoundError: transformers is missing."""
+    optional("transformers", "a checkpoint of transformers needs the package transformers", "'ufmstar-torch[models]'")
     from transformers import PreTrainedConfig
     from transformers.image_processing_base import ImageProcessingMixin
 

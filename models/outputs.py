@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self, get_args
 
 import torch
 import torch.nn.functional as F
@@ -20,7 +20,8 @@ from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
 METRIC = "metric"
-SPREADS = ("variance", "std", "log_variance", "log_std", "relative_std")
+Spread = Literal["variance", "std", "log_variance", "log_std", "relative_std"]
+SPREADS = get_args(Spread)
 NOT_METRIC = ("inverse", "disparity", "relative", "affine")
 
 

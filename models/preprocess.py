@@ -21,6 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ufmstar_torch.arguments import CameraLike, ImageLike, as_image, as_intrinsics
 from ufmstar_torch.camera import crop_intrinsics, resize_intrinsics
 from ufmstar_torch.checked import Checked, number
 
@@ -134,15 +135,17 @@ class Preprocess(Checked):
         height, width = (max(1, round(factor * side / multiple)) * multiple for side in cropped)
         return height, width
 
-    def __call__(self, image: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(self, image: ImageLike, intrinsics: CameraLike) -> tuple[Tensor, Tensor]:
         """The network's input [B, 3, h, w], floating-point, of ``image`` [B, 3, H, W] RGB, uint8 or floating-point in
-        [0, 1]; and its intrinsics, of the shape and type of ``intrinsics`` [B, 3, 3] (or [3, 3]) of ``image`` [px].
-        Raises ValueError: wrong shapes, an integer type other than uint8, or floats outside [0, 1]."""
-        return self.apply_image(image), self.apply_intrinsics(intrinsics, *image.shape[-2:])
+        [0, 1] (or as NumPy and Pillow have it: ``arguments.as_image``); and its intrinsics, of the shape and type of
+        ``intrinsics`` [B, 3, 3] (or [3, 3]) of ``image`` [px]. Raises TypeError, ValueError: wrong kinds or shapes, an
+        integer type other than uint8, or floats outside [0, 1]."""
+        image = as_image(image)
+        return self.apply_image(image), self.apply_intrinsics(as_intrinsics(intrinsics), *image.shape[-2:])
 
-    def apply_image(self, image: Tensor) -> Tensor:
+    def apply_image(self, image: ImageLike) -> Tensor:
         """The image alone; shapes, types and errors as in :meth:`__call__`."""
-        x = self._resampled(image)
+        x = self._resampled(as_image(image))
         if self.value_range != 1.0:
             x = x * self.value_range
         if any(self.mean) or any(s != 1.0 for s in self.std):
@@ -196,9 +199,7 @@ class Preprocess(Checked):
 
 
 def _check(image: Tensor) -> None:
-    """Raise ValueError unless it is [B, 3, H, W], uint8 or floats in [0, 1]."""
-    if image.dim() != 4 or image.shape[1] != 3:
-        raise ValueError(f"image must be [B, 3, H, W], got {tuple(image.shape)}")
+    """Raise ValueError unless it is uint8 or floats in [0, 1]."""
     if image.dtype == torch.uint8:
         return
     if not torch.is_floating_point(image):

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch.eval.engine.judge import OF_ALL
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
@@ -54,7 +55,7 @@ def write_examples(out: Path, dataset: str, sequence: str, rows: Sequence[Row]) 
         maps = {"depth": truth - 1 + 0.1 * np.float32(n), "variance": np.full(SHAPE, 0.1 + n, np.float32)}
         np.savez(folder / "examples" / f"7@{row.slug}.npz", **maps)
     covariance = np.eye(3)[None].repeat(2, 0)
-    room = {"mean_world": np.ones((2, 3)), "covariance_world": covariance, "disagreement": [0, 1.0]}
+    room = {"mean_world": np.ones((2, 3)), "covariance_world": covariance, "disagreement": [0, 1.0], "count": [2, 3]}
     np.savez(folder / "room" / f"{rows[-1].slug}_7.npz", **room, T_world_cam=np.eye(4))
 
 
@@ -80,10 +81,13 @@ def judge(maps: Maps, references: Mapping[str, Tensor]) -> tuple[Record, dict[st
     curves: dict[str, Any] = metrics.curves()
     sums = {"metrics": dict(metrics.state_dict())}
     for name, confident in references.items() if variance is not None else ():
-        by_error = NLLByError()
+        by_error, of_all = NLLByError(), NLLByError(**OF_ALL)
         by_error.update(depth, variance, truth, confident)
+        of_all.add_levels(depth, variance, truth, variance)
         curves |= {f"{curve}:{name}": value.tolist() for curve, value in by_error.compute().items()}
-        sums[f"nll_by_error:{name}"] = dict(by_error.state_dict())
+        sums |= {
+            f"nll_by_error{kind}:{name}": dict(m.state_dict()) for kind, m in (("", by_error), ("_of_all", of_all))
+        }
     return Record("", "", "", "", "", figures=metrics.compute(), curves=curves), sums
 
 

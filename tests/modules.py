@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import torch
-from walks import SPGF
+from walks import SPGF as SPGF
 
 import scenes
 from ufmstar_torch import UfMStarConfig
 
 H, W = 30, 40
 
-CONFIG = UfMStarConfig(segment=SPGF)
+CONFIG = UfMStarConfig(segment=SPGF, unmeasured="paper")
 
 DEPTHS, POSES, K_ = scenes.sequence(8, H, W, 0.05)
 

@@ -20,7 +20,9 @@ from ufmstar_torch.regress import distribute
 
 pytestmark = pytest.mark.numerics
 
-ANCHORED = UfMStarConfig(segment=SPGF, regression="exact", anchors=AnchorConfig(shrinkage=3.0, half_life=4.0))
+ANCHORED = UfMStarConfig(
+    segment=SPGF, unmeasured="paper", regression="exact", anchors=AnchorConfig(shrinkage=3.0, half_life=4.0)
+)
 
 
 def taken(truth, rng, count):

@@ -39,7 +39,7 @@ from ufmstar_torch.eval.run.colours import colour_table
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import make_tour, render, tour_sequence
 from ufmstar_torch.models import NetworkSpec, save_trained
-from ufmstar_torch.pipeline import NetworksInTurn
+from ufmstar_torch.networks_in_turn import NetworksInTurn
 
 CPU = torch.device("cpu")
 FRAMES, SEED = 7, 5
@@ -150,7 +150,7 @@ class Collected(FrameSink):
 
 def walked(networks, frames, count=FRAMES, sinks=(), names=ROWS):
     """The first frames through rows of the suite: (frame, results by the row's name) of each."""
-    source = NetworkSource(NetworksInTurn(networks, preprocess=networks[0].preprocess), CPU, {}, seeding=None)
+    source = NetworkSource(NetworksInTurn(networks, preprocess=networks[0].preprocess), CPU, {})
     rows = [row for row in suite_named("demo").rows if NAMES[row.slug] in names]
     collected = Collected()
     judge = Judge({"aleatoric": source, "ensemble": source}, CPU, limit=slice(count))

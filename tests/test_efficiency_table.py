@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from ufmstar_torch.eval.bench.energy import CPU, GPU, NOT_MEASURABLE
-from ufmstar_torch.eval.bench.memory import overhead_percent
+from ufmstar_torch.eval.bench.measure import overhead_percent
 from ufmstar_torch.eval.report.efficiency import efficiency_tables, megabytes
 from ufmstar_torch.eval.report.table import latex, markdown
 
@@ -49,7 +49,7 @@ def line(depth=(27.0, 206.3), dnn=(252.0, 1857.0), mvd=None, memory=None, overhe
 
 
 def cells(measured):
-    (table,) = efficiency_tables(measured)
+    table, *_ = efficiency_tables(measured)
     return [cell.value for cell in table.lines[0].cells]
 
 
@@ -57,7 +57,7 @@ def test_the_papers_lines_are_printed_as_in_the_paper():
     assert cells(line()) == ["252", "7.4", "1857", "", "", "", "90.0", "1245", "", "90.0"]
     star = line(dnn=(2.0, 10.4), mvd=(25.2, 53.0), memory={"mvd": 30_000}, overhead=32.0)
     assert cells(star) == ["2.0", "5.2", "10", "25", "2.1", "53", "32.0", "1245", "0.03", "90.0"]
-    (table,) = efficiency_tables(star)
+    table, *_ = efficiency_tables(star)
     assert "Depth alone: 27 ms on the GPU, 138.3 MB." in markdown(table)
     assert "smoothing besides: 0.20 MB" in markdown(table)
     assert r"UfM$^*$-Ensemble & $2.0$ & $5.2$" in latex(table)
@@ -77,11 +77,19 @@ def test_an_unmeasured_unit_has_words_in_its_cells_only():
     assert "Power and energy of the CPU are not measurable here: no counter." in markdown(efficiency_tables(half)[0])
 
 
-def test_several_architectures_have_a_table_each():
-    both = line()
-    both["rows"].append({**both["rows"][0], "network": "FastDepth"})
-    tables = efficiency_tables(both)
-    assert [table.name for table in tables] == ["efficiency-resnet50-monodepth2", "efficiency-fastdepth"]
+def test_two_architectures_and_the_papers_below():
+    """Measured in one run, as the paper's table 2."""
+    second = line(dnn=(112.0, 608.0), memory={"depth_bytes": 15.8e6, "network_uncertainty_bytes": 142.6e6})
+    second["rows"][0]["network"] = "FastDepth"
+    tables = efficiency_tables(line() | {"further": [second]})
+    names = ["efficiency-resnet50-monodepth2", "efficiency-fastdepth"]
+    assert [table.name for table in tables] == [
+        *names,
+        "paper-efficiency-ResNet50-Monodepth2",
+        "paper-efficiency-FastDepth",
+    ]
+    ours, theirs = ([cell.value for cell in tables[n].lines[0].cells] for n in (1, 3))
+    assert [ours[n] for n in (0, 2, 7)] == [theirs[n] for n in (0, 2, 7)] == ["112", "608", "142.6"]
 
 
 @pytest.mark.parametrize(

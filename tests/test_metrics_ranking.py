@@ -116,6 +116,18 @@ class TestRanking:
         got = figures(NLLByError(4), d, v, g, sure)["nll_by_error"]
         np.testing.assert_array_equal(got, figures(NLLByError(4), d[sure], v[sure], g[sure])["nll_by_error"])
 
+    def test_one_threshold_over_all_sequences(self) -> None:
+        """Confident pixels of two sequences together, the second of which is the surer one."""
+        parts = [maps(200, 200), maps(150, 150)]
+        parts[1] = (parts[1][0], parts[1][1] / 20, parts[1][2])
+        metric = NLLByError(4, levels=4000, confident=0.4)
+        for d, v, g in parts:
+            metric.add_levels(d, v, g, torch.where(d > 2, v, torch.nan))
+        d, v, g = (torch.cat([part[k].flatten() for part in parts]) for k in range(3))
+        threshold = v[d > 2].quantile(0.4)
+        expected = figures(NLLByError(4), d, v, g, (d > 2) & (v <= threshold))["nll_by_error"]
+        np.testing.assert_allclose(metric.compute()["nll_by_error"], expected, atol=0.02)
+
     @given(st.floats(0, 1e9))
     def test_log_bins_rise(self, value: float) -> None:
         low, high = log_bin(value, 4096), log_bin(value * 1.01 + 1e-7, 4096)

@@ -114,15 +114,21 @@ class TestSplats:
 
     def test_colour_follows_disagreement(self, tmp_path: Path) -> None:
         mix = mixture(30, streams=1)
+        mix = mix.replace(count=torch.where(torch.arange(30) % 5 == 0, 1, mix.count + mix.valid))
         write_mixture_ply(tmp_path / "m.ply", mix)
         elements, comments = parse(tmp_path / "m.ply")
         rgb = 0.5 + 0.28209479177387814 * stack(elements["vertex"], "f_dc_0", "f_dc_1", "f_dc_2")
         assert rgb.min() > -1e-6
         assert rgb.max() < 1 + 1e-6
+        compared = elements["vertex"]["count"] > 1
+        assert 0 < (~compared).sum() < compared.sum()
         brightness, m = rgb @ [0.3, 0.6, 0.1], elements["vertex"]["disagreement"]
-        assert (np.diff(brightness[np.argsort(m)]) >= -1e-6).all()
-        high = np.percentile(np.sqrt(mix.disagreement[mix.valid].numpy()), 99)
-        assert comments[0] == f"comment colour: sqrt(disagreement), magma from 0 to {high:.4g} m"
+        assert (np.diff(brightness[compared][np.argsort(m[compared])]) >= -1e-6).all()
+        np.testing.assert_allclose(rgb[~compared], 150 / 255, atol=1e-6)
+        high = np.percentile(np.sqrt(mix.disagreement[mix.valid & (mix.count > 1)].numpy()), 99)
+        assert (
+            comments[0] == f"comment colour: sqrt(disagreement), magma from 0 to {high:.4g} m; grey: seen from one view"
+        )
 
     def test_flat_and_point_components_are_finite(self, tmp_path: Path) -> None:
         mix = mixture(4, streams=1)

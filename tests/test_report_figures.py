@@ -17,12 +17,13 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Merged, Results
 from ufmstar_torch.eval.report.figures_cost import STAGES, draw_latency, draw_stages, draw_tradeoff
 from ufmstar_torch.eval.report.figures_curves import (
+    Histogram,
     chosen_sequences,
-    density,
     draw_calibration,
     draw_entropy,
     draw_error,
     draw_sequence_calibration,
+    entropies,
     entropy_range,
 )
 from ufmstar_torch.eval.report.figures_sweep import Point, draw_sweep, sweep_lines, sweeps
@@ -103,8 +104,8 @@ class TestError:
         figure = draw_error(results, "rooms")
         shown = [axes for axes in figure.axes if axes.get_visible()]
         assert [axes.get_title(loc="left") for axes in shown] == [
-            "Ensemble: where it is confident",
-            "Ensemble: where UfM-100K is confident",
+            "Ensemble: where it is confident in each frame",
+            "Ensemble: where UfM-100K is confident in each frame",
         ]
         for axes, reference in zip(shown, ("Ensemble", "UfM-Ensemble-100K"), strict=True):
             for row in (ALONE, UFM, UFM_STAR):
@@ -120,31 +121,47 @@ class TestEntropy:
         figure = draw_entropy(results, "ensemble")
         axes = figure.axes[0]
         means = [line.get_xdata()[0] for line in axes.lines]
-        merged = [results.merged["rooms", row] for row in (ALONE, UFM, UFM_STAR)]
-        assert means == [m.figures["entropy"] for m in merged]
+        for row, mean in zip((ALONE, UFM, UFM_STAR), means, strict=True):  # every sequence has as many pixels
+            assert mean == pytest.approx(np.mean([r.figures["entropy"] for r in results.of(row)]), rel=1e-9)
         assert {line.get_linestyle() for line in axes.lines} == {"--"}
         assert means[0] < means[1] < means[2]  # the drawn sigma is the shorter the more overconfident the method
-        for m in merged:
-            heights, edges = density(m)
-            assert (heights * np.diff(edges)).sum() == pytest.approx(1.0)  # no pixel lies outside here
+        (histograms,) = entropies(results, "ensemble").values()
+        for histogram in histograms.values():
+            assert (histogram.density * np.diff(histogram.edges)).sum() == pytest.approx(1.0)  # no pixel lies outside
         assert words(axes) == [
             f"{name}: mean {mean:.2f}" for name, mean in zip(("alone", "UfM-100K", "UfM*"), means, strict=True)
         ]
 
+    def test_environments_in_the_papers_order(self):
+        curves = {"entropy_counts": [0, 3, 1, 0], "entropy_edges": [-1.0, 0.0, 1.0]}
+        names = [
+            ("kitti360", "2013_05_28_drive_0007_sync"),
+            ("scannet", "scene0000_00"),
+            ("own", "x"),
+            ("scannet", "b"),
+        ]
+        names += [("tartanair", "soulcity__P000"), ("tartanair", "seasonsforest_winter__P001")]
+        values = {(UFM_STAR, where): {"entropy": 0.5} for where in names}
+        swept = in_memory(values)
+        swept = replace(swept, records=tuple(replace(r, curves=curves) for r in swept.records))
+        result = entropies(swept, "ensemble")
+        assert list(result) == ["indoor", "forest", "driving", "city", "own"]
+        assert result["indoor"][UFM_STAR].counts.tolist() == [0, 6, 2, 0]
+        titles = [axes.get_title(loc="left") for axes in draw_entropy(swept, "ensemble").axes]
+        assert titles == list(result)
+
     def test_pixels_without_a_variance_are_told(self):
-        curves = {"entropy_counts": [25.0, 0.0, 75.0, 0.0], "entropy_edges": [-1.0, 0.0, 1.0]}
-        merged = Merged({"entropy": 0.5}, curves)
-        heights, _ = density(merged)
-        assert heights.tolist() == [0.0, 0.75]  # the share of all pixels, those without a variance among them
-        result = replace(in_memory({(UFM_STAR, ("d", "s")): {}}), merged={("d", UFM_STAR): merged})
+        curves = {"entropy_counts": [25, 0, 75, 0], "entropy_edges": [-1.0, 0.0, 1.0]}
+        result = in_memory({(UFM_STAR, ("d", "s")): {"entropy": 0.5}})
+        result = replace(result, records=(replace(result.records[0], curves=curves),))
+        # The share of all pixels, those without a variance among them.
+        assert entropies(result, "ensemble")["d"][UFM_STAR].density.tolist() == [0.0, 0.75]
         assert words(draw_entropy(result, "ensemble").axes[0]) == ["UfM*: mean 0.50\n(25 % with hardly any V)"]
 
     def test_range_holds_the_pixels(self):
-        edges = np.linspace(-8, 8, 65)
         counts = np.zeros(66)
         counts[1 + 20], counts[1 + 30] = 500, 500  # [-3, -2.75) and [-.5, -.25)
-        merged = Merged({}, {"entropy_counts": counts.tolist(), "entropy_edges": edges.tolist()})
-        assert entropy_range([merged]) == (-3.5, 0.25)
+        assert entropy_range([Histogram(counts, np.linspace(-8, 8, 65), 0.0)]) == (-3.5, 0.25)
 
 
 def noisy(value: float, seed: int = 0) -> Row:
@@ -161,7 +178,7 @@ def swept() -> Results:
 
 
 def points_of(results: Results) -> tuple[Point, ...]:
-    """Of plain UfM* over the rotation noise."""
+    """The points of plain UfM* over the rotation noise."""
     lines = sweep_lines(results, "ensemble", "rotation_noise")
     return next(line.points for line in lines if line.method == UFM_STAR.method and not line.rest)
 

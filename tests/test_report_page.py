@@ -112,7 +112,7 @@ def test_numbers_are_the_results_with_the_papers_beside(page: Page, results: Res
     main = page.tables[0]
     assert main[0][1:] == ["Ours", "Paper"]
     assert main[1][:5] == ["Method", "δ₁ ↑", "NLL ↓", "ECE_δ ↓", "ECE_q ↓"]
-    assert main[1][6:9] == ["paper: δ₁", "paper: NLL", "paper: ECE_δ"]
+    assert main[1][6:9] == ["δ₁", "NLL", "ECE_δ"]
     rows = {row[0]: row for row in main}
     for row in results.rows:
         for column, (key, decimals) in enumerate({"delta1": 3, "nll": 2, "ece_delta": 3, "ece_q": 3}.items(), 1):
@@ -135,9 +135,12 @@ def test_everything_that_is_missing_is_a_limit() -> None:
     (row,) = rows_of("Ensemble")
     results = in_memory({(row, ("d", "s")): {"nll": 1.0}}, failed=(Failed("d", "x", "broken"),))
     results = replace(results, missing=(("d", "y", row),), notes=("a note",))
+    frames = {**results.records[0].frames, "without_segment": 39, "without_match": 40}
+    results = replace(results, records=(replace(results.records[0], frames=frames),))
     results = replace(results, about={**results.about, "missing_bases": ["evidential"]})
     assert {title: rows for title, _, rows in limits(results, {"latency": "no glyph"})} == {
         "Sequences that failed": [("d", "x", "broken")],
+        "Frames in which UfM* compared no views": [("d", "Ensemble", "40", "39", "40")],
         "Frames that were skipped": [("d", "s", "42", "40", "2 × pose is not finite")],
         "Rows not evaluated yet": [("d", "y", "1")],
         "Rows without a network": [("evidential",)],

@@ -23,6 +23,7 @@ from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.video import preview_frame
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.frame import in_memory
+from ufmstar_torch.eval.sequences.images import read_depth
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models import Preprocess
 
@@ -131,7 +132,7 @@ def test_without_anchors_nothing_is_said_of_them(tour, tmp_path):
     assert summary["time"]["median_ms"]["anchors"] is None
     assert not {"anchors", "mean_anchored", "mean_bias"} & records(tmp_path / "out")[0].keys()
     stored = read_frame(tmp_path / "out" / "frames" / f"{tour.names[0]}.npz")
-    assert stored.keys() == {"depth", "variance", "disagreement", "valid"}
+    assert stored.keys() == {"depth", "variance", "disagreement", "valid", "T_world_cam", "intrinsics"}
 
 
 # ---- frames without anchors ----
@@ -259,6 +260,12 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
         one, other = (read_frame(out / "frames" / f"{name}.npz") for out in (whole, parts))
         for key in ("posterior_depth", "posterior_variance"):
             np.testing.assert_array_equal(one[key], other[key])
+        sigma = {"": np.sqrt(one["posterior_variance"]), "network_": np.sqrt(one["variance"])}
+        depth = {"": one["posterior_depth"], "network_": one["depth"]}
+        for prefix in ("", "network_"):
+            for kind, values, unit in (("depth", depth[prefix], 1e-3), ("sigma", sigma[prefix], 1e-4)):
+                image = read_depth(whole / f"{prefix}{kind}" / f"{name}.png")
+                np.testing.assert_allclose(image[one["valid"]], values[one["valid"]], atol=unit)
     panel = Finished(whole, tour, records(whole), with_error=True).panel(7)
     labels = [column.label for column in map_columns([panel])]
     assert labels == ["depth", "posterior", "σ", "|error|", "σ, posterior", "|error|, posterior"]

@@ -8,6 +8,8 @@ import torch
 from layouts import write_scannet
 
 from scenes import render
+from ufmstar_torch.eval.run.colours import INVALID_GREY
+from ufmstar_torch.eval.run.panels import FramePanel, map_columns
 from ufmstar_torch.eval.run.pictures import field_of_view, square_pixels
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
@@ -51,6 +53,18 @@ def test_scannet_depth_is_brought_to_the_colour_camera(tmp_path):
     off = np.abs(actual - expected)[both] / expected[both]
     assert np.quantile(off, 0.9) < 0.02
     assert np.median(off) < 0.006
+
+
+def test_sigma_is_striped_where_nothing_was_compared():
+    """A third of those pixels is grey; depth and the others keep their colours."""
+    maps = {"depth": np.full((60, 80), 2.0), "sigma": np.full((60, 80), 0.3), "measured": np.ones((60, 80))}
+    maps["measured"][:, :40] = 0.2
+    panel = FramePanel("f", np.zeros((60, 80, 3), np.uint8), maps)
+    depth, sigma = (column.rgb(panel) for column in map_columns([panel]))
+    grey = (sigma == INVALID_GREY).all(-1)
+    assert grey[:, :40].mean() == pytest.approx(1 / 3, abs=0.02)
+    assert not grey[:, 40:].any()
+    assert not (depth == INVALID_GREY).all(-1).any()
 
 
 def test_square_pixels_keep_the_view():

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import pickle
+import subprocess
 
 import layouts
 import numpy as np
 import pytest
+from imageio_ffmpeg import get_ffmpeg_exe
 from layouts import quaternion_line, truncate, write_depth_png, write_image, write_video
 
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
@@ -233,6 +235,35 @@ def test_video_time_is_index_by_fps_plus_offset(tmp_path, fps):
     for i, frame in enumerate(sequence):
         np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-9)
         assert frame.timestamp == pytest.approx(100 + i / rate)
+
+
+def test_video_frames_have_the_times_in_the_container(tmp_path):
+    """A phone's variable frame rate, with frames that are stored out of order (H.264)."""
+    K = layouts.resized(500, 500, 320, 240, (480, 640))
+    truth = layouts.truth(K, 8)
+    times = np.cumsum([0, 0.033, 0.1, 0.033, 0.25, 0.04, 0.033, 0.07])
+    for i, image in enumerate(truth.images):
+        write_image(tmp_path / "frames" / f"{i}.png", image)
+    shown = "".join(f"if(eq(N,{i}),{time:.3f}/TB," for i, time in enumerate(times)) + "0" + ")" * len(times)
+    command = [
+        get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-i",
+        str(tmp_path / "frames" / "%d.png"),
+        "-vf",
+        f"settb=1/9000,setpts='{shown}'",
+    ]
+    command += ["-fps_mode", "passthrough", "-enc_time_base", "1/9000", "-pix_fmt", "yuv420p", "-qp", "0"]
+    subprocess.run([*command, str(tmp_path / "phone.mp4")], check=True)
+    tum_trajectory(tmp_path / "slam.txt", truth.T_world_cam, times)
+    sequence = open_sequence(tmp_path / "phone.mp4", intrinsics=K, trajectory="slam.txt")
+    np.testing.assert_allclose([entry.timestamp for entry in sequence.entries], times, atol=2e-3)
+    for i, frame in enumerate(sequence):
+        np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=5e-3)
+        assert np.abs(frame.image.astype(int) - truth.images[i]).mean() < 8  # half the colour resolution
+    with pytest.raises(ValueError, match=r"pass trajectory.*`ufmstar poses` computes poses from images alone"):
+        open_sequence(tmp_path / "phone.mp4", intrinsics=K)
 
 
 def test_broken_video(tmp_path, capfd):

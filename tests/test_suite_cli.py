@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
+import logging
 import signal
 
 import pytest
-from suite_runs import TRUTH, Stub, write_rooms
-from tiny_suite import rows_of
+from tiny_suite import TRUTH, Stub, rows_of, write_rooms
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.bench import measure as measurement
 from ufmstar_torch.eval.commands import dry_run as dry
 from ufmstar_torch.eval.commands.evaluate import job_from, read
-from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.commands.terminal import warned_once
 from ufmstar_torch.eval.methods.suite import names
 from ufmstar_torch.eval.suite import shards
 
@@ -60,7 +60,7 @@ MISTAKES = {
     "no file": (["{}", "--suite", "/nowhere/mine.toml"], "/nowhere/mine.toml"),
     "base of a table": (["{}", "--base", "aleatoric"], "--base goes with figures and ablations"),
     "no such base": (["{}", "--network", "resnet=trained:x"], "base must be one of ensemble"),
-    "base twice": (["{}", "--network", "depth_only=ground-truth"], "every base once, got depth_only, depth_only"),
+    "base twice": (["{}", "--network", "depth_only=ground-truth"], "time and energy, got depth_only, depth_only"),
     "no row left": (["{}", "--suite", "paper-table-1"], "there are networks of depth_only only"),
     "no root": (["{}", "--root", "/nowhere"], "no such file or folder: /nowhere"),
     "frames": (["{}", "--frames", "5"], "--frames must be START:STOP"),
@@ -169,11 +169,11 @@ class Members:
 
 
 def test_predictions_are_counted_once_however_many_rows_share_them():
-    rows = rows_of(["Ensemble", "UfM*-FullEnsemble", "UfM-Ensemble", "UfM*-Ensemble"])
+    rows = rows_of("Ensemble", "UfM*-FullEnsemble", "UfM-Ensemble", "UfM*-Ensemble")
     assert dry.predictions(rows[:1], Members(), 10) == 10
     assert dry.predictions(rows, Members(), 10) == 20
     # Every second frame: images 0, 2, 4, 6, 8 are member 0, 1, 2, 0, 1's; of the default row 0, 2, 1, 0, 2's.
-    skipping = rows_of(["UfM*-Ensemble"], Setting(skip=1))
+    skipping = rows_of("UfM*-Ensemble", skip=1)
     assert dry.predictions(skipping, Members(), 10) == 5
     assert dry.predictions([*rows[3:], *skipping], Members(), 10) == 10 + 3
 
@@ -212,3 +212,16 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
     assert measured == [(rows, name, 1, 1) for name in ("ash", "birch", "cedar")]
     assert ufmstar(*words, "--resume")[0] == 0
     assert len(measured) == 3
+    (tmp_path / "out" / "efficiency.json").unlink()
+    assert ufmstar(*words, "--resume", "--network", "depth_only=ground-truth:8x8")[0] == 0
+    written = json.loads((tmp_path / "out" / "efficiency.json").read_text())
+    assert (written["count"], [one["count"] for one in written["further"]]) == (5.0, [8.0]), "a second architecture"
+
+
+def test_a_warning_of_many_streams_is_logged_once(caplog):
+    logger = logging.getLogger("ufmstar_torch")
+    for _ in range(2):
+        with warned_once():
+            for stream, text in ((0, "a frame has no segment"), (1, "a frame has no segment"), (1, "other")):
+                logger.warning("stream %d: %s", stream, text)
+    assert caplog.messages == 2 * ["stream 0: a frame has no segment", "stream 1: other"]

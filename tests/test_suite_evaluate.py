@@ -12,7 +12,8 @@ from layouts import truncate, write_generic, write_tum
 from tiny_suite import CPU, base_network, evaluate, row, same, unbatched, write_networks
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.eval.engine.evaluate import SequenceError
+from ufmstar_torch.eval.engine.judge import SequenceError
+from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
@@ -20,7 +21,7 @@ from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.models import load_trained
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction
 
 SKIP = UfMStarConfig(on_bad_frame="skip")
@@ -175,6 +176,8 @@ def test_samples_depend_on_the_frame_and_their_number_alone(texts, networks, seq
     for key in reversed(requested):
         assert torch.equal(other.one(frames[key[0]], key[1]).maps.depth, first[key])
     assert not torch.equal(first[0, 0], first[0, 1])
+    of_run = network_source("trained", [texts["mc_dropout"].partition(":")[2]], mode="full", samples=3)
+    assert torch.equal(of_run.one(frames[2], 1).maps.depth, first[2, 1]), "ufmstar run draws the same"
     same_image = replace(frames[0], index=1)
     assert not torch.equal(network.one(same_image, 0).maps.depth, first[0, 0]), "each frame has its own draw"
 
@@ -268,12 +271,17 @@ def test_skip_and_limit_choose_frames_and_turns(texts, networks, sequence):
 # ---- confident pixels ----
 
 
+def binned(*references):
+    """The names of the sums of NLL by error."""
+    return {f"nll_by_error{kind}:{name}" for kind in ("", "_of_all") for name in references}
+
+
 def test_the_nll_by_error_is_over_the_pixels_where_the_reference_is_confident(networks, sequence):
     rows = [row("UfM*-Aleatoric"), row("UfM-Aleatoric"), row("UfM-Aleatoric-1K"), row("Aleatoric"), row("Evidential")]
     actual = evaluate(sequence, rows, networks, confident=0.3)
     expected, groups = NLLByError(), {name: [] for name in ("Aleatoric", "UfM-Aleatoric-1K")}
-    assert set(actual["UfMstar-Aleatoric"].sums) == {"metrics", *(f"nll_by_error:{n}" for n in groups)}
-    assert set(actual["Evidential"].sums) == {"metrics", "nll_by_error:Evidential"}
+    assert set(actual["UfMstar-Aleatoric"].sums) == {"metrics", *binned(*groups)}
+    assert set(actual["Evidential"].sums) == {"metrics", *binned("Evidential")}
     network = networks["aleatoric"]
     for frame, *_ in frames_of(sequence):
         p = unbatched(network, frame)
@@ -296,8 +304,8 @@ def test_the_nll_by_error_is_over_the_pixels_where_the_reference_is_confident(ne
 def test_a_row_is_compared_with_references_on_its_own_frames(networks, sequence):
     rows = [row("Ensemble"), row("UfM*-Ensemble", skip=1), row("UfM-Ensemble-100K", skip=1), row("UfM*-FullEnsemble")]
     result = evaluate(sequence, rows, networks)
-    assert set(result[rows[1].slug].sums) == {"metrics", "nll_by_error:UfM-Ensemble-100K"}
-    assert set(result[rows[3].slug].sums) == {"metrics", "nll_by_error:Ensemble"}
+    assert set(result[rows[1].slug].sums) == {"metrics", *binned("UfM-Ensemble-100K")}
+    assert set(result[rows[3].slug].sums) == {"metrics", *binned("Ensemble")}
 
 
 # ---- what is left out ----
@@ -310,7 +318,9 @@ def test_broken_frames_are_left_out_by_all_rows_alike(networks, tmp_path):
     sequence = open_sequence(path)
     names = ["Ensemble", "UfM*-Ensemble", "DepthOnly", "UfM-DepthOnly"]
     outcome = evaluate(sequence, [row(name) for name in names], networks)
-    frames = [result.frames for result in outcome.values()]
+    frames = [dict(result.frames) for result in outcome.values()]
+    assert [counts.pop("without_segment", None) for counts in frames] == [None, 0, None, None], "of UfM* alone"
+    assert [counts.pop("without_match", None) for counts in frames] == [None, 0, None, None]
     assert all(counts == frames[0] for counts in frames)
     assert (frames[0]["selected"], frames[0]["done"], frames[0]["judged"], frames[0]["skipped"]) == (7, 5, 5, 2)
     assert sum(frames[0]["reasons"].values()) == 2
@@ -319,6 +329,21 @@ def test_broken_frames_are_left_out_by_all_rows_alike(networks, tmp_path):
     clean = evaluate(good, [row(name) for name in names], networks)
     for slug, result in clean.items():
         assert repr(result.figures) == repr(outcome[slug].figures), "as if they had never been there, turns included"
+
+
+def test_frames_that_compare_nothing_are_counted(networks, sequence):
+    """Segments larger than the image, and poses a kilometre apart: no segment, and no match."""
+    entries = [
+        replace(entry, T_world_cam=entry.T_world_cam + np.pad([[1e3 * number]] * 3, ((0, 1), (3, 0))))
+        for number, entry in enumerate(sequence.entries)
+    ]
+    rows = [
+        row("UfM*-Ensemble"),
+        row("UfM*-Ensemble", overrides={"segment.min_pixels": 10**6, "segment.prune": "either"}),
+    ]
+    result = evaluate(replace(sequence, entries=tuple(entries)), rows, networks)
+    counts = [[r.frames[f"without_{name}"] for name in ("segment", "match")] for r in result.values()]
+    assert counts == [[0, len(sequence) - 1], [len(sequence), len(sequence) - 1]]
 
 
 def test_poses_that_are_none_are_left_out(networks, sequence):

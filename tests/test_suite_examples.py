@@ -58,7 +58,7 @@ def test_the_maps_are_the_frames(folder, networks, sequence):
     assert scene["index"] == 1
     np.testing.assert_array_equal(scene["K"], p.intrinsics)
     np.testing.assert_array_equal(scene["truth"], truth_at(frame, p.intrinsics.numpy(), p.size))
-    assert maps.keys() == {"depth", "variance", "aleatoric", "disagreement"}
+    assert maps.keys() == {"depth", "variance", "aleatoric", "disagreement", "measured"}
     np.testing.assert_array_equal(maps["depth"], p.depth)
     np.testing.assert_array_equal(maps["variance"], out.variance[0])
     np.testing.assert_array_equal(maps["aleatoric"], p.aleatoric)

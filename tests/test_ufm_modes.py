@@ -9,7 +9,7 @@ import torch
 
 import scenes
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction
 
 pytestmark = pytest.mark.numerics

@@ -1,13 +1,109 @@
-"""Checks of tensors at public entries: dtype, shape and device, each with one wording."""
+"""Arguments at public entries: what is accepted as an image, a map, a pose or intrinsics, and checks of dtype, shape
+and device, each with one wording."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, TypeAlias
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 Shapes = Sequence[tuple[int, ...]]
+Array: TypeAlias = Tensor | NDArray[Any]
+# An image may also be Pillow's, and intrinsics four numbers.
+ImageLike: TypeAlias = Any
+CameraLike: TypeAlias = Tensor | NDArray[Any] | Sequence[float]
+
+
+def as_tensor(name: str, value: object) -> Tensor:
+    """The argument ``name`` as a tensor: a tensor itself, or a NumPy array of numbers.
+
+    Raises:
+        TypeError: something else.
+    """
+    if isinstance(value, Tensor):
+        return value
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "bfiu":
+        kind = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
+        raise TypeError(f"{name} must be a torch.Tensor or a NumPy array of numbers, got {kind}")
+    native = value.astype(value.dtype.newbyteorder("="), copy=not value.flags.writeable)
+    return torch.from_numpy(np.ascontiguousarray(native))
+
+
+def as_image(image: ImageLike) -> Tensor:
+    """[B, 3, H, W] RGB of one image or several: a tensor [B, 3, H, W] or [3, H, W], a NumPy array [B, H, W, 3] or
+    [H, W, 3], or a Pillow image.
+
+    Raises:
+        TypeError: something else.
+        ValueError: another shape.
+    """
+    if isinstance(image, Tensor):
+        pixels = image[None] if image.dim() == 3 and image.shape[0] == 3 else image
+        if pixels.dim() == 4 and pixels.shape[1] == 3:
+            return pixels
+        last = "; its channels come last: image.permute(0, 3, 1, 2)" if pixels.shape[-1:] == (3,) else ""
+        raise ValueError(f"image must be [B, 3, H, W] RGB, got a tensor {tuple(image.shape)}{last}")
+    if hasattr(image, "convert") and hasattr(image, "mode"):
+        image = np.array(image.convert("RGB"))
+    if not isinstance(image, np.ndarray):
+        expected = "a torch.Tensor [B, 3, H, W], a NumPy array [H, W, 3] or a Pillow image"
+        raise TypeError(f"image must be {expected}, got {type(image).__name__}")
+    if image.ndim not in (3, 4) or image.shape[-1] != 3:
+        raise ValueError(f"image as a NumPy array must be [B, H, W, 3] or [H, W, 3] RGB, got {image.shape}")
+    pixels = as_tensor("image", image).view(-1, *image.shape[-3:]).permute(0, 3, 1, 2)
+    return pixels.to(torch.get_default_dtype()) if pixels.is_floating_point() else pixels
+
+
+def as_pose(pose: CameraLike) -> Tensor:
+    """[B, 4, 4] or [4, 4] camera-to-world of such a matrix, or of one without its last row [..., 3, 4].
+
+    Raises:
+        TypeError: something else.
+        ValueError: another shape.
+    """
+    T = _numbers("pose", pose)
+    if T.dim() in (2, 3) and T.shape[-2:] == (3, 4):
+        return torch.cat([T, T.new_tensor([[0.0, 0.0, 0.0, 1.0]]).expand(*T.shape[:-2], 1, 4)], dim=-2)
+    if T.dim() not in (2, 3) or T.shape[-2:] != (4, 4):
+        raise ValueError(f"pose must be camera-to-world [B, 4, 4] or [4, 4], or [..., 3, 4], got {tuple(T.shape)}")
+    return T
+
+
+def as_intrinsics(intrinsics: CameraLike) -> Tensor:
+    """[B, 3, 3] or [3, 3] of such a matrix, of one beside an empty fourth row and column [..., 4, 4], or of the four
+    numbers fx, fy, cx, cy [px].
+
+    Raises:
+        TypeError: something else.
+        ValueError: another shape, or a fourth row or column that is not empty.
+    """
+    K = _numbers("intrinsics", intrinsics)
+    if K.shape == (4,):
+        (fx, fy, cx, cy), zero, one = K, K.new_zeros(()), K.new_ones(())
+        return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).view(3, 3)
+    if K.dim() in (2, 3) and K.shape[-2:] == (4, 4):
+        if bool((K[..., 3, :] != K.new_tensor([0, 0, 0, 1])).any()) or bool((K[..., :3, 3] != 0).any()):
+            raise ValueError("intrinsics [4, 4] must be 0, 0, 0, 1 in the fourth row and column; is this the pose?")
+        return K[..., :3, :3]
+    if K.dim() not in (2, 3) or K.shape[-2:] != (3, 3):
+        raise ValueError(f"intrinsics must be [B, 3, 3], [3, 3] or fx, fy, cx, cy, got {tuple(K.shape)}")
+    return K
+
+
+def _numbers(name: str, value: object) -> Tensor:
+    """A floating-point tensor of a tensor, an array, or nested sequences; whole numbers become float64."""
+    if isinstance(value, list | tuple):
+        try:
+            value = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise TypeError(f"{name} must hold numbers, got {value!r:.60}") from error
+    numbers = as_tensor(name, value)
+    whole = not numbers.is_floating_point() and not numbers.is_complex() and numbers.dtype != torch.bool
+    return require_float(name, numbers.double() if whole else numbers)
 
 
 def require_float(name: str, value: object, shapes: Shapes = (), like: Tensor | None = None) -> Tensor:

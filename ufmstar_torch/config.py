@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 from ufmstar_torch.checked import Checked, choice, number, section
@@ -10,6 +12,11 @@ from ufmstar_torch.posterior.config import PosteriorConfig as PosteriorConfig
 
 # [m] Largest depth of a network that states none; SPGF's own.
 UNSTATED_RANGE = 20.0
+# The paper's settings where the defaults differ from them (``UfMStarConfig.paper`` has the reasons), by dotted name.
+PAPER: Mapping[str, Any] = MappingProxyType({
+    "segment.min_pixels": 2000, "segment.min_rows": 32, "segment.prune": "either", "segment.slope_focal": "camera",
+    "regression": "neighbourhood", "unmeasured": "paper",
+})  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -174,9 +181,8 @@ class MergeConfig(Checked):
 
 @dataclass(frozen=True)
 class UfMStarConfig(Checked):
-    """All settings of UfM*. The defaults are the paper's, with two exceptions, each explained where it stands: the
-    pruning rule (``segment.prune``, docs/algorithm.md) and ``regression``. Extensions that are not in the
-    paper have a section each, None = off.
+    """All settings of UfM*. The defaults are the paper's except for those listed in :meth:`paper`. Extensions that are
+    not in the paper have a section each, None = off.
 
     Attributes:
         segment: thresholds of the segmentation
@@ -189,8 +195,8 @@ class UfMStarConfig(Checked):
             Gaussians are seen (overlap)
         prior_weight: weight of the prior in the regression
         prior_mean: disagreement where no Gaussian is near
-        unmeasured: M where no two views were compared: as the paper (0 of what was seen once, prior_mean where no
-            Gaussian is near), a share of the depth squared (relative), or NaN (nan)
+        unmeasured: M where no two views were compared: a share of the depth squared (relative), as the paper (0 of what
+            was seen once, prior_mean where no Gaussian is near), or NaN (nan)
         unmeasured_relative: relative: standard deviation as a share of the depth
         regression: exact sum over the Gaussians in view, or the paper's neighbourhood
         near_radius: neighbourhood: Gaussians whose extent comes this near to a pixel's point are summed
@@ -229,9 +235,8 @@ class UfMStarConfig(Checked):
     # Regression (section "Uncertainty Regression")
     prior_weight: float = number(1.0, "pi_0", "px/m^3", 0.0, open_low=True)
     prior_mean: float = number(0.0, "mu_0", "m^2", 0.0)
-    unmeasured: str = choice("paper", "relative", "nan")
+    unmeasured: str = choice("relative", "paper", "nan")
     unmeasured_relative: float = number(0.2, "rho", "1", 0.0, open_low=True)
-    # The paper's neighbourhood approximates the exact sum to save time, which our kernel does not need.
     regression: str = choice("exact", "neighbourhood")
     near_radius: float = number(0.1, "r", "m", 0.0, open_low=True)
     far_radius: float = number(0.5, "R", "m", 0.0, open_low=True)
@@ -269,17 +274,19 @@ class UfMStarConfig(Checked):
     def paper(cls) -> UfMStarConfig:
         """The paper's own settings, for its images of 224 x 224; thresholds in pixels follow other sizes.
 
-        The default differs in three respects. Here a Gaussian below 2,000 pixels or below 32 rows is dropped; by
-        default only one that is below 200 pixels and below 16 rows. Measured on four sequences at 224 x 224, that is
-        4 to 6 Gaussians over 55 to 85 % of the usable pixels here, and 12 to 24 over 92 to 99 % by default
-        (docs/results/accuracy.md); ECE_delta of FastDepth's depth alone, whole frame, is .562 here and .485 by
-        default, mean over the four (docs/results/accuracy.md). The regression sums here over the Gaussians within
-        .1 m, or .5 m where there are none; by default over all, the sum that this approximates to save time, which was
-        the better calibrated one. And SPGF's thresholds have the camera's own focal length
-        here, the reference's by default, which made no difference on tours.
+        ``PAPER`` lists all that differs from the defaults:
+
+        - ``segment.min_pixels``, ``.min_rows``, ``.prune``: the paper drops a Gaussian below 2,000 pixels or below 32
+          rows; the default one that is below 200 pixels and below 16 rows. On four sequences that is 4 to 6 Gaussians
+          over 55 to 85 % of the usable pixels here, 12 to 24 over 92 to 99 % by default, and ECE_delta of FastDepth's
+          depth alone is .562 here and .456 by default (docs/results/accuracy.md).
+        - ``segment.slope_focal``: SPGF's thresholds have the camera's own focal length here, by default the
+          reference's, which made no difference on tours.
+        - ``regression``: over the Gaussians within .1 m here, or .5 m where there are none; by default over all, the
+          sum that this approximates to save time, which was calibrated better.
+        - ``unmeasured``: a surface that no two views compared reads as 0 here, as a share of its depth by default.
         """
-        segment = SPGFConfig(min_pixels=2000, min_rows=32, prune="either", slope_focal="camera")
-        return cls(segment=segment, regression="neighbourhood")
+        return cls().with_values(PAPER)
 
     def within(self, stated: float | None) -> UfMStarConfig:
         """The settings for a network that states its largest depth [m]: ``segment.max_depth``, where that is None."""

@@ -100,6 +100,10 @@ class Extension:
     def require(self, config: UfMStarConfig) -> None:
         """Raise a ValueError unless the extension fits the config."""
 
+    def require_state(self, state: Tensors) -> None:
+        """Raise a ValueError unless its tensors are such as a run leaves behind; shapes and finite values are checked
+        already."""
+
     def by_component(
         self, streams: int, slots: int, dtype: torch.dtype, device: torch.device | str
     ) -> dict[str, Tensor]:
@@ -214,6 +218,11 @@ class Extensions:
         for one in each:
             one.require(config)
         self.each = tuple(each)
+
+    def require_state(self, state: Tensors) -> None:
+        """See :meth:`Extension.require_state`."""
+        for one in self.each:
+            one.require_state(state)
 
     @property
     def always_float64(self) -> tuple[str, ...]:

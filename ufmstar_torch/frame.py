@@ -13,11 +13,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ufmstar_torch.arguments import require_float, require_mask
+from ufmstar_torch.arguments import Array, CameraLike, as_intrinsics, as_pose, as_tensor, require_float, require_mask
 from ufmstar_torch.camera import POLAR_STEPS as POLAR_STEPS
 from ufmstar_torch.camera import focal_and_centre, nearest_rotation, rotation_deviation
-from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.output import FrameStatistics
 
 # Index = code. Each text finishes the sentence "stream b: ...".
 FRAME_FAULTS = (
@@ -142,13 +140,13 @@ def check_values(
 
 
 def check_frame(
-    depth: Tensor,
-    pose: Tensor,
-    intrinsics: Tensor,
-    aleatoric: Tensor | None,
-    epistemic: Tensor | None,
-    valid: Tensor | None,
-    features: Tensor | None,
+    depth: Array,
+    pose: CameraLike,
+    intrinsics: CameraLike,
+    aleatoric: Array | None,
+    epistemic: Array | None,
+    valid: Array | None,
+    features: Array | None,
     *,
     feature_count: int,
     rotation_tolerance: float,
@@ -167,27 +165,27 @@ def check_frame(
         TypeError: an argument is no tensor or has the wrong kind of dtype.
         ValueError: an argument has the wrong shape or lies on another device than ``depth``.
     """
-    require_float("depth", depth)
+    depth = require_float("depth", as_tensor("depth", depth))
     shape = tuple(depth.shape)
     if not (len(shape) == 3 or (len(shape) == 4 and shape[1] == 1)) or 0 in shape:
-        raise ValueError(f"depth must be [B, H, W] or [B, 1, H, W] with no empty dimension, got {shape}")
+        one = "; a single map is depth[None]" if len(shape) == 2 else ""
+        raise ValueError(f"depth must be [B, H, W] or [B, 1, H, W] with no empty dimension, got {shape}{one}")
     dtype = torch.float64 if depth.dtype == torch.float64 else torch.float32
     size = (shape[0], *shape[-2:])
     plain = _as(_constant(depth), size, dtype)
     shapes = [shape, size]
 
-    def own(name: str, value: Tensor | None) -> Tensor | None:
-        return None if value is None else _as(require_float(name, value, shapes, depth), size, dtype)
+    def own(name: str, value: Array | None) -> Tensor | None:
+        return None if value is None else _as(require_float(name, as_tensor(name, value), shapes, depth), size, dtype)
 
     a, e = own("aleatoric", aleatoric), own("epistemic", epistemic)
     extra = _features(features, feature_count, plain)
 
-    T = _matrix("pose", pose, 4, plain)
-    K = _matrix("intrinsics", intrinsics, 3, plain)
+    T, K = _of_depth("pose", as_pose(pose), plain), _of_depth("intrinsics", as_intrinsics(intrinsics), plain)
     mask = None
     if valid is not None:
         either = [*shapes, (shape[0], 1, *shape[-2:])]
-        mask = _as(require_mask("valid", valid, either, depth), size, torch.bool)
+        mask = _as(require_mask("valid", as_tensor("valid", valid), either, depth), size, torch.bool)
     maps = FrameMaps(plain, a, e, extra, mask)
     return kernel(maps, T, K, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
 
@@ -207,37 +205,19 @@ def raise_faults(frame: FrameInput) -> None:
         raise ValueError("; ".join(bad))
 
 
-def without_segments(frame: FrameInput, statistics: FrameStatistics, config: UfMStarConfig) -> str:
-    """A warning where a stream had depth but no segment, else ""; on the CPU only, elsewhere it would have to wait."""
-    if frame.depth.device.type != "cpu" or all(statistics.segments.tolist()):
-        return ""
-    pixels = statistics.valid_pixels + frame.beyond + frame.out_of_range
-    empty = (pixels > 0) & (statistics.segments == 0)
-    if not bool(empty.any()):
-        return ""
-    b = int(empty.nonzero()[0])
-    return (
-        f"stream {b}: a frame has no segment, so nothing is compared between views: of {int(pixels[b])} pixels "
-        f"{int(frame.beyond[b])} lie beyond segment.max_depth = {config.segment.depth_limit} m and "
-        f"{int(frame.out_of_range[b])} outside the accepted ranges. Is the depth in metres, smooth, and the "
-        "intrinsics the depth map's? (said once)"
-    )
-
-
-def _features(features: Tensor | None, count: int, plain: Tensor) -> Tensor | None:
+def _features(features: Array | None, count: int, plain: Tensor) -> Tensor | None:
     expected = (plain.shape[0], count, *plain.shape[1:])
     if features is None:
         if count:
             raise ValueError(f"features must be given with shape {expected}: config.features is {count}")
         return None
-    return _as(_constant(require_float("features", features, [expected], plain)), expected, plain.dtype)
+    return _as(
+        _constant(require_float("features", as_tensor("features", features), [expected], plain)), expected, plain.dtype
+    )
 
 
-def _matrix(name: str, value: Tensor, n: int, plain: Tensor) -> Tensor:
+def _of_depth(name: str, value: Tensor, plain: Tensor) -> Tensor:
     """A camera on the device where it was given (a pose on the CPU is checked without waiting)."""
-    require_float(name, value)
-    if value.shape[-2:] != (n, n) or value.dim() not in (2, 3):
-        raise ValueError(f"{name} must be [B, {n}, {n}] or [{n}, {n}], got {tuple(value.shape)}")
     if value.dim() == 3 and value.shape[0] not in (1, plain.shape[0]):
         raise ValueError(f"{name} must have depth's {plain.shape[0]} streams, got {value.shape[0]}")
     if value.device.type == "meta" and plain.device.type != "meta":
@@ -281,7 +261,7 @@ def pose_fault(T: Tensor, deviation: Tensor, tolerance: float) -> Tensor:
     return _code({**dict(enumerate(checks, start=1)), 7: far})
 
 
-def intrinsics_fault(K: Tensor, size: tuple[int, ...]) -> Tensor:
+def intrinsics_fault(K: Tensor, size: tuple[float, ...]) -> Tensor:
     """[B] codes 5, 6, 8 and 9 for a depth map of ``size`` (H, W), on the intrinsics' own device."""
     off_diagonal = K[:, 0, 1].abs() + K[:, 1, 0].abs() + K[:, 2, :2].abs().sum(-1)
     shape = (off_diagonal != 0) | (K[:, 2, 2] != 1) | (K[:, 0, 0] <= 0) | (K[:, 1, 1] <= 0)

@@ -16,6 +16,8 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
+from ufmstar_torch.optional import naming_extra
+
 
 def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """``__getattr__`` and ``__dir__`` of a package for the names imported under ``if TYPE_CHECKING:`` in it.
@@ -39,6 +41,9 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
         if name.startswith("__") or name not in origins():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module, original = origins()[name]
-        return getattr(import_module(module), original)
+        try:
+            return getattr(import_module(module), original)
+        except ModuleNotFoundError as error:
+            raise naming_extra(error, f"{package}.{name}") from error
 
     return getattr_, lambda: sorted(origins())

@@ -5,6 +5,18 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+# By the name under which a package is imported, the extra of ``ufmstar-torch`` that brings it.
+EXTRAS = {
+    **dict.fromkeys(("torchvision", "onnx", "onnxruntime", "safetensors", "transformers"), "models"),
+    **dict.fromkeys(("filelock", "torchmetrics", "scipy", "cv2", "imageio", "imageio_ffmpeg", "kornia_rs"), "eval"),
+    **dict.fromkeys(("PIL", "tqdm", "jsonargparse", "h5py", "jinja2", "pandas", "OpenEXR", "yaml"), "eval"),
+    "matplotlib": "viz",
+    "lightning": "train",
+    "tensorboard": "train",
+    "zeus": "energy",
+    "submitit": "cluster",
+}
+
 
 def optional(module: str, need: str, install: str) -> Any:
     """The module. Raises ModuleNotFoundError: it is not installed; the message states the ``need`` ("pictures need
@@ -13,3 +25,12 @@ def optional(module: str, need: str, install: str) -> Any:
         return import_module(module)
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(f"{need}: pip install {install}") from error
+
+
+def naming_extra(error: BaseException, who: str) -> BaseException:
+    """An error of ``who``; of a missing package, with the extra that brings it."""
+    package = (getattr(error, "name", None) or "").partition(".")[0]
+    if not isinstance(error, ModuleNotFoundError) or package not in EXTRAS:
+        return error
+    text = f"{who} needs the package {package}: pip install 'ufmstar-torch[{EXTRAS[package]}]'"
+    return ModuleNotFoundError(text, name=error.name)

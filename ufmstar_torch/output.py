@@ -29,6 +29,8 @@ class FrameStatistics:
             ranges that ``UfMStar.forward`` states.
         unmeasured: of the pixels used (with a subset, of those regressed), where M rests by less than half on surfaces
             seen from two views or more; what they get is ``config.unmeasured``.
+        single_view: components that one frame alone has seen. Close to all of ``components`` after some frames: hardly
+            anything is compared between views, and the logger ``ufmstar_torch`` has named likely causes.
         fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
         rotation_deviation: max |R^T R - I| of the pose, removed by projection onto SO(3).
         anchors: with ``config.anchors``, given and usable; 0 for a standing camera, say. None without.
@@ -56,6 +58,7 @@ class FrameStatistics:
     unmeasured: Tensor
     fault: Tensor
     rotation_deviation: Tensor
+    single_view: Tensor | None = None
     anchors: Tensor | None = None
     anchors_used: Tensor | None = None
     anchors_rejected: Tensor | None = None
@@ -115,6 +118,8 @@ class UfMStarOutput:
             ``config.anchors``.
         bias: the relative error r = g/d - 1 that anchors lead to expect; None unless ``config.anchors``.
         posterior_depth, posterior_variance: what :meth:`posterior` returns; None unless ``config.posterior``.
+        posterior_outlier: probability that the pixel lies on another surface than the anchors that corrected it; its
+            variance is counted in ``posterior_variance``. NaN before any anchor; None likewise.
         features: regressed further entries of H, [B, H, W, F], in the caller's units.
         measured: share in [0, 1] of M that rests on surfaces seen from two views or more; below one half the pixel
             counts as not measured (``config.unmeasured``). NaN where not valid.
@@ -139,6 +144,7 @@ class UfMStarOutput:
     bias: Tensor | None = None
     posterior_depth: Tensor | None = None
     posterior_variance: Tensor | None = None
+    posterior_outlier: Tensor | None = None
 
     def __repr__(self) -> str:
         """Shape, median standard deviation and counts in a line."""
@@ -193,7 +199,7 @@ class MeanUncertainty:
             NaN with fewer than two pixels.
         pixels: number of pixels averaged.
         measured: share in [0, 1] of the sampled pixels whose M rests on surfaces seen from two views or more; about 0
-            in a first view, whose mean does not measure disagreement. NaN without a valid pixel.
+            in a first view, whose mean is that of ``config.unmeasured``. NaN without a valid pixel.
         statistics: per-stream counts of this frame; ``unmeasured`` are the other sampled pixels.
     """
 

@@ -9,10 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ufmstar_torch.arguments import as_tensor
+
 
 @dataclass(frozen=True)
 class DepthPrediction:
-    """One prediction of a monocular depth network (section "Single DNN inference").
+    """One prediction of a monocular depth network (section "Single DNN inference"); NumPy arrays become tensors.
 
     Attributes:
         depth: [B, H, W] metric depth D along the optical axis [m].
@@ -20,6 +22,7 @@ class DepthPrediction:
         epistemic_variance: [B, H, W] learned model variance E [m^2], or None.
 
     Raises:
+        TypeError: something else than tensors and arrays.
         ValueError: the shapes disagree or depth is not [B, H, W].
     """
 
@@ -28,6 +31,9 @@ class DepthPrediction:
     epistemic_variance: Tensor | None = None
 
     def __post_init__(self) -> None:
+        for name in ("depth", "aleatoric_variance", "epistemic_variance"):
+            if (value := getattr(self, name)) is not None or name == "depth":
+                object.__setattr__(self, name, as_tensor(name, value))
         if self.depth.dim() != 3 or not torch.is_floating_point(self.depth):
             raise ValueError(
                 f"depth must be a floating-point tensor [B, H, W], got {self.depth.dtype} {tuple(self.depth.shape)}"

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 import torch
 from torch import Tensor
@@ -18,7 +18,8 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension
 from ufmstar_torch.stateful import flat, plain
 
-SCALAR, ISOTONIC = "scalar", "isotonic"
+SCALAR: Final = "scalar"
+ISOTONIC: Final = "isotonic"
 # Settings of UfM* that do not change what V means.
 _HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
 
@@ -46,7 +47,7 @@ class Recalibration(Checked, Extension):
 
     variance: tuple[float, ...]
     recalibrated: tuple[float, ...]
-    kind: str = choice(ISOTONIC, SCALAR)
+    kind: Literal["isotonic", "scalar"] = choice(ISOTONIC, SCALAR)
     row: str = ""
     ufm: Mapping[str, Any] = field(default_factory=dict)
     network: str = ""

@@ -81,12 +81,15 @@ class StatefulModule(nn.Module):
         return _bytes_of(self.config).clone()
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Warn where the config of a loaded state differs from this module's."""
+        """The module keeps its own config; :meth:`_load_from_state_dict` warns where the saved one differs."""
+
+    def _warn_of_config(self, state: object) -> None:
+        """Warn where the config of a saved state differs from this module's."""
         saved, ours = flat(_config_of(state)), flat(plain(self.config))
         changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
         if changed:
             each = ", ".join(f"{key} was {saved.get(key)!r}, is {ours.get(key)!r}" for key in changed)
-            warnings.warn(f"the loaded state was made with another config: {each}", stacklevel=2)
+            warnings.warn(f"the loaded state was made with another config: {each}", stacklevel=4)
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any], **options: Any) -> Self:
@@ -119,19 +122,13 @@ class StatefulModule(nn.Module):
             ValueError: tensors that do not fit together, or values that no run can produce.
         """
 
-    def _load_from_state_dict(
-        self, state_dict: dict[str, Any], prefix: str, metadata: Any, strict: bool,
-        missing: list[str], unexpected: list[str], errors: list[str],
-    ) -> None:  # fmt: skip
-        """Check the whole of a saved state, then take its shapes and copy its values: all of it or nothing."""
+    def accepted(self, state_dict: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
+        """The tensors of a saved state, in the buffers' dtypes, once all of them are checked; nothing changes.
+
+        Raises:
+            ValueError: tensors that do not fit together, or values that no run can produce.
+        """
         self._settle()
-        expected = [prefix + name for name in (*self.STATE, "_extra_state")]
-        absent = [key for key in expected if key not in state_dict]
-        foreign = [key for key in state_dict if key.startswith(prefix) and key not in expected]
-        if strict and (absent or foreign):
-            missing.extend(absent)
-            unexpected.extend(foreign)
-            return
         try:
             saved = {
                 n: _fitting(n, state_dict[prefix + n], getattr(self, n)) for n in self.STATE if prefix + n in state_dict
@@ -140,8 +137,28 @@ class StatefulModule(nn.Module):
                 _config_of(state_dict[prefix + "_extra_state"])
             self._require_state({name: getattr(self, name) for name in self.STATE} | saved)
         except ValueError as error:
-            errors.append(f"{type(self).__name__} keeps its state: {error}")
+            raise ValueError(f"{type(self).__name__} keeps its state: {error}") from error
+        return saved
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, metadata: Any, strict: bool,
+        missing: list[str], unexpected: list[str], errors: list[str],
+    ) -> None:  # fmt: skip
+        """Check the whole of a saved state, then take its shapes and copy its values: all of it or nothing."""
+        expected = [prefix + name for name in (*self.STATE, "_extra_state")]
+        absent = [key for key in expected if key not in state_dict]
+        foreign = [key for key in state_dict if key.startswith(prefix) and key not in expected]
+        if strict and (absent or foreign):
+            missing.extend(absent)
+            unexpected.extend(foreign)
             return
+        try:
+            saved = self.accepted(state_dict, prefix)
+        except ValueError as error:
+            errors.append(str(error))
+            return
+        if prefix + "_extra_state" in state_dict:
+            self._warn_of_config(state_dict[prefix + "_extra_state"])  # an error for some: before anything changes
         for name, value in saved.items():
             if value.shape != (own := getattr(self, name)).shape:
                 setattr(self, name, torch.empty(value.shape, dtype=own.dtype, device=own.device))

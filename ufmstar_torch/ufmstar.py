@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, cast
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch import unmeasured
-from ufmstar_torch.arguments import require_float
+from ufmstar_torch.arguments import Array, CameraLike, as_tensor
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension
 from ufmstar_torch.extensions import extensions_of
 from ufmstar_torch.fixed_order import apply
-from ufmstar_torch.frame import FrameInput, check_frame, raise_faults, without_segments
+from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
 from ufmstar_torch.kernels.select import LateStep, select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty, StepOutput, UfMStarOutput
@@ -25,6 +25,7 @@ from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
 from ufmstar_torch.step import Step
 from ufmstar_torch.step_parts import StepObserver
+from ufmstar_torch.stream_warnings import StreamWarnings
 from ufmstar_torch.warm_up import warm_up
 
 
@@ -38,28 +39,27 @@ class UfMStar(StatefulModule):
     ``aleatoric`` and ``epistemic`` through ``variance``, and to nothing else.
 
     Args:
-        config: see :class:`UfMStarConfig`; None = the default.
+        config: None = ``UfMStarConfig()``, which differs from the paper's settings as listed in
+            :meth:`UfMStarConfig.paper`.
         extensions: further ones beside those of the config's sections, as a
             :class:`~ufmstar_torch.recalibrate.Recalibration` of V.
         dtype: of the state, torch.float32 or torch.float64.
         device: of the state until ``.to()``; it follows the first frame otherwise.
 
-    Attributes:
-        observer: follows the stages of every step, to time them (``ufmstar_torch.step_parts.StepObserver``), or None.
+    Attribute ``observer``: follows the stages of every step, to time them (``step_parts.StepObserver``), or None.
 
     Example::
 
         ufm = UfMStar()
         for image, T_world_cam in video:
             out = ufm(network(image), T_world_cam, K)   # depth [B, H, W]
-            trust = out.std                              # [m]
+            trust = out.std  # [m]
     """
 
     STATE = UfMStarState.names()
     CONFIG = UfMStarConfig
     config: UfMStarConfig
     observer: StepObserver | None = None
-    _warned: bool = False
     _kept_step: tuple[tuple[str, str], Step] | None = None
 
     def __init__(
@@ -76,7 +76,7 @@ class UfMStar(StatefulModule):
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
-        self._extensions = extensions_of(self.config, extensions)
+        self._extensions, self._warnings = extensions_of(self.config, extensions), StreamWarnings()
         self._empty = self._extensions.initial(0, self.config, dtype, device or "cpu")
         self.STATE = tuple(self._empty.tensors())
         self.ALWAYS_FLOAT64 = (*UfMStar.ALWAYS_FLOAT64, *self._extensions.always_float64)
@@ -85,27 +85,28 @@ class UfMStar(StatefulModule):
 
     def forward(
         self,
-        depth: Tensor,
-        pose: Tensor,
-        intrinsics: Tensor,
-        aleatoric: Tensor | None = None,
-        epistemic: Tensor | None = None,
-        valid: Tensor | None = None,
+        depth: Array,
+        pose: CameraLike,
+        intrinsics: CameraLike,
+        aleatoric: Array | None = None,
+        epistemic: Array | None = None,
+        valid: Array | None = None,
         *,
-        features: Tensor | None = None,
+        features: Array | None = None,
         **inputs: Any,
     ) -> UfMStarOutput:
         """Process one predicted depth map per stream and return its variance.
 
         Args:
-            depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype.
-                Accepted is [1e-6 m, 1e6 m], and at most ``config.segment.max_depth``: state the network's largest depth
-                there. Pixels beyond (``statistics.beyond``) or otherwise outside (``out_of_range``) are not valid, nor
-                are those that are NaN, infinite, zero or negative.
-            pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m], coordinates up to 1e9 m. Rotations off by at
-                most ``config.rotation_tolerance`` are projected onto SO(3) and reported.
-            intrinsics: [B, 3, 3] or [3, 3] in pixels of this depth map (not of the image: ``resize_intrinsics``), first
-                pixel's centre at (0, 0); a focal length of 0.01 to 1e7 px, and the principal point on the map.
+            depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype; this
+                and the others are tensors or NumPy arrays. Accepted is [1e-6 m, 1e6 m], and at most
+                ``config.segment.max_depth``: state the network's largest depth there. Pixels beyond
+                (``statistics.beyond``) or otherwise outside (``out_of_range``) are not valid, nor NaN or infinite ones.
+            pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m], or without its last row; coordinates up to
+                1e9 m. Rotations off by at most ``config.rotation_tolerance`` are projected onto SO(3) and reported.
+            intrinsics: [B, 3, 3] or [3, 3], or fx, fy, cx, cy, in pixels of this depth map (not of the image:
+                ``resize_intrinsics``), first pixel's centre at (0, 0); a focal length of 0.01 to 1e7 px, and the
+                principal point on the map.
             aleatoric: like ``depth``, the network's own variance A [m^2]; pixels where it does not lie in [0, 1e12] are
                 left out and counted.
             epistemic: likewise E [m^2].
@@ -113,15 +114,14 @@ class UfMStar(StatefulModule):
             features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed; of at most 1e12.
             **inputs: what an extension takes per frame, by the name of its section in the config; None = nothing.
 
-        Returns:
-            The variance and its parts.
-
         Raises:
             TypeError: wrong kind of argument or dtype.
             ValueError: wrong shape or device; another number of streams than before (:meth:`reset` first); a pose that
                 is not rigid, bad intrinsics (counted with ``on_bad_frame="skip"``); input of an extension that is off.
         """
-        frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
+        depth = as_tensor("depth", depth)
+        a, e = (None if v is None else as_tensor(n, v) for n, v in (("aleatoric", aleatoric), ("epistemic", epistemic)))
+        frame = self._checked(depth, pose, intrinsics, a, e, valid, features)
         out, variance, further = self._observe(frame, inputs)
 
         def shaped(value: Tensor) -> Tensor:
@@ -131,8 +131,8 @@ class UfMStar(StatefulModule):
             depth=depth,
             variance=shaped(variance),
             disagreement=shaped(out.disagreement),
-            aleatoric=aleatoric,
-            epistemic=epistemic,
+            aleatoric=a,
+            epistemic=e,
             features=out.features,
             measured=shaped(out.measured),
             valid=shaped(frame.valid),
@@ -142,16 +142,19 @@ class UfMStar(StatefulModule):
             **{name: shaped(value) for name, value in further.items()},
         )
 
+    if TYPE_CHECKING:
+        __call__ = forward
+
     def mean_uncertainty(
         self,
-        depth: Tensor,
-        pose: Tensor,
-        intrinsics: Tensor,
-        aleatoric: Tensor | None = None,
-        epistemic: Tensor | None = None,
-        valid: Tensor | None = None,
+        depth: Array,
+        pose: CameraLike,
+        intrinsics: CameraLike,
+        aleatoric: Array | None = None,
+        epistemic: Array | None = None,
+        valid: Array | None = None,
         *,
-        features: Tensor | None = None,
+        features: Array | None = None,
         pixels: int | None = None,
         fraction: float | None = None,
         seed: int = 0,
@@ -159,8 +162,8 @@ class UfMStar(StatefulModule):
         **inputs: Any,
     ) -> MeanUncertainty:
         """An average per image for active learning (section "Compute- and memory efficiency"): :meth:`forward`, but
-        only a sample of pixels is regressed. First views have nothing to be compared with: their mean is low
-        (``measured`` near 0), or NaN with ``unmeasured="nan"``. Extensions that need whole maps do nothing here.
+        only a sample of pixels is regressed. First views have nothing to be compared with (``measured`` near 0): their
+        mean is that of ``config.unmeasured``. Extensions that need whole maps do nothing here.
 
         Args:
             pixels: size of the sample per image; or
@@ -183,12 +186,9 @@ class UfMStar(StatefulModule):
         """Compile all kernels, or load them from disk, by running two synthetic frames in a module of its own.
 
         Args:
-            size: (H, W) of the depth maps [px].
+            size: (H, W) of the depth maps [px], positive.
             streams: B.
             progress: is called with the number of stages done and of all.
-
-        Raises:
-            ValueError: a size or number of streams that is not positive.
         """
         twin = UfMStar(self.config, dtype=self.mean.dtype, device=self.mean.device)
         warm_up(twin, size, streams, progress)
@@ -201,8 +201,8 @@ class UfMStar(StatefulModule):
             frame: "world" (the poses' frame) or "first" (each stream's first camera).
 
         Returns:
-            disagreement [B, N] [m^2] and features [B, N, F]; far from everything measured what ``config.unmeasured``
-            states, where "relative" reads as "paper", since a point has no depth.
+            disagreement [B, N] [m^2] and features [B, N, F]. Where nothing was measured the disagreement is NaN, with
+            ``config.unmeasured = "paper"`` the prior's: a point has no depth of which "relative" could be a share.
 
         Raises:
             ValueError: wrong shape or frame, or no frame has been taken in yet.
@@ -214,7 +214,6 @@ class UfMStar(StatefulModule):
             raise ValueError("query needs a mixture: call the module on a frame first")
         if points.dim() != 3 or points.shape[0] != streams or points.shape[2] != 3:
             raise ValueError(f"points must be [{streams}, N, 3], got {tuple(points.shape)}")
-        # A neighbourhood's boxes are cut along the axes of the first camera here, of the present one in a frame.
         with torch.no_grad(), full_precision(points.device):
             local = points.detach()
             if frame == "world":
@@ -253,6 +252,7 @@ class UfMStar(StatefulModule):
         with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
             old, b = self.state, self.mean.shape[0]
             if streams is None:
+                self._warnings.reset()
                 new = self._extensions.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
             else:
                 new = old.restarted(self._chosen(streams, b))
@@ -260,10 +260,12 @@ class UfMStar(StatefulModule):
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         self._empty.with_tensors(state).require(self.config, self._empty)
+        if state["weight"].device.type != "meta":
+            self._extensions.require_state(state)
 
-    def _checked(self, depth: Tensor, pose: Tensor, intrinsics: Tensor, *optional: Tensor | None) -> FrameInput:
+    def _checked(self, depth: Array, pose: CameraLike, intrinsics: CameraLike, *optional: Array | None) -> FrameInput:
         aleatoric, epistemic, valid, features = optional
-        require_float("depth", depth)
+        depth = as_tensor("depth", depth)
         return check_frame(
             depth, pose, intrinsics, aleatoric, epistemic, valid, features,
             feature_count=self.config.features, rotation_tolerance=self.config.rotation_tolerance,
@@ -304,11 +306,11 @@ class UfMStar(StatefulModule):
             )
             state, out = extensions.after_frame(state, out, total)
             disagreement = extensions.disagreement(out.disagreement, chosen(frame.depth))
-            self._store(state.tensors())
-            if not self._warned and (text := without_segments(frame, out.statistics, self.config)):
-                self._warned = True
-                warnings.warn(text, stacklevel=4)
-        return out, total(disagreement), extensions.outputs()
+            out = replace(out, statistics=replace(out.statistics, single_view=(state.count == 1).sum(1)))
+        variance, further = total(disagreement), extensions.outputs()
+        self._store(state.tensors())  # last, so that an error before it, or a warning that is one, changes nothing
+        self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
+        return out, variance, further
 
     def _stored(self) -> UfMStarState:
         buffers = cast("dict[str, Tensor]", self._buffers)  # none is None; without the detour by ``__getattr__``
@@ -345,5 +347,4 @@ class UfMStar(StatefulModule):
         return state
 
     def extra_repr(self) -> str:
-        """Streams and components."""
         return f"streams={self.mean.shape[0]}, capacity={self.mean.shape[1]}, backend={self.config.backend!r}"

@@ -33,7 +33,7 @@ def after_regression(result: Regression, depth: Tensor | None, config: UfMStarCo
 
     Args:
         result: of the mixture of :func:`before_regression`.
-        depth: of the same pixels [m]; None = points without a depth.
+        depth: of the same pixels [m]; None = points without a depth, for which "relative" reads as "nan".
         config: of UfM*.
 
     Returns:
@@ -41,7 +41,7 @@ def after_regression(result: Regression, depth: Tensor | None, config: UfMStarCo
     """
     measured = result.features[..., -1]
     disagreement = result.disagreement
-    if config.unmeasured == "nan":
+    if config.unmeasured == "nan" or (config.unmeasured == "relative" and depth is None):
         disagreement = torch.where(measured < HALF, torch.nan, disagreement)
     elif config.unmeasured == "relative" and depth is not None:
         disagreement = disagreement + (1 - measured).clamp_min(0) * (config.unmeasured_relative * depth).square()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig
 from ufmstar_torch.eval.commands.opening import OpeningOptions
-from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, parse
+from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, reader
 from ufmstar_torch.eval.sequences.frame import parse_slice
 
 PRESETS = ("paper", "default")
@@ -31,7 +30,8 @@ class SuiteOptions:
         suite: name of a suite (see --list), or a TOML file of your own
         base: the network that a figure or ablation is about, instead of the paper's: depth_only, ...
         ufm_preset: settings of UfM* in all its rows, instead of the suite's: paper (UfMStarConfig.paper) or default
-        network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable
+        network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable. With
+            paper-table-1, -2 and -4 a base may have a second one, whose time, energy and memory are measured as well
         samples: passes of MC-Dropout of a row that needs all of them; default: 10
         runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
         precision: of the networks; bf16: torch's autocast
@@ -68,17 +68,6 @@ class DataOptions:
     seed: int = 0
     sequence_list: str | None = None
     frames: str | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvalOpeningOptions(OpeningOptions):
-    """How the sequences are opened, all of them alike.
-
-    Attributes:
-        truth_scale: metres per unit of the sequences' own depth maps, instead of the layout's
-    """
-
-    truth_scale: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +125,7 @@ class EvalOptions:
     debug: bool = False
     what: SuiteOptions
     data: DataOptions
-    opening: EvalOpeningOptions
+    opening: OpeningOptions
     output: EvalOutputOptions
 
     def __post_init__(self) -> None:
@@ -159,9 +148,7 @@ class EvalOptions:
             raise ValueError("--shard and --slurm contradict each other")
 
 
-def read(words: Sequence[str]) -> EvalOptions:
-    """The options of a command line; errors as :func:`parse`."""
-    return parse(EvalOptions, words, "ufmstar eval")
+read = reader(EvalOptions, "ufmstar eval")
 
 
 def main(options: EvalOptions) -> int:
@@ -192,17 +179,23 @@ def job_from(options: EvalOptions) -> EvalJob:
 
     what, data, output, values = options.what, options.data, options.output, as_dict(options)
     suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), what.recalibration)
-    choices = [NetworkChoice.parse(text) for text in what.network]
-    networks = {choice.base: choice for choice in choices}
-    if len(networks) < len(choices):
-        raise ValueError(f"--network: every base once, got {', '.join(choice.base for choice in choices)}")
-    opening = options.opening.given()
+    architectures: list[dict[str, NetworkChoice]] = [{}]
+    for choice in map(NetworkChoice.parse, what.network):  # a base's n-th network belongs to the n-th architecture
+        number = sum(choice.base in known for known in architectures)
+        architectures += [{}] if number == len(architectures) else []
+        architectures[number][choice.base] = choice
+    networks, *further = architectures
+    if further and not suite.efficiency:
+        given = ", ".join(text.partition("=")[0] for text in what.network)
+        raise ValueError(f"--network: every base once, but in a suite that measures time and energy, got {given}")
+    opening = {name: value for name, value in options.opening.given().items() if name != "layout"}
     Options(**{name: value for name, value in opening.items() if name != "poses"})  # raises for impossible values
     only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
-    items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only)
+    items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, layout=options.opening.layout)
     return EvalJob(
         suite=suite.with_bases(networks),
         networks=networks,
+        further=tuple(further),
         items=tuple(replace(item, opening=tuple(opening.items())) for item in items),
         out=Path(str(output.out)),
         missing_bases=tuple(base for base in suite.bases if base not in networks),
@@ -217,7 +210,7 @@ def _evaluate(options: EvalOptions) -> int:
 
     from ufmstar_torch import UfMStarConfig
     from ufmstar_torch.anchors.landmarks import DENSE
-    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals, warned_once
     from ufmstar_torch.eval.engine.warm_up import warm_up_command
     from ufmstar_torch.eval.methods.method import UFM_STAR
     from ufmstar_torch.eval.suite.shards import Slurm, evaluate_on_slurm, evaluate_suite
@@ -227,7 +220,7 @@ def _evaluate(options: EvalOptions) -> int:
     slurm = Slurm.parse(options.slurm) if options.slurm else None
     how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}
     how |= {"processes": options.processes, "threads": options.threads}
-    with Bars() as bars, stop_signals(bars.say) as stop:
+    with Bars() as bars, stop_signals(bars.say) as stop, warned_once():
         job = job_from(options)
         for base in job.unused:
             bars.say(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")

@@ -9,8 +9,11 @@ from ufmstar_torch.eval.commands.options import option
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
-LAYOUTS = ("auto", "tum", "7scenes", "scannet", "sens", "tartanair", "kitti360", "nyu", "generic")
-# What `open_sequence` calls the options whose names on the command line say that they are about ground truth.
+LAYOUTS = (
+    *("auto", "tum", "7scenes", "scannet", "sens", "tartanair", "kitti360", "nyu", "colmap", "transforms", "euroc"),
+    "generic",
+)
+# Names in `open_sequence` of the options for ground truth.
 _TRUTH = {"truth": "depth", "truth_scale": "depth_scale"}
 
 
@@ -19,18 +22,31 @@ class OpeningOptions:
     """How sequences are opened.
 
     Attributes:
+        layout: of the sequence's folder; auto: by the files in it
+        intrinsics: of the images, instead of the layout's own: a file, or fx fy cx cy [px]
+        distortion: of the images' lens, which is undone: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or own:
+            TUM RGB-D's published one
+        truth_scale: metres per unit of the sequence's own depth maps, instead of the layout's
+        max_truth: depths beyond are no ground truth [m], such as what a window shows
         trajectory: file with poses in TUM or KITTI format instead of the layout's own, in the sequence's folder or
             else in the working folder
         poses: how the poses are written; world-to-camera is inverted, ned has x forward, y right, z down, opengl
             x right, y up, z backward
+        pose_scale: metres per unit of the poses, and of a file of landmarks
         fps: frames per second of images without timestamps
         time_offset: added to the images' times [s]
         max_pose_gap: poses are interpolated between samples at most this far apart [s]
         scans: KITTI-360: laser scans of so many frames before and after a frame that are added to its own
     """
 
+    layout: str = option("auto", choices=LAYOUTS)
+    intrinsics: tuple[str, ...] = ()
+    distortion: tuple[str, ...] = ()
+    truth_scale: float | None = None
+    max_truth: float | None = None
     trajectory: str | None = None
     poses: str = option(OURS, choices=tuple(CONVENTIONS))
+    pose_scale: float | None = None
     fps: float | None = None
     time_offset: float = 0.0
     max_pose_gap: float = 0.1
@@ -50,24 +66,18 @@ class SequenceOptions(OpeningOptions):
     """How the sequence is opened.
 
     Attributes:
-        layout: of the sequence's folder; auto: by the files in it
-        intrinsics: of the images, instead of the layout's own: a file, or fx fy cx cy [px]
         depth_intrinsics: of the sequence's own depth maps: a file, or fx fy cx cy [px]
         images: folder of images, or video file, of a generic sequence
         truth: folder of the ground-truth depth maps of a generic sequence
-        truth_scale: metres per unit of the sequence's own depth maps, instead of the layout's
         max_time_difference: largest difference between the times of a colour image and its depth map [s]
         register: leave 7-Scenes' depth in its own camera
         T_color_depth: 7-Scenes: file with the 4x4 matrix from the depth camera into the colour camera [m]
         drive: KITTI-360: name or number of a drive below the root
     """
 
-    layout: str = option("auto", choices=LAYOUTS)
-    intrinsics: tuple[str, ...] = ()
     depth_intrinsics: tuple[str, ...] = ()
     images: str | None = None
     truth: str | None = None
-    truth_scale: float | None = None
     max_time_difference: float = 0.02
     register: bool = True
     T_color_depth: str | None = None

@@ -81,6 +81,8 @@ class UfMOptions:
             landmarks, a line x y z sigma [m] each, in the world of the poses
         posterior: also a depth that anchors correct, with its variance (docs/results/posterior.md); --anchors chooses
             the anchors, default: dense
+        scale_from: network: the unit of a COLMAP model's poses, where it is not known, is the network's own scale;
+            anchors then show the shape of its error, not its scale
         recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
     """
 
@@ -88,6 +90,7 @@ class UfMOptions:
     ufm_preset: str | None = option(None, choices=("paper", "default"))
     anchors: bool | str = option(False, const=True)
     posterior: bool = False
+    scale_from: str | None = option(None, choices=("network",))
     recalibration: str | None = None
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
 

@@ -5,7 +5,7 @@ bound.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
-from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, LandmarkSource, landmark_source
+from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, LandmarkMap, LandmarkSource, landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import Landmarks, TrackerConfig
 from ufmstar_torch.config import UfMStarConfig
@@ -31,18 +31,7 @@ from ufmstar_torch.eval.sequences.options import resolve
 TRUTH_COUNT, TRUTH_SIGMA = 100, 0.01
 # Third number of the seeds for the choice of anchors and for noise. Poses have a seed of two numbers.
 _TAKEN, _NOISE = 1, 2
-
-
-@dataclass(frozen=True, eq=False)
-class FrameAnchors:
-    """The anchors of one frame."""
-
-    # [1, N] in the pixels of the depth map, on its device; None where there is no image to track in.
-    anchors: Anchors | None
-    tracked: int = 0  # corners that were followed from the frame before; 0 of ground truth
-    triangulated: int = 0  # those of them with a depth; of ground truth, all
-    ms: float | None = None  # of the tracker [ms]; None of ground truth
-    none: str = ""  # why nothing was triangulated, where that is so
+_NO_IMAGE = Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked=0, none="no image")
 
 
 class Tracks:
@@ -53,7 +42,7 @@ class Tracks:
     """
 
     def __init__(self, source: LandmarkSource | None = None) -> None:
-        self._streams = StreamLandmarks(CORNERS if source is None else source)
+        self._streams = StreamLandmarks(landmark_source(CORNERS) if source is None else source)
         self._last: tuple[Frame, Landmarks, float] | None = None
 
     def of(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:
@@ -107,29 +96,38 @@ class AnchorSource:
 
     def of(
         self, frame: Frame, T_world_cam: NDArray[np.float64], predicted: Predicted, truth: NDArray[np.float32] | None
-    ) -> FrameAnchors:
-        """The anchors of the next frame, at the pose [4, 4] that the row sees [m], in the camera of the prediction;
-        ``truth`` [h, w] is the ground truth at its pixels [m], 0 = none, or None."""
-        device = predicted.maps.depth.device
+    ) -> tuple[Landmarks, Anchors | None, float | None]:
+        """The landmarks of the next frame, the same as anchors, and the time that they took [ms].
+
+        Args:
+            frame: its image is tracked in.
+            T_world_cam: [4, 4] the pose that the row sees [m].
+            predicted: has the camera of the anchors' pixels.
+            truth: [h, w] ground truth at its pixels [m], 0 = none, or None.
+
+        Returns:
+            The landmarks in the pixels of the image (of ground truth, in those of the depth map); anchors [1, N] in the
+            pixels of the depth map, None without an image to track in; None for the time if nothing was tracked.
+        """
+        device, K = predicted.maps.depth.device, predicted.intrinsics[0]
         if self.tracks is None:
             depth = np.zeros(predicted.size, np.float32) if truth is None else truth
-            sampled = self._sampled(depth, frame.index).to(device)
-            return FrameAnchors(sampled, triangulated=sampled.depth.shape[1], none="no ground truth")
+            drawn = self._sampled(depth, frame.index)
+            values = (torch.from_numpy(part)[None] for part in (drawn.pixel, drawn.depth, drawn.variance))
+            return drawn, Anchors(*values).to(device), None
         tracked = self.tracks.of(frame, T_world_cam)
         if tracked is None:
-            return FrameAnchors(None, none="no image")
-        landmarks, ms = self._thinned(self._disturbed(tracked[0], frame.index), frame.index), tracked[1]
-        anchors = landmarks.anchors(frame.intrinsics, predicted.intrinsics[0]).to(device)
-        return FrameAnchors(anchors, landmarks.tracked, len(landmarks.depth), ms, landmarks.none)
+            return _NO_IMAGE, None, None
+        landmarks = self._thinned(self._disturbed(tracked[0], frame.index), frame.index)
+        return landmarks, landmarks.anchors(frame.intrinsics, K).to(device), tracked[1]
 
-    def _sampled(self, truth: NDArray[np.float32], index: int) -> Anchors:
+    def _sampled(self, truth: NDArray[np.float32], index: int) -> Landmarks:
         v, u = np.nonzero(truth > 0)
         count = TRUTH_COUNT if self._setting.anchor_count is None else self._setting.anchor_count
         chosen = self._drawn(index, _TAKEN).permutation(len(v))[:count]
         depth = truth[v[chosen], u[chosen]].astype(np.float64)
         pixel = np.stack([u[chosen], v[chosen]], axis=-1).astype(np.float64)
-        values = (pixel, depth, np.square(TRUTH_SIGMA * depth))
-        return Anchors(*(torch.from_numpy(array)[None] for array in values))
+        return Landmarks(pixel, depth, np.square(TRUTH_SIGMA * depth), tracked=0, none="no ground truth")
 
     def _disturbed(self, landmarks: Landmarks, index: int) -> Landmarks:
         size = self._setting.track_noise
@@ -153,9 +151,10 @@ class AnchorSource:
         return np.random.default_rng([self._setting.seed, index, what])
 
 
-def landmarks_of(value: str | bool, folder: Path | None) -> LandmarkSource:
+def landmarks_of(value: str | bool, folder: Path | None, scale: float = 1.0) -> LandmarkSource:
     """The source of landmarks of a sequence; True, "corners" and "tracked" mean tracked corners, other values are as
-    ``landmark_source`` takes them. A file of landmarks lies in the sequence's folder or the working folder.
+    ``landmark_source`` takes them. A file of landmarks lies in the sequence's folder or the working folder; its lengths
+    are in the unit of the recording's poses, of ``scale`` metres.
 
     Raises:
         FileNotFoundError: no such file.
@@ -163,18 +162,21 @@ def landmarks_of(value: str | bool, folder: Path | None) -> LandmarkSource:
     """
     word = CORNERS if value in (True, TRACKED) else str(value)
     is_file = Path(word).suffix.lower() in FILE_TYPES
-    return landmark_source(resolve(folder or Path(), word) if is_file else word)
+    source = landmark_source(resolve(folder or Path(), word) if is_file else word)
+    if isinstance(source, LandmarkMap) and scale != 1:
+        return LandmarkMap(scale * source.points_world, scale * source.sigma)
+    return source
 
 
-def landmark_digests(rows: Iterable[Row], folder: Path | None) -> dict[str, str]:
+def landmark_digests(rows: Iterable[Row], folder: Path | None, scale: float = 1.0) -> dict[str, str]:
     """Digests of the landmarks of those rows that have them from a file, by the rows' slugs. Raises FileNotFoundError,
     ValueError, as :func:`landmarks_of`."""
     files = {row.slug: row.setting.anchors for row in rows if row.setting.anchors not in ("", TRACKED, DENSE, TRUTH)}
-    identities = {file: landmarks_of(file, folder).identity for file in set(files.values())}
+    identities = {file: landmarks_of(file, folder, scale).identity for file in set(files.values())}
     return {slug: identities[file]["landmarks"] for slug, file in files.items() if "landmarks" in identities[file]}
 
 
-def anchor_sources(rows: Iterable[Row], folder: Path | None = None) -> dict[Row, AnchorSource]:
+def anchor_sources(rows: Iterable[Row], folder: Path | None = None, scale: float = 1.0) -> dict[Row, AnchorSource]:
     """The source of every row with anchors; rows of the same images and poses share a tracker. Raises
     FileNotFoundError, ValueError, as :func:`landmarks_of`."""
     tracks: dict[tuple[object, ...], Tracks] = {}
@@ -186,6 +188,6 @@ def anchor_sources(rows: Iterable[Row], folder: Path | None = None) -> dict[Row,
         elif setting.anchors:
             key = (setting.anchors, setting.skip, setting.pose_noise)
             if key not in tracks:
-                tracks[key] = Tracks(landmarks_of(setting.anchors, folder))
+                tracks[key] = Tracks(landmarks_of(setting.anchors, folder, scale))
             sources[row] = AnchorSource(setting, tracks[key])
     return sources

@@ -2,18 +2,22 @@
 
 Ranks need all pixels at once; a stream has none of the earlier ones. So the pixels go into bins of equal
 width in the logarithm of the variance and of the error, finer than anyone reads a variance, and pixels
-of one bin count as ties. What that can change is bounded: see each class.
+of one bin count as ties. Each class states a bound on the error that this makes.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric
-from ufmstar_torch.eval.metrics.pixel_sums import add_joint, add_nll_by_error, add_sparsification
+from ufmstar_torch.eval.metrics.base import SumMetric, flat_pixels
+from ufmstar_torch.eval.metrics.pixel_sums import HIGH, LOW, add_joint, add_nll_by_error, add_sparsification
+
+# In the logarithm of the variance or of the error; of both together: 5.5 % in variance, 2 MB of counts.
+BINS, JOINT_BINS = 4096, 512
 
 
 def mean_of_share(count: Tensor, total: Tensor, shares: Tensor) -> Tensor:
@@ -42,20 +46,15 @@ class Sparsification(SumMetric):
 
     Ties: pixels whose variance agrees within a bin (4096 bins: .7 %, .35 % of sigma) count as equal, so
     the curve is exactly that of variances rounded so far.
-
-    Args:
-        bins: of the logarithm of the variance.
     """
 
     OF_VARIANCE = "AUSE"
     ADD = add_sparsification
 
-    def __init__(self, bins: int = 4096, **kwargs: Any) -> None:
-        if bins < 1:
-            raise ValueError(f"bins must be >= 1, got {bins}")
-        super().__init__({"bins": bins}, **kwargs)
-        self.add_counts("count", "count_squared", "count_relative", shape=(bins + 2,))
-        self.add_sums("squared", "relative", "sum_squared", "sum_relative", shape=(bins + 2,))
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_counts("count", "count_squared", "count_relative", shape=(BINS + 2,))
+        self.add_sums("squared", "relative", "sum_squared", "sum_relative", shape=(BINS + 2,))
 
     def compute(self) -> dict[str, Tensor]:
         kept = 1 - torch.arange(50, dtype=torch.float64, device=self.count.device) / 50
@@ -87,19 +86,14 @@ class SpearmanCorrelation(SumMetric):
     The bound: a bin's mean rank X' is the conditional mean of the ranks X in it, so that var X = var X' +
     w var X with w <= sum_b n_b (n_b^2 - 1) / (N (N^2 - 1)); by Cauchy-Schwarz the covariance changes by
     at most sd X sd Y (sqrt(w_x) + sqrt(w_y) + sqrt(w_x w_y)).
-
-    Args:
-        bins: per axis; 512 make bins of 5.5 % in variance (2.7 % of sigma) and 2 MB of counts.
     """
 
     OF_VARIANCE = "Spearman's correlation"
     ADD = add_joint
 
-    def __init__(self, bins: int = 512, **kwargs: Any) -> None:
-        if bins < 1:
-            raise ValueError(f"bins must be >= 1, got {bins}")
-        super().__init__({"bins": bins}, **kwargs)
-        self.add_counts("joint", shape=(bins + 2, bins + 2))
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_counts("joint", shape=(JOINT_BINS + 2, JOINT_BINS + 2))
 
     def compute(self) -> dict[str, Tensor]:
         joint = self.joint.double()
@@ -129,28 +123,48 @@ class NLLByError(SumMetric):
     ``error_by_error``, mean |d - g| [m], of the pixels between one percentile and the next, NaN without a
     pixel. Errors that agree within a bin (4096 bins of squared error: .35 % of the error) count as equal.
 
+    With ``levels``, the threshold of confidence is chosen after all sequences: :meth:`add_levels` counts the pixels by
+    the level of the other method's variance, and ``compute()`` takes the share ``confident`` with the lowest (of the
+    level at the threshold a part, as if its pixels were in random order).
+
     Args:
         percentiles: number of groups of equal size; 10 = deciles.
         bins: of the logarithm of the squared error.
+        levels: of the other method's variance.
+        confident: share of the pixels that is judged.
     """
 
     OF_VARIANCE = "NLL by error"
     ADD = add_nll_by_error
 
-    def __init__(self, percentiles: int = 10, bins: int = 4096, **kwargs: Any) -> None:
-        if percentiles < 1 or bins < 1:
-            raise ValueError(f"percentiles and bins must be >= 1, got {percentiles} and {bins}")
-        super().__init__({"percentiles": percentiles, "bins": bins}, **kwargs)
-        self.percentiles = percentiles
-        self.add_counts("count", shape=(bins + 2,))
-        self.add_sums("nll", "error", shape=(bins + 2,))
+    def __init__(
+        self, percentiles: int = 10, bins: int = 4096, levels: int = 1, confident: float = 1.0, **kwargs: Any
+    ) -> None:
+        if min(percentiles, bins, levels) < 1:
+            raise ValueError(f"percentiles, bins and levels must be >= 1, got {percentiles}, {bins} and {levels}")
+        settings = {"percentiles": percentiles, "bins": bins, "levels": levels, "confident": confident}
+        super().__init__(settings, **kwargs)
+        self.percentiles, self.levels, self.confident = percentiles, levels, confident
+        self.add_counts("count", shape=(levels, bins + 2))
+        self.add_sums("nll", "error", shape=(levels, bins + 2))
+
+    def add_levels(self, depth: Tensor, variance: Tensor, target: Tensor, confidence: Tensor) -> None:
+        """Add frames [...]; ``confidence`` [...] is the other method's variance [m^2], NaN where it is not to count."""
+        used = confidence >= 0
+        level = (torch.where(used, confidence, LOW).clamp(LOW, HIGH) / LOW).log() * (self.levels / math.log(HIGH / LOW))
+        level = torch.where(used, level.long().clamp(max=self.levels - 1) + 1, 0)
+        self.add(flat_pixels(depth, variance, target)._replace(use=level.cpu().flatten().numpy()))
 
     def compute(self) -> dict[str, Tensor]:
         steps = torch.arange(1, self.percentiles + 1, dtype=torch.float64, device=self.count.device)
         kept = steps / self.percentiles
-        return {"nll_by_error": self._groups(self.nll, kept), "error_by_error": self._groups(self.error, kept)}
+        pixels = self.count.double().sum(1)
+        upto = pixels.cumsum(0)
+        part = ((self.confident * upto[-1] - upto + pixels) / pixels.clamp(min=1)).clamp(0, 1)
+        count, nll, error = (part @ value.double() for value in (self.count, self.nll, self.error))
+        return {"nll_by_error": self._groups(count, nll, kept), "error_by_error": self._groups(count, error, kept)}
 
-    def _groups(self, total: Tensor, kept: Tensor) -> Tensor:
+    def _groups(self, count: Tensor, total: Tensor, kept: Tensor) -> Tensor:
         """[percentiles] mean of each group, from the sums up to its end."""
-        upto = mean_of_share(self.count, total, kept) * kept
+        upto = mean_of_share(count, total, kept) * kept
         return torch.diff(upto, prepend=upto.new_zeros(1)) * self.percentiles

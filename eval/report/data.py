@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import pickle
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.judge import BY_ERROR, METRICS
+from ufmstar_torch.eval.engine.judge import BY_ERROR_OF_ALL, METRICS, OF_ALL
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.methods.setting import Setting
@@ -25,6 +26,14 @@ FORMAT = 1
 # The keys of ``Setting.to_dict()`` that are fields of Setting; all others are overrides of the config.
 _SETTING_FIELDS = {f.name for f in fields(Setting)} - {"overrides"}
 Sums = dict[str, dict[str, Tensor]]
+# The paper's groups of its figure of entropy, by the beginnings of words in the names of data sets and sequences
+# (TartanAir's environments, say); other data sets are groups of their own.
+ENVIRONMENTS = {
+    "indoor": ("indoor", "scannet", "7scenes", "scenes", "tum", "nyu", "tour", "office", "hospital"),
+    "forest": ("forest", "seasonsforest", "gascola"),
+    "driving": ("driving", "kitti"),
+    "city": ("city", "soulcity", "neighborhood", "oldtown", "japanesealley"),
+}
 
 
 class ResultsError(ValueError):
@@ -45,8 +54,7 @@ class Merged(NamedTuple):
     """Several sequences evaluated as one, every pixel with the same weight."""
 
     figures: Mapping[str, float]  # SequenceMetrics.compute()
-    curves: Mapping[str, list[float]]  # its curves(), and "nll_by_error:REFERENCE", "error_by_error:REFERENCE"
-    sequences: int = 1
+    curves: Mapping[str, list[float]]  # its curves(), "nll_by_error:REFERENCE" and "nll_by_error_of_all:REFERENCE"
 
 
 @dataclass(frozen=True)
@@ -92,8 +100,8 @@ class Results:
 
     def of(self, row: Row, dataset: str | None = None, sequence: str | None = None) -> tuple[Record, ...]:
         """The records of a row, of one data set or sequence or (None) of all, by data set and sequence."""
-        records = self._by_row.get((row, dataset), ())
-        return records if sequence is None else tuple(record for record in records if record.sequence == sequence)
+        listed = self._by_row.get(row, ())
+        return tuple(r for r in listed if dataset in (None, r.dataset) and sequence in (None, r.sequence))
 
     def default_rows(self, base: str | None = None) -> list[Row]:
         """The first row of each method of a base (None: of all) that no ablation varies."""
@@ -108,12 +116,11 @@ class Results:
         return next((r.network for r in self.records if Method.parse(r.method).base == base), None)
 
     @cached_property
-    def _by_row(self) -> dict[tuple[Row, str | None], tuple[Record, ...]]:
-        groups: dict[tuple[Row, str | None], list[Record]] = {}
+    def _by_row(self) -> dict[Row, list[Record]]:
+        groups: dict[Row, list[Record]] = {}
         for record in self.records:
-            for dataset in (record.dataset, None):
-                groups.setdefault((row_of(record), dataset), []).append(record)
-        return {key: tuple(records) for key, records in groups.items()}
+            groups.setdefault(row_of(record), []).append(record)
+        return groups
 
 
 def load_results(out: Path, *, with_sums: bool = True) -> Results:
@@ -135,9 +142,16 @@ def load_results(out: Path, *, with_sums: bool = True) -> Results:
     by_path = dict(sorted(by_path.items(), key=place))
     _check(out, about, by_path)
     records, failed = tuple(by_path.values()), _failed(out)
-    merged, notes = _merged(by_path) if with_sums else ({}, [])
+    merged, notes = _merged(by_path, about) if with_sums else ({}, [])
     missing, efficiency = _missing(about, records, failed), _read_json(out / "efficiency.json")
     return Results(out, about, records, merged, failed, missing, efficiency, tuple(notes))
+
+
+def environment_of(record: Record) -> str:
+    """The group of a sequence in the figure of entropy: a key of ``ENVIRONMENTS``, or its data set."""
+    words = re.split("[^a-z0-9]+", f"{record.dataset}/{record.sequence}".lower())
+    fitting = (name for name, begins in ENVIRONMENTS.items() if any(word.startswith(begins) for word in words))
+    return next(fitting, record.dataset)
 
 
 def row_of(record: Record) -> Row:
@@ -241,7 +255,9 @@ def _missing(
 # ---- sums over sequences ----
 
 
-def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Merged], list[str]]:
+def _merged(
+    records: Mapping[Path, Record], about: Mapping[str, Any]
+) -> tuple[dict[tuple[str, Row], Merged], list[str]]:
     """Sums of each (dataset, row), added in the order of the sequences; a note where a file is missing."""
     groups: dict[tuple[str, Row], list[Path]] = {}
     for path, record in records.items():
@@ -259,7 +275,7 @@ def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Merge
                 if {key: value.shape for key, value in mine.items()} != {k: v.shape for k, v in states.items()}:
                     raise ResultsError(f"{path} holds sums of other metrics than the sequences before it ({name})")
                 total[name] = {key: mine[key] + value for key, value in states.items()}
-        merged[dataset, row] = _compute(total, files)
+        merged[dataset, row] = _compute(total, files[0], about)
     return merged, notes
 
 
@@ -274,8 +290,8 @@ def read_sums(path: Path) -> Sums:
     return {name: {key: unpack(value) for key, value in states.items()} for name, states in sums.items()}
 
 
-def _compute(total: Sums, paths: Sequence[Path]) -> Merged:
-    """Figures and curves of summed states."""
+def _compute(total: Sums, file: Path, about: Mapping[str, Any]) -> Merged:
+    """Figures and curves of summed states; ``file`` is named in errors."""
     from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 
     states = total[METRICS]
@@ -283,16 +299,16 @@ def _compute(total: Sums, paths: Sequence[Path]) -> Merged:
     many = "NLL" in kinds and states["metrics.ECEDelta.pixels"].numel() == 100
     bins = "authors" if many else "ours"
     metrics = SequenceMetrics(with_variance="NLL" in kinds, ranking="Sparsification" in kinds, bins=bins)
-    by_error = {name: NLLByError() for name in total if name.startswith(f"{BY_ERROR}:")}
+    of_all = {**OF_ALL, "confident": (about.get("settings") or {}).get("confident", 0.5)}
+    by_error = {
+        name: NLLByError(**(of_all if name.startswith(BY_ERROR_OF_ALL) else {})) for name in total if name != METRICS
+    }
     try:
         metrics.load_state_dict(dict(states))
         for name, metric in by_error.items():
             metric.load_state_dict(dict(total[name]))
     except RuntimeError as error:
         text = " ".join(str(error).split())[:200]
-        raise ResultsError(f"{paths[0]} holds sums of other metrics: {text}") from error
-    curves = metrics.curves()
-    for name, metric in by_error.items():
-        reference = name.removeprefix(f"{BY_ERROR}:")
-        curves |= {f"{curve}:{reference}": value.tolist() for curve, value in metric.compute().items()}
-    return Merged(metrics.compute(), curves, len(paths))
+        raise ResultsError(f"{file} holds sums of other metrics: {text}") from error
+    curves = {name: metric.compute()["nll_by_error"].tolist() for name, metric in by_error.items()}
+    return Merged(metrics.compute(), metrics.curves() | curves)

@@ -141,6 +141,7 @@ def panel(name: str, note: str, frame: Any, rows: Mapping[str, Any]) -> FramePan
         maps[prefix.rstrip("_") or "depth"] = depth
         maps[f"{prefix}sigma"] = row.variance.float().sqrt().numpy()
         maps[f"{prefix}error"] = absolute_error(depth, star.truth)
+    maps["measured"] = star.measured.float().numpy()
     return FramePanel(name, frame.image, {key: known_where(valid, values) for key, values in maps.items()}, note)
 
 

@@ -20,15 +20,21 @@ from ufmstar_torch.eval.report.table import Cell, Column, Line, Table
 # Keys and words of ``efficiency.json``, as eval/bench writes them.
 DEPTH, NETWORK, MULTIVIEW = "depth", "network_uncertainty", "multiview"
 CPU, GPU, GROSS = "cpu", "gpu", "gross"
-NOT_MEASURABLE = "not measurable here"
-NOT_SEPARABLE = "not separable"
+NOT_MEASURABLE, NOT_SEPARABLE = "not measurable here", "not separable"
 UNITS = {GPU: "GPU", CPU: "CPU"}
 _SMALLEST = 0.01  # less prints as "<0.01"
 
 
 def efficiency_tables(measured: Mapping[str, Any]) -> list[Table]:
-    """One table per architecture of ``efficiency.json``."""
-    return [_table(measured, label) for label in dict.fromkeys(row["network"] for row in measured["rows"])]
+    """One table per architecture of ``efficiency.json``, then the paper's of those of its architectures that are among
+    them, or of all of its."""
+    tables = {row["network"]: run for run in architectures(measured) for row in run["rows"]}
+    return [*(_table(run, label) for label, run in tables.items()), *paper_efficiency_tables(tables)]
+
+
+def architectures(measured: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The measurements of ``efficiency.json``: one of the networks that were evaluated, and of further ones."""
+    return [measured, *measured.get("further", ())]
 
 
 def paper_efficiency_tables(networks: Iterable[str]) -> list[Table]:
@@ -79,12 +85,11 @@ def _paper_table(quoted: PaperTable) -> Table:
 
 def _columns() -> list[Column]:
     per_unit = ("Latency [ms]", "Power [W]", "Energy [mJ]")
+    memory = ("DNN unc. [MB]", "MVD [MB]", "Overhead [%]")
     return [
-        *(Column(unit, f"{unit} {name}", name) for unit in UNITS.values() for name in per_unit),
-        Column("", "Energy overhead [%]", r"Energy overhead [\%]"),
-        Column("Memory", "DNN unc. mem. [MB]", "DNN unc. [MB]"),
-        Column("Memory", "MVD mem. [MB]", "MVD [MB]"),
-        Column("Memory", "Mem. overhead [%]", r"Overhead [\%]"),
+        *(Column(unit, name) for unit in UNITS.values() for name in per_unit),
+        Column("", "Energy overhead [%]"),
+        *(Column("Memory", name) for name in memory),
     ]
 
 

@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.run.colours import known_where
+from ufmstar_torch import unmeasured
+from ufmstar_torch.array_files import read_npz_whole
+from ufmstar_torch.eval.run.colours import known_where, striped
 
 Map = NDArray[np.float32]
 _SCENE = ("image", "truth", "K")
@@ -21,7 +22,8 @@ _SCENE = ("image", "truth", "K")
 @dataclass(frozen=True, eq=False)
 class RowMaps:
     """One row's maps of a frame, [h, w] float32: depth [m], variance V [m^2], and its parts [m^2] where the row has
-    them: the network's own A, the spread of members or samples E, and the disagreement between the views M.
+    them: the network's own A, the spread of members or samples E, and the disagreement between the views M;
+    ``measured`` is the share of M that rests on two views or more.
     """
 
     depth: Map
@@ -29,6 +31,7 @@ class RowMaps:
     aleatoric: Map | None = None
     epistemic: Map | None = None
     disagreement: Map | None = None
+    measured: Map | None = None
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -50,6 +53,10 @@ class RowMaps:
     def sigma(self) -> Map:
         """[h, w] standard deviation [m], NaN where invalid."""
         return self.root(self.variance)
+
+    def striped(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """A picture [h, w, 3] of M or sigma, striped where M was not measured."""
+        return rgb if self.measured is None else striped(rgb, self.measured < unmeasured.HALF)
 
 
 _MAPS = tuple(f.name for f in fields(RowMaps))
@@ -126,11 +133,7 @@ def find_examples(folder: Path, labels: Mapping[str, str] | None = None) -> list
 
 def load_arrays(file: Path, names: Sequence[str]) -> dict[str, NDArray]:
     """The arrays of an npz file. Raises ValueError: it is none, or broken, or one of ``names`` is missing."""
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (BadZipFile, EOFError, KeyError, ValueError) as error:
-        raise ValueError(f"{file} is not a readable npz file: {error}") from error
+    arrays = read_npz_whole(file)
     missing = [name for name in names if name not in arrays]
     if missing:
         raise ValueError(f"{file} must hold {', '.join(names)}; {', '.join(missing)} is missing")

@@ -12,6 +12,7 @@ from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report import style
 from ufmstar_torch.eval.report.data import Results
+from ufmstar_torch.eval.report.efficiency import architectures
 from ufmstar_torch.eval.report.means import Mean, mean_of
 from ufmstar_torch.eval.report.names import ECE_DELTA, NETWORK_MS, STATE, TOTAL_MS, UNCERTAINTY_MS
 from ufmstar_torch.eval.run.colours import INK, plain
@@ -53,7 +54,8 @@ def draw_latency(results: Results) -> Any | None:
 
 def draw_stages(results: Results) -> Any | None:
     """Shares of the stages in a step of UfM*, the paper's figure; None unless ``efficiency.json`` has it."""
-    staged = [row for row in (results.efficiency or {}).get("rows", ()) if row.get("stages")]
+    measured = [] if results.efficiency is None else architectures(results.efficiency)
+    staged = [row for run in measured for row in run["rows"] if row.get("stages")]
     if not staged:
         return None
     figure = style.new_figure(8.6, 1.5 + 0.5 * len(staged), "Where the time of UfM* goes")

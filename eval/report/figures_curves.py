@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.engine.judge import BY_ERROR
+from ufmstar_torch.eval.engine.judge import BY_ERROR, BY_ERROR_OF_ALL
 from ufmstar_torch.eval.methods.method import ALONE, BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report import style
-from ufmstar_torch.eval.report.data import Merged, Results
+from ufmstar_torch.eval.report.data import ENVIRONMENTS, Results, environment_of
 from ufmstar_torch.eval.report.means import value_of
 from ufmstar_torch.eval.report.names import count
 from ufmstar_torch.eval.report.style import Look
@@ -176,7 +176,8 @@ _SIGMAS = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)  # [m]
 
 def draw_error(results: Results, dataset: str) -> Any | None:
     """The mean NLL of each tenth of the pixels, from a row's smallest errors to its largest: a line of panels per
-    network, a panel per reference; None where no row was judged so."""
+    network, two panels per reference (its confident pixels of each frame, and of all sequences with one threshold);
+    None where no row was judged so."""
     panels = {base: of_base for base in results.bases if (of_base := _error_curves(results, dataset, base))}
     if not panels:
         return None
@@ -185,7 +186,7 @@ def draw_error(results: Results, dataset: str) -> Any | None:
     for line, (base, by_reference) in zip(
         style.hidden_panels(figure, len(panels), columns), panels.items(), strict=True
     ):
-        for axes, (reference, curves) in zip(line, by_reference.items(), strict=False):
+        for axes, ((reference, kind), curves) in zip(line, by_reference.items(), strict=False):
             axes.set_visible(True)
             for row, values in sorted(curves.items(), key=lambda item: item[0].method.fusion == UFM_STAR):
                 x = (np.arange(len(values)) + 0.5) * 100 / len(values)
@@ -194,78 +195,100 @@ def draw_error(results: Results, dataset: str) -> Any | None:
             method = Method.parse(reference)
             judge = "it" if method.fusion == ALONE else style.look_of(method).name
             title = f"{BASES[base][0]}: where {judge} is confident"
+            title += ", one threshold" if kind == BY_ERROR_OF_ALL else " in each frame"
             style.finish(axes, title=title, x="percentile of the row's error", y="mean NLL [nats]")
             style.name_lines(axes)
     return figure
 
 
-def _error_curves(results: Results, dataset: str, base: str) -> dict[str, dict[Row, Sequence[float]]]:
-    """Curves by row, by reference: the base alone first, then UfM."""
-    curves: dict[str, dict[Row, Sequence[float]]] = {}
+def _error_curves(results: Results, dataset: str, base: str) -> dict[tuple[str, str], dict[Row, Sequence[float]]]:
+    """Curves by row, by reference and kind of threshold: the base alone first, then UfM."""
+    curves: dict[tuple[str, str], dict[Row, Sequence[float]]] = {}
     for row in results.default_rows(base):
         merged = results.merged.get((dataset, row))
         for name, values in (merged.curves if merged else {}).items():
-            reference = name.removeprefix(f"{BY_ERROR}:")
-            if reference != name and np.isfinite(values).any() and Method.parse(reference).base == base:
-                curves.setdefault(reference, {})[row] = values
-    return dict(sorted(curves.items(), key=lambda item: (item[0].startswith("UfM"), item[0])))
+            kind, _, reference = name.partition(":")
+            known = kind in (BY_ERROR, BY_ERROR_OF_ALL) and np.isfinite(values).any()
+            if known and Method.parse(reference).base == base:
+                curves.setdefault((reference, kind), {})[row] = values
+    return dict(sorted(curves.items(), key=lambda item: (item[0][0].startswith("UfM"), item[0])))
 
 
 # ---- the paper's figure of predictive entropy ----
 
 
+class Histogram(NamedTuple):
+    """Pixels by their entropy: ``counts`` [bins + 2], those below and above ``edges`` [bins + 1] first and last [nats],
+    and the mean entropy over V > 0."""
+
+    counts: NDArray[np.float64]
+    edges: NDArray[np.float64]
+    mean: float
+
+    @property
+    def density(self) -> NDArray[np.float64]:
+        """[bins] share of all pixels per nat."""
+        return np.asarray(self.counts[1:-1] / self.counts.sum() / np.diff(self.edges))
+
+
+def entropies(results: Results, base: str) -> dict[str, dict[Row, Histogram]]:
+    """The histogram of each row over the sequences of an environment, in the paper's order of environments."""
+    records: dict[str, dict[Row, list[Record]]] = {}
+    for row in results.default_rows(base):
+        for record in results.of(row):
+            if sum(record.curves.get("entropy_counts", ())) > 0:
+                records.setdefault(environment_of(record), {}).setdefault(row, []).append(record)
+    order = [*ENVIRONMENTS, *sorted(records.keys() - ENVIRONMENTS.keys())]
+    return {name: {row: _histogram(r) for row, r in records[name].items()} for name in order if name in records}
+
+
+def _histogram(records: Sequence[Record]) -> Histogram:
+    counts = np.array([record.curves["entropy_counts"] for record in records], np.float64)
+    pixels, means = counts[:, 1:].sum(1), np.array([value_of(record, "entropy") for record in records])
+    mean = float(np.nansum(pixels * means) / pixels.sum()) if pixels.any() else math.nan
+    return Histogram(counts.sum(0), np.array(records[0].curves["entropy_edges"]), mean)
+
+
 def draw_entropy(results: Results, base: str) -> Any | None:
-    """Data sets below each other on one axis; None where no row of the base has a variance."""
-    panels: dict[str, dict[Row, Merged]] = {}
-    for dataset in results.datasets:
-        for row in results.default_rows(base):
-            merged = results.merged.get((dataset, row))
-            if merged is not None and sum(merged.curves.get("entropy_counts", ())) > 0:
-                panels.setdefault(dataset, {})[row] = merged
+    """Environments (indoor, forest, driving, city) below each other on one axis; None where no row of the base has a
+    variance."""
+    panels = entropies(results, base)
     if not panels:
         return None
-    figure = style.new_figure(7.6, 1.0 + 2.1 * len(panels), f"Predictive entropy by data set, {BASES[base][0]}")
+    figure = style.new_figure(7.6, 1.0 + 2.1 * len(panels), f"Predictive entropy by environment, {BASES[base][0]}")
     axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True)[:, 0]
-    low, high = entropy_range([merged for rows in panels.values() for merged in rows.values()])
-    for panel, (dataset, rows) in zip(axes, panels.items(), strict=True):
+    low, high = entropy_range([histogram for rows in panels.values() for histogram in rows.values()])
+    for panel, (environment, rows) in zip(axes, panels.items(), strict=True):
         panel.set_xlim(low, high)
         _draw_histograms(panel, rows)
-        style.finish(panel, title=dataset, y="share of pixels per nat")
+        style.finish(panel, title=environment, y="share of pixels per nat")
     axes[-1].set_xlabel("entropy ½ ln(2πeV) [nats]", size=style.LABEL, color=INK)
     _sigma_axis(axes[0], low, high)
     return figure
 
 
-def entropy_range(merged: Sequence[Merged]) -> tuple[float, float]:
+def entropy_range(histograms: Sequence[Histogram]) -> tuple[float, float]:
     """Between the first and the last bin with more than a thousandth of some row's pixels, and half a nat around."""
-    edges = np.array(merged[0].curves["entropy_edges"])
-    counts = np.array([one.curves["entropy_counts"] for one in merged])
-    filled = np.flatnonzero((counts / counts.sum(1, keepdims=True))[:, 1:-1].max(0) > 0.001)
+    edges = histograms[0].edges
+    shares = np.array([histogram.counts / histogram.counts.sum() for histogram in histograms])
+    filled = np.flatnonzero(shares[:, 1:-1].max(0) > 0.001)
     if not len(filled):
         return float(edges[0]), float(edges[-1])
     return max(edges[filled[0]] - 0.5, float(edges[0])), min(edges[filled[-1] + 1] + 0.5, float(edges[-1]))
 
 
-def density(merged: Merged) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """[bins] share of all pixels per nat, and [bins + 1] the bins' edges [nats]."""
-    counts, edges = np.array(merged.curves["entropy_counts"]), np.array(merged.curves["entropy_edges"])
-    return counts[1:-1] / counts.sum() / np.diff(edges), edges
-
-
-def _draw_histograms(axes: Any, rows: Mapping[Row, Merged]) -> None:
+def _draw_histograms(axes: Any, rows: Mapping[Row, Histogram]) -> None:
     """Histograms, and the mean of each as a dashed line with its name beside."""
-    for number, (row, merged) in enumerate(rows.items()):
+    for number, (row, histogram) in enumerate(rows.items()):
         look = style.look_of(row.method)
-        heights, edges = density(merged)
-        axes.stairs(heights, edges, color=look.colour, linewidth=1.5, label=look.name)
+        axes.stairs(histogram.density, histogram.edges, color=look.colour, linewidth=1.5, label=look.name)
         if row.method.fusion == UFM_STAR and not row.method.full:
-            axes.stairs(heights, edges, color=look.colour, alpha=0.15, fill=True)
-        mean, counts = merged.figures["entropy"], merged.curves["entropy_counts"]
-        axes.axvline(mean, color=look.colour, linestyle="--", linewidth=1.1)
+            axes.stairs(histogram.density, histogram.edges, color=look.colour, alpha=0.15, fill=True)
+        axes.axvline(histogram.mean, color=look.colour, linestyle="--", linewidth=1.1)
         # Pixels below the histogram: V = 0 above all.
-        below = counts[0] / sum(counts)
+        below = histogram.counts[0] / histogram.counts.sum()
         remark = "" if below < 0.005 else f"\n({100 * below:.0f} % with hardly any V)"
-        words = f"{look.name}: mean {mean:.2f}{remark}"
+        words = f"{look.name}: mean {histogram.mean:.2f}{remark}"
         axes.text(
             1.02, 0.95 - 0.13 * number, words, color=look.colour, size=style.TICK, va="top", transform=axes.transAxes
         )

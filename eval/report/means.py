@@ -10,7 +10,7 @@ from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.names import LOWER, Quantity
+from ufmstar_torch.eval.report.names import LOWER, NO_MATCH, NO_SEGMENT, Quantity
 from ufmstar_torch.eval.suite.record import Record
 
 # Student's interval of fewer values rests on a normal distribution, which nobody checked: no interval is given.
@@ -24,15 +24,10 @@ class Mean(NamedTuple):
     half: float = math.nan  # half-width of its 95 % confidence interval, NaN below MIN_SEQUENCES
     sequences: int = 0  # that have the figure
 
-    @property
-    def beyond(self) -> bool:
-        """Whether 0 lies outside the interval; False where there is no interval."""
-        return abs(self.value) > self.half
-
     def better(self, quantity: Quantity) -> bool | None:
-        """Whether a difference beyond its interval is an improvement; None within the interval, or where neither
-        direction is better."""
-        if not self.beyond or quantity.better is None:
+        """Whether a difference beyond its interval is an improvement; None within the interval, without one, or where
+        neither direction is better."""
+        if not abs(self.value) > self.half or quantity.better is None:
             return None
         return (self.value < 0) == (quantity.better == LOWER)
 
@@ -44,6 +39,8 @@ def value_of(record: Record, key: str) -> float:
         parts = [record.ms.get(part) for part in ("network", "uncertainty")] + [record.ms.get("anchors", 0.0)]
         # Predictions from the cache were not timed: without them there is no sum.
         return math.nan if None in parts else math.fsum(float(part) for part in parts if part is not None)
+    if key in (NO_SEGMENT.key, NO_MATCH.key):  # as a share
+        return record.frames.get(name, math.nan) / max(1, record.frames.get("done", 0))
     value = {"": record.figures, "state": record.state, "ms": record.ms, "frames": record.frames}[group].get(name)
     return math.nan if value is None else float(value)
 

@@ -17,59 +17,56 @@ class Quantity:
     """A figure, its name and unit in tables and figures."""
 
     key: str  # of Record.figures, or "state.bytes_mean", "ms.network", "frames.done" for the others
-    name: str  # in Markdown and in figures
-    latex: str
+    name: str
     decimals: int | None  # None = three significant digits
     better: str | None = None  # "lower", "higher", or None where neither is
     unit: str = ""
     factor: float = 1.0  # by which the recorded value is multiplied to have that unit
 
-    def with_unit(self, name: str) -> str:
-        """A name with the unit: "RMSE [m]"."""
-        return f"{name} [{self.unit}]" if self.unit else name
+    @property
+    def label(self) -> str:
+        """The name with its unit: "RMSE [m]"."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     @property
     def heading(self) -> str:
-        """For a column, with an arrow the better way: "RMSE [m] ↓"."""
-        arrow = {LOWER: " ↓", HIGHER: " ↑", None: ""}[self.better]
-        return f"{self.with_unit(self.name)}{arrow}"
-
-    @property
-    def latex_heading(self) -> str:
-        """The same in LaTeX."""
-        arrow = {LOWER: r" $\downarrow$", HIGHER: r" $\uparrow$", None: ""}[self.better]
-        unit = self.unit.replace("%", r"\%").replace("²", "$^2$")
-        return f"{self.latex}{f' [{unit}]' if unit else ''}{arrow}"
+        """The label with an arrow the better way: "RMSE [m] ↓"."""
+        return f"{self.label}{ {LOWER: ' ↓', HIGHER: ' ↑', None: ''}[self.better] }"
 
 
-DELTA1 = Quantity("delta1", "δ₁", r"$\delta_1$", 3, HIGHER)
-NLL = Quantity("nll", "NLL", "NLL", 2, LOWER)
-ECE_DELTA = Quantity("ece_delta", "ECE_δ", r"ECE$_{\delta}$", 3, LOWER)
-ECE_Q = Quantity("ece_q", "ECE_q", r"ECE$_{q}$", 3, LOWER)
-STATE = Quantity("state.bytes_mean", "state", "State", None, None, "MB", 1e-6)
-SPEARMAN = Quantity("spearman", "Spearman", "Spearman", 2, HIGHER)
-AUSE = Quantity("ause_rmse", "AUSE", "AUSE", 3, LOWER, "m")
-UNCERTAINTY_MS = Quantity("ms.uncertainty", "uncertainty", "Uncertainty", 1, None, "ms")
-NETWORK_MS = Quantity("ms.network", "network", "Network", 1, None, "ms")
-TOTAL_MS = Quantity("ms.total", "time per frame", "Time per frame", 1, None, "ms")
+DELTA1 = Quantity("delta1", "δ₁", 3, HIGHER)
+NLL = Quantity("nll", "NLL", 2, LOWER)
+ECE_DELTA = Quantity("ece_delta", "ECE_δ", 3, LOWER)
+ECE_Q = Quantity("ece_q", "ECE_q", 3, LOWER)
+STATE = Quantity("state.bytes_mean", "state", None, None, "MB", 1e-6)
+SPEARMAN = Quantity("spearman", "Spearman", 2, HIGHER)
+AUSE = Quantity("ause_rmse", "AUSE", 3, LOWER, "m")
+UNCERTAINTY_MS = Quantity("ms.uncertainty", "uncertainty", 1, None, "ms")
+NETWORK_MS = Quantity("ms.network", "network", 1, None, "ms")
+TOTAL_MS = Quantity("ms.total", "time per frame", 1, None, "ms")
+# Shares of UfM*'s frames: without a segment; after the first, without a segment that met a component.
+NO_SEGMENT = Quantity("frames.without_segment", "no segment", 1, None, "%", 100.0)
+NO_MATCH = Quantity("frames.without_match", "no match", 1, None, "%", 100.0)
 
-# What uncertainty costs, where it was measured.
-ENERGY = Quantity("energy_mj", "energy", "Energy", None, LOWER, "mJ")
-MEMORY = Quantity("memory_mb", "memory", "Memory", None, LOWER, "MB")
+# The cost of uncertainty, where it was measured.
+ENERGY = Quantity("energy_mj", "energy", None, LOWER, "mJ")
+MEMORY = Quantity("memory_mb", "memory", None, LOWER, "MB")
 
 # The paper's columns, and those that the field expects beside them.
 MAIN = (DELTA1, NLL, ECE_DELTA, ECE_Q, STATE)
 EXTRA = (
-    Quantity("delta1_ratio", "δ₁ (ratio)", r"$\delta_1$ (ratio)", 3, HIGHER),
-    Quantity("abs_rel", "AbsRel", "AbsRel", 3, LOWER),
-    Quantity("rmse", "RMSE", "RMSE", 3, LOWER, "m"),
+    Quantity("delta1_ratio", "δ₁ (ratio)", 3, HIGHER),
+    Quantity("abs_rel", "AbsRel", 3, LOWER),
+    Quantity("rmse", "RMSE", 3, LOWER, "m"),
     AUSE,
-    Quantity("aurg_rmse", "AURG", "AURG", 3, HIGHER, "m"),
+    Quantity("aurg_rmse", "AURG", 3, HIGHER, "m"),
     SPEARMAN,
-    Quantity("overconfidence", "overconfidence", "Overconfidence", 3),
-    Quantity("entropy", "entropy", "Entropy", 2, None, "nats"),
-    Quantity("left_out_share", "no depth", "No depth", 1, None, "%", 100.0),
-    Quantity("nll_left_out_share", "no NLL", "No NLL", 1, None, "%", 100.0),
+    Quantity("overconfidence", "overconfidence", 3),
+    Quantity("entropy", "entropy", 2, None, "nats"),
+    Quantity("left_out_share", "no depth", 1, None, "%", 100.0),
+    Quantity("nll_left_out_share", "no NLL", 1, None, "%", 100.0),
+    NO_SEGMENT,
+    NO_MATCH,
     NETWORK_MS,
     UNCERTAINTY_MS,
 )

@@ -7,24 +7,26 @@ import io
 import json
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.efficiency import efficiency_tables, paper_efficiency_tables
+from ufmstar_torch.eval.report.efficiency import efficiency_tables
 from ufmstar_torch.eval.report.means import MIN_SEQUENCES
+from ufmstar_torch.eval.report.names import row_labels
 from ufmstar_torch.eval.report.pictures import Picture
 from ufmstar_torch.eval.report.tables import overview, sequence_tables
 from ufmstar_torch.eval.run.files import write_atomic
 
 PAGE = "report.html"
 TEMPLATES = Path(__file__).parent / "templates"
-# Of WebP: below it letters in pictures get visible rings.
+# WebP's; with less, letters in pictures get visible rings.
 QUALITY = 84
 # Kinds of figures, the first words of their files' names, by the part of the page in which they stand.
 CURVES, COST = ("calibration", "error", "entropy", "sweep"), ("latency", "tradeoff")
+_IDLE = ("data set", "row", "frames", "without a segment", "without a match")
 
 
 def write_page(
@@ -38,10 +40,7 @@ def write_page(
         ImportError: Pillow or Jinja2 is missing.
     """
     main, *further = overview(results).values()
-    measured = results.efficiency
-    cost = []
-    if measured is not None:
-        cost = [*efficiency_tables(measured), *paper_efficiency_tables(row["network"] for row in measured["rows"])]
+    cost = [] if results.efficiency is None else efficiency_tables(results.efficiency)
     folder = results.out / "figures"
     text = _template().render(
         results=results,
@@ -119,6 +118,7 @@ def limits(results: Results, undrawn: Mapping[str, str]) -> list[tuple[str, tupl
     where = ("data set", "sequence")
     tables: list[tuple[str, tuple[str, ...], list[tuple[str, ...]]]] = [
         ("Sequences that failed", (*where, "reason"), [(f.dataset, f.sequence, f.reason) for f in results.failed]),
+        ("Frames in which UfM* compared no views", _IDLE, list(_idle(results))),
         ("Frames that were skipped", (*where, "frames", "used", "reasons"), list(skipped)),
         ("Rows not evaluated yet", (*where, "rows"), [(*key, str(n)) for key, n in missing.items()]),
         ("Rows without a network", ("kind of network",), [(b,) for b in results.about.get("missing_bases") or ()]),
@@ -126,6 +126,16 @@ def limits(results: Results, undrawn: Mapping[str, str]) -> list[tuple[str, tupl
         ("Further problems", ("problem",), [(note,) for note in results.notes]),
     ]
     return [table for table in tables if table[2]]
+
+
+def _idle(results: Results) -> Iterator[tuple[str, ...]]:
+    """Rows of UfM* with frames without a segment or match, with their numbers over a data set."""
+    for row, label in row_labels(results.rows).items():
+        for dataset in results.datasets:
+            frames = [record.frames for record in results.of(row, dataset)]
+            counts = [sum(f.get(key, 0) for f in frames) for key in ("done", "without_segment", "without_match")]
+            if any(counts[1:]):
+                yield dataset, label, *map(str, counts)
 
 
 def _made(results: Results) -> dict[str, Any]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from hashlib import sha256
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from ufmstar_torch.eval.report.examples import Example, find_examples
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.report.rooms import Snapshot, choose_times, draw_room, find_rooms
 from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
-from ufmstar_torch.eval.run.panels import Bar, Box, GridRow, Panel, PanelScales, draw_grid
+from ufmstar_torch.eval.run.panels import Bar, Box, GridRow, Panel, draw_grid
 from ufmstar_torch.eval.suite.work_items import WorkItem
 
 STRIP, BREAKDOWN, COMPARE, ROOM = "strip", "breakdown", "compare", "room"
@@ -37,12 +37,10 @@ DIFFERENCE_MAP = "RdBu_r"
 ZOOM = 1 / 3
 
 
-@dataclass(frozen=True)
-class Picture:
-    """One picture, as pictures.json lists it."""
+class Picture(NamedTuple):
+    """One picture and its words."""
 
     file: str  # name within the figures' folder
-    kind: str  # "strip", "breakdown", "compare" or "room"
     title: str
     caption: str  # how to read it
     alt: str  # for a reader who cannot see it
@@ -140,7 +138,7 @@ def _picture(example: Example, rows: Sequence[str], kind: str, base: str, title:
     listed = ", ".join(f"{label} ({'no NLL' if nll is None else f'mean NLL {nll:.2f}'})" for label, nll in means)
     name = file_name(kind, example.dataset, example.sequence, example.frame, *filter(None, (base,)))
     title = f"{example.sequence}, frame {example.frame}: {title}"
-    return Picture(name, kind, title, caption, f"{title}; {listed}")
+    return Picture(name, title, caption, f"{title}; {listed}")
 
 
 def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequence[Snapshot]) -> Picture:
@@ -148,11 +146,18 @@ def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequenc
     counts = " then ".join(str(len(snapshot.mean)) for snapshot in snapshots)
     caption = (
         "Each Gaussian is an ellipse as large as the patch it stands for. What lies above the camera (the ceiling) is "
-        "left out. Black: seen from one view only, or no disagreement. Blue: the camera's path."
+        "left out. Grey: seen from one view only. Black: no disagreement. Blue: the camera's path."
     )
     title = f"{sequence}: the Gaussians of {label}"
     alt = f"{title}: {counts} Gaussians, coloured by disagreement from 0 to {scale.high:.2g} m"
-    return Picture(name, ROOM, title, caption, alt)
+    return Picture(name, title, caption, alt)
+
+
+class PanelScales(NamedTuple):
+    """The colour scales of a frame's pictures: of depth, and of sigma and error together."""
+
+    depth: ColourScale
+    length: ColourScale
 
 
 def fit_strip_scales(example: Example, rows: Sequence[str]) -> PanelScales:
@@ -193,12 +198,11 @@ def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Pictu
     body = []
     for row in rows:
         maps = example.rows[row]
-        parts = [
-            Panel(None if part is None else scales.length.rgb(maps.root(part)), absent="none")
-            for part in (maps.aleatoric, maps.epistemic, maps.disagreement)
-        ]
+        parts = (maps.aleatoric, maps.epistemic, maps.disagreement)
+        a, e, m = (None if part is None else scales.length.rgb(maps.root(part)) for part in parts)
+        panels = [Panel(rgb, absent="none") for rgb in (a, e, None if m is None else maps.striped(m))]
         error, sigma, nll = _judged(example, row, scales)
-        body.append(GridRow(example.label(row), figures_of(example, row), [*parts, sigma, error, nll]))
+        body.append(GridRow(example.label(row), figures_of(example, row), [*panels, sigma, error, nll]))
     captions = ("√A, aleatoric", "√E, epistemic", "√M, between views", "σ = √V, V = A + E + M", "|error|", "NLL")
     body[0] = body[0].captioned(captions)
     bars = [Bar("√A, √E, √M, σ and |error| [m]", scales.length, 0, span=5), Bar("NLL [nats]", NLL_SCALE, 5)]
@@ -222,8 +226,8 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
     maps = {
         "image": example.image,
         f"|error| of {example.label(ufm_star)}": scales.length.rgb(example.error(ufm_star)),
-        f"σ, {example.label(ufm)}": scales.length.rgb(old),
-        f"σ, {example.label(ufm_star)}": scales.length.rgb(new),
+        f"σ, {example.label(ufm)}": example.rows[ufm].striped(scales.length.rgb(old)),
+        f"σ, {example.label(ufm_star)}": example.rows[ufm_star].striped(scales.length.rgb(new)),
         "difference of σ": signed.rgb(difference),
     }
     boxes = [_scaled(box, old.shape, picture.shape) for picture in maps.values()]
@@ -268,7 +272,8 @@ def _scaled(box: Box, shape: tuple[int, ...], picture: tuple[int, ...]) -> Box:
 
 def _judged(example: Example, row: str, scales: PanelScales) -> tuple[Panel, Panel, Panel]:
     """|error|, sigma and NLL of a row."""
-    error, sigma = scales.length.rgb(example.error(row)), scales.length.rgb(example.rows[row].sigma)
+    maps = example.rows[row]
+    error, sigma = scales.length.rgb(example.error(row)), maps.striped(scales.length.rgb(maps.sigma))
     return Panel(error), Panel(sigma), Panel(NLL_SCALE.rgb(example.nll(row)))
 
 

@@ -23,7 +23,7 @@ HEADROOM = 0.3
 MOST_TIMES = 4
 ELEVATION = 35.0  # degrees
 _PATH = "#00a6d6"
-_STORED = ("mean_world", "covariance_world", "disagreement", "T_world_cam")
+_STORED = ("mean_world", "covariance_world", "disagreement", "count", "T_world_cam")
 _CELL, _LEFT, _TOP, _BOTTOM = 3.1, 0.1, 0.62, 0.66  # inches
 
 
@@ -35,18 +35,19 @@ class Snapshot:
     mean: Array  # [K, 3] [m]
     covariance: Array  # [K, 3, 3] [m^2]
     disagreement: Array  # [K] m [m^2]
+    count: Array  # [K] views
     T_world_cam: Array  # [4, 4]
     path: Array  # [n, 3] where the camera has been until then [m]; n may be 1
 
     @property
     def root(self) -> Array:
-        """[K] sqrt(m) [m]."""
-        root: Array = np.sqrt(np.maximum(self.disagreement, 0))
+        """[K] sqrt(m) [m], NaN of what was seen from one view only."""
+        root: Array = np.where(self.count > 1, np.sqrt(np.maximum(self.disagreement, 0)), np.nan)
         return root
 
     def take(self, chosen: NDArray[Any]) -> Snapshot:
         """The snapshot with the Gaussians chosen by an index or a mask."""
-        kept = {name: getattr(self, name)[chosen] for name in ("mean", "covariance", "disagreement")}
+        kept = {name: getattr(self, name)[chosen] for name in ("mean", "covariance", "disagreement", "count")}
         return replace(self, **kept)
 
 
@@ -60,9 +61,9 @@ def find_rooms(folder: Path) -> dict[str, list[Snapshot]]:
         if row and frame:
             stored = load_arrays(file, _STORED)
             arrays = {name: stored[name].astype(np.float64) for name in (*_STORED, "path") if name in stored}
-            mean, covariance, disagreement, T = (arrays[name] for name in _STORED)
+            *gaussians, T = (arrays[name] for name in _STORED)
             path = arrays.get("path", T[None, :3, 3])
-            rooms.setdefault(row, []).append(Snapshot(frame, mean, covariance, disagreement, T, path))
+            rooms.setdefault(row, []).append(Snapshot(frame, *gaussians, T, path))
     return rooms
 
 

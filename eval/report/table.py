@@ -46,7 +46,11 @@ class Column(NamedTuple):
 
     group: str
     name: str
-    latex: str
+
+    @property
+    def label(self) -> str:
+        """The heading where there is none above: "Paper: NLL"."""
+        return f"{self.group}: {self.name}" if self.group else self.name
 
 
 class Line(NamedTuple):
@@ -59,8 +63,7 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A table. Bold means one thing: the best value of a block. Raises ValueError: a line has another number of cells
-    than there are columns."""
+    """A table. Bold means one thing: the best value of a block."""
 
     name: str  # of its files
     title: str
@@ -68,12 +71,6 @@ class Table:
     columns: Sequence[Column]
     lines: Sequence[Line]
     notes: Sequence[str] = ()
-
-    def __post_init__(self) -> None:
-        for line in self.lines:
-            if len(line.cells) != len(self.columns):
-                counts = f"{len(line.cells)} cells for {len(self.columns)} columns"
-                raise ValueError(f"{self.name}: {line.label} has {counts}")
 
     @property
     def blocks(self) -> Iterator[list[Line]]:
@@ -124,7 +121,7 @@ def mark_best(cells: Sequence[Cell], quantity: Quantity | None) -> list[Cell]:
 
 def markdown(table: Table) -> str:
     """The table under its title, with its notes below."""
-    rows = [[table.first, *(column.name for column in table.columns)], ["---", *("---:" for _ in table.columns)]]
+    rows = [[table.first, *(column.label for column in table.columns)], ["---", *("---:" for _ in table.columns)]]
     rows += [[markdown_text(line.label), *map(_markdown_cell, line.cells)] for line in table.lines]
     body = "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
     notes = "\n".join(f"- {markdown_text(note)}" for note in table.notes)
@@ -163,7 +160,7 @@ _LATEX = {
 
 def latex(table: Table) -> str:
     """The table for booktabs, with title and notes as its caption."""
-    heads: Any = [(latex_text(column.group), column.latex) for column in table.columns]
+    heads: Any = [(latex_text(column.group), _latex_name(column.name)) for column in table.columns]
     heads = pd.MultiIndex.from_tuples(heads) if table.groups else [name for _, name in heads]
     frame = pd.DataFrame(
         [[_latex_cell(cell) for cell in line.cells] for line in table.lines],
@@ -188,6 +185,14 @@ def latex_text(text: str) -> str:
     return "".join(_LATEX.get(character, character) for character in text)
 
 
+def _latex_name(name: str) -> str:
+    """A heading as LaTeX: the letter behind "_" becomes an index."""
+    first, *rest = name.split("_")
+    return latex_text(first) + "".join(
+        f"$_{{{latex_text(part[0]).strip('$')}}}${latex_text(part[1:])}" for part in rest
+    )
+
+
 def _latex_cell(cell: Cell) -> str:
     if not cell.value:
         return "--"
@@ -209,11 +214,9 @@ def table_csv(tables: Iterable[Table]) -> str:
             "table": [table.title] * len(table.lines), table.first: [line.label for line in table.lines],
         }  # fmt: skip
         for column, cells in zip(table.columns, zip(*(line.cells for line in table.lines), strict=True), strict=True):
-            grouped = column.name.lower().startswith(column.group.lower())
-            name = column.name if grouped else f"{column.group}: {column.name}"
-            columns[name] = [cell.value for cell in cells]
+            columns[column.label] = [cell.value for cell in cells]
             if any(cell.half for cell in cells):
-                columns[f"{name} ±"] = [cell.half for cell in cells]
+                columns[f"{column.label} ±"] = [cell.half for cell in cells]
         frames.append(pd.DataFrame(columns, dtype=object))
     return pd.concat(frames).map(csv_text).to_csv(index=False, lineterminator="\n")
 

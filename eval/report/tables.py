@@ -11,7 +11,7 @@ import pandas as pd
 
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.report.data import FORMAT, Results
-from ufmstar_torch.eval.report.efficiency import efficiency_tables, paper_efficiency_tables
+from ufmstar_torch.eval.report.efficiency import efficiency_tables
 from ufmstar_torch.eval.report.means import (
     MIN_SEQUENCES,
     Mean,
@@ -22,7 +22,18 @@ from ufmstar_torch.eval.report.means import (
     references,
     value_of,
 )
-from ufmstar_torch.eval.report.names import DIFFERENCES, ENERGY, EXTRA, MAIN, MEMORY, Quantity, row_labels, shared_words
+from ufmstar_torch.eval.report.names import (
+    DIFFERENCES,
+    ENERGY,
+    EXTRA,
+    MAIN,
+    MEMORY,
+    NO_MATCH,
+    NO_SEGMENT,
+    Quantity,
+    row_labels,
+    shared_words,
+)
 from ufmstar_torch.eval.report.paper import PaperTable, paper_table_of
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, csv_text, latex, mark_best, markdown, table_csv
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
@@ -69,10 +80,7 @@ def difference_table(results: Results, dataset: str | None = None) -> Table:
                 figures = map(_difference_cell, means, DIFFERENCES)
                 block = blocks.setdefault(row.method.base, len(blocks))
                 lines.append(Line(block, f"{labels[row]} – {labels[reference]}", (Cell(str(count)), *figures)))
-    columns = [
-        Column("", "sequences", "Sequences"),
-        *(Column("", f"Δ {q.heading}", rf"$\Delta$ {q.latex_heading}") for q in DIFFERENCES),
-    ]
+    columns = [Column("", "sequences"), *(Column("", f"Δ {q.heading}") for q in DIFFERENCES)]
     note = (
         "Mean over sequences of row – reference on the same sequence, with its 95 % confidence interval (from "
         f"{MIN_SEQUENCES} sequences on); better and worse: beyond the interval."
@@ -102,7 +110,7 @@ def _means(
     alike = len({frozenset((r.dataset, r.sequence) for r in listed) for listed in records.values()}) == 1
     group = "Ours" if quoted else ""
     columns = _figures(records, quantities, group)
-    notes = [_network_note(results), _prepared_note(records), _interval_note(records)]
+    notes = [_network_note(results), _prepared_note(records), _interval_note(records), *_idle_notes(records)]
     costs = _costs(results.efficiency, records, group) if name == "main" and results.efficiency else []
     if any(cell.value for column in costs for cell in column.cells.values()):
         columns += costs
@@ -110,7 +118,7 @@ def _means(
     if not alike:
         counts = {row: Cell(str(len(listed))) for row, listed in records.items()}
         unmarked = (column._replace(quantity=None) for column in columns)
-        columns = [_Figures(Column(group, "sequences", "Sequences"), counts), *unmarked]
+        columns = [_Figures(Column(group, "sequences"), counts), *unmarked]
         notes.append("The rows are means over different sequences, so none is marked as the best.")
     if quoted:
         columns += _quoted(quoted, records)
@@ -126,7 +134,7 @@ def _figures(records: Mapping[Row, Sequence[Record]], quantities: Sequence[Quant
 
 def _column(quantity: Quantity, group: str, means: Mapping[Row, Mean]) -> _Figures:
     cells = {row: Cell.of(mean, quantity.decimals) for row, mean in means.items()}
-    return _Figures(Column(group, quantity.heading, quantity.latex_heading), cells, quantity)
+    return _Figures(Column(group, quantity.heading), cells, quantity)
 
 
 def _costs(efficiency: Mapping[str, Any], records: Mapping[Row, Sequence[Record]], group: str) -> list[_Figures]:
@@ -150,8 +158,7 @@ def _quoted(quoted: PaperTable, rows: Iterable[Row]) -> list[_Figures]:
     theirs = {row: quoted.rows.get(row.method.name, {}) for row in plain_rows(rows)}
     columns = []
     for key in quoted.columns:
-        q = _PAPER_COLUMNS[key]
-        head = Column("Paper", f"paper: {q.with_unit(q.name)}", q.with_unit(q.latex))
+        head = Column("Paper", _PAPER_COLUMNS[key].label)
         columns.append(_Figures(head, {row: cells[key] for row, cells in theirs.items() if key in cells}))
     return columns
 
@@ -205,6 +212,15 @@ def _interval_note(records: Mapping[Row, Sequence[Record]]) -> str:
     )
 
 
+def _idle_notes(records: Mapping[Row, Sequence[Record]]) -> Iterator[str]:
+    """A note on every row of UfM* that compared no views in most frames."""
+    for row, label in row_labels(records).items():
+        segment, match = (mean_of(records[row], quantity).value for quantity in (NO_SEGMENT, NO_MATCH))
+        if match >= 50:
+            frames = f"{segment:.0f} % of its frames have no segment, {match:.0f} % no match"
+            yield f"{label} compared no views in most frames: {frames}."
+
+
 def _cost_note(efficiency: Mapping[str, Any]) -> str:
     used = set(efficiency["devices"]["units"].values())
     missing = "; ".join(dict.fromkeys(why for unit, why in efficiency["power"]["missing"].items() if unit in used))
@@ -250,8 +266,7 @@ def _table_files(results: Results) -> Iterator[tuple[str, list[Table]]]:
     for dataset in results.datasets:
         yield f"sequences-{dataset}", sequence_tables(results, dataset)
     if results.efficiency is not None:
-        networks = (row["network"] for row in results.efficiency["rows"])
-        yield "efficiency", [*efficiency_tables(results.efficiency), *paper_efficiency_tables(networks)]
+        yield "efficiency", efficiency_tables(results.efficiency)
 
 
 def write_tidy(results: Results) -> list[Path]:

@@ -77,6 +77,13 @@ def known_where(condition: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[n
     return np.where(condition, values, np.nan).astype(np.float32)
 
 
+def striped(rgb: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A picture [h, w, 3] with diagonal grey stripes over the pixels ``where`` [h, w]: a third of them."""
+    third = max(2, len(rgb) // 110)
+    across = np.add.outer(np.arange(where.shape[0]), np.arange(where.shape[1])) // third % 3 == 0
+    return np.where((where & across)[..., None], np.uint8(INVALID_GREY), rgb)
+
+
 def robust_range(maps: Iterable[NDArray[Any]], *, from_zero: bool) -> tuple[float, float]:
     """The 1st to 99th percentile [m] over all finite pixels of several maps, low < high; (0, 1) without a pixel.
 

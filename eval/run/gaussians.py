@@ -40,7 +40,8 @@ def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_fir
     nx ny nz (the shortest axis), f_dc_0..2 (colour, see below), opacity (logit), scale_0..2 = ln sigma
     [ln m], rot_0..3 = unit quaternion w x y z, so that Sigma = R diag(exp(scale))^2 R^T. WriterThread them our
     own: weight [px], disagreement [m^2], count.
-    The colour is sqrt(disagreement) in magma from 0 to its 99th percentile, which the header states.
+    The colour is sqrt(disagreement) in magma from 0 to its 99th percentile, which the header states; grey where it was
+    seen from one view alone, so that its disagreement of 0 compares nothing.
 
     Args:
         path: the file; its folder must exist.
@@ -142,9 +143,10 @@ class _Components:
         self.axes: NDArray[np.float64] = R @ axes
         self.sigma: NDArray[np.float64] = np.sqrt(np.maximum(variance, SIGMA_FLOOR**2))
         root = np.sqrt(np.maximum(self.disagreement, 0))
+        root[self.count < 2] = np.nan
         scale = ColourScale(*robust_range([root], from_zero=True), ERROR_MAP)
         self.colour = scale.rgb(root)
-        self.legend = f"colour: sqrt(disagreement), {ERROR_MAP} from 0 to {scale.high:.4g} m"
+        self.legend = f"colour: sqrt(disagreement), {ERROR_MAP} from 0 to {scale.high:.4g} m; grey: seen from one view"
 
 
 def _rotation_translation(T: Tensor | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from ufmstar_torch.anchors.landmarks import LandmarkSource
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.eval.check.image_fit import FollowedCorners, ImageFit, image_fit, track_corners
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
 from ufmstar_torch.eval.engine.estimators import Gaussians
 from ufmstar_torch.eval.engine.judge import UFM
@@ -20,6 +22,7 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.setting import TRACKED, Setting
 from ufmstar_torch.eval.run.run_folder import Checkpoint
+from ufmstar_torch.eval.run.scale import NetworkScale
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
@@ -41,6 +44,17 @@ class RunJob:
     sheet: bool = True  # whether to make contact_sheet.png
     # makes the source of the anchors, in its initial state; for ``config.anchors``.
     landmarks: Callable[[], LandmarkSource] = LandmarkTracker
+    scale: NetworkScale | None = None  # of the poses, where it is the network's own; anchors then show shape alone
+
+    @cached_property
+    def corners(self) -> list[FollowedCorners]:
+        """Corners tracked over some of the frames."""
+        return track_corners(self.sequence, self.indices)
+
+    @cached_property
+    def image_fit(self) -> ImageFit | None:
+        """How poses and intrinsics fit the images; None where no corner could be followed."""
+        return image_fit(self.sequence, self.corners)
 
     def row(self, checkpoint: Checkpoint) -> RowRunner:
         """UfM* on the source, in the state of a checkpoint."""
@@ -76,6 +90,8 @@ class RunJob:
         for index in self.indices:
             entry = sequence.entries[index]
             digest.update(entry.name.encode() + entry.T_world_cam.tobytes())
+            if entry.intrinsics is not None:
+                digest.update(entry.intrinsics.tobytes())
         return {
             "sequence": {
                 "name": sequence.name,

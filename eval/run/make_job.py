@@ -17,8 +17,10 @@ from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.run.job import RunJob
+from ufmstar_torch.eval.run.scale import network_scale, require_metric
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+from ufmstar_torch.eval.sequences.open import scale_poses
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.recalibrate import Recalibration, beside
 
@@ -40,11 +42,17 @@ def make_job(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameS
     """
     if not sequence.posed:
         raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
-    landmarks = _landmarks(options["anchors"] or DENSE, sequence) if config.anchors else LandmarkTracker
     indices = range(len(sequence))[parse_slice(options["frames"])]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")
+    scale = None
+    if options["scale_from"] is None:
+        require_metric(sequence)
     source = _source(options, sequence, indices)
+    if options["scale_from"] is not None:
+        scale = network_scale(sequence, source, indices)
+        sequence = scale_poses(sequence, scale.metres)
+    landmarks = _landmarks(options["anchors"] or DENSE, sequence) if config.anchors else LandmarkTracker
     return RunJob(
         sequence=sequence,
         indices=indices,
@@ -57,6 +65,7 @@ def make_job(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameS
         video=not options["no_video"],
         sheet=not options["no_sheet"],
         landmarks=landmarks,
+        scale=scale,
     )
 
 
@@ -73,7 +82,7 @@ def _recalibration(options: Mapping[str, Any], config: UfMStarConfig, source: De
     file = beside(weights[0]) if name is None else Path(name)
     try:
         recalibration = Recalibration.from_json(file)
-        recalibration.require(config, ", ".join(one["name"] for one in source.identity.get("weights", ())))
+        recalibration.require(config, ", ".join(one["name"] for one in source.identity.get("files", ())))
     except ValueError as error:
         raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
     return recalibration
@@ -87,7 +96,7 @@ def _landmarks(value: str | bool, sequence: FrameSequence) -> Callable[[], Landm
         ValueError: an unknown source, or the sequence has no images to track in.
         ModuleNotFoundError: OpenCV is not installed.
     """
-    source = landmarks_of(value, sequence.folder)
+    source = landmarks_of(value, sequence.folder, sequence.pose_scale)
     if source.needs_image and all(entry.load_image is None for entry in sequence.entries):
         raise ValueError(f"--anchors tracks corners of images, of which the sequence {sequence.name!r} has none")
     if source.needs_image and find_spec("cv2") is None:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch import unmeasured
 from ufmstar_torch.eval.run import colours
 from ufmstar_torch.eval.run.colours import FAINT, INK, ColourScale
 
@@ -96,7 +97,8 @@ def draw_grid(
 
     grey = (colours.INVALID_GREY / 255,) * 3
     figure.add_artist(Rectangle((_MARGIN, bottom), 0.12, _BAR, color=grey, transform=figure.dpi_scale_trans))
-    say(figure, _MARGIN + 0.18, bottom + _BAR / 2, "no value, no truth", size=7.5, color=FAINT, va="center")
+    legend = "no value, no truth;\nstripes: not compared"
+    say(figure, _MARGIN + 0.18, bottom + _BAR / 2, legend, size=7.5, color=FAINT, va="center", linespacing=1.2)
     colours.save_png(figure, path)
 
 
@@ -176,8 +178,9 @@ MAPS = {
     "sigma": ("σ", "length"),
     "anchored": ("√B", "length"),
     "error": ("|error|", "length"),
-    "posterior_sigma": ("σ, posterior", "length"),
-    "posterior_error": ("|error|, posterior", "length"),
+    # Of its own: beside the network's errors the posterior's would all be black.
+    "posterior_sigma": ("σ, posterior", "posterior length"),
+    "posterior_error": ("|error|, posterior", "posterior length"),
 }
 
 
@@ -186,7 +189,8 @@ class FramePanel:
     """One frame to be shown: its image [H, W, 3] uint8 RGB of any size, and its maps [h, w] [m], NaN where unknown.
 
     ``maps`` has names of ``MAPS``: "depth" and "sigma" always, "error" with ground truth, "anchored" (the part of
-    sigma that is due to anchors) and those of the posterior of a run with them. ``note`` ("K = 31") stands beside the
+    sigma that is due to anchors) and those of the posterior of a run with them. "measured", the share of the
+    disagreement that rests on two views or more, has no column: it stripes sigma. ``note`` ("K = 31") stands beside the
     name.
 
     Raises:
@@ -211,13 +215,6 @@ class FramePanel:
         return self.maps["depth"].shape
 
 
-class PanelScales(NamedTuple):
-    """The colour scales that all frames of a sheet or a video share: of depth, and of sigma and error together."""
-
-    depth: ColourScale
-    length: ColourScale
-
-
 class MapColumn(NamedTuple):
     """One kind of map: its label, its scale, and its name in ``MAPS``."""
 
@@ -226,27 +223,33 @@ class MapColumn(NamedTuple):
     field: str
 
     def rgb(self, panel: FramePanel) -> NDArray[np.uint8] | None:
-        """[h, w, 3] the coloured map, None if the panel has none."""
-        return self.scale.rgb(panel.maps[self.field]) if self.field in panel.maps else None
+        """[h, w, 3] the coloured map, sigma striped where no two views were compared; None if the panel has none."""
+        if self.field not in panel.maps:
+            return None
+        rgb = self.scale.rgb(panel.maps[self.field])
+        measured = panel.maps.get("measured") if self.field == "sigma" else None
+        return rgb if measured is None else colours.striped(rgb, measured < unmeasured.HALF)
 
 
 def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:
     """The columns right of the image, of all maps that some panel has, on scales that fit all panels."""
-    scales = fit_scales(panels)._asdict()
+    scales = fit_scales(panels)
     shown = (name for name in MAPS if any(name in panel.maps for panel in panels))
     return [MapColumn(MAPS[name][0], scales[MAPS[name][1]], name) for name in shown]
 
 
-def fit_scales(panels: Sequence[FramePanel]) -> PanelScales:
-    """Scales over all panels: depths between their 1st and 99th percentile; sigma and error share one, from 0.
-
-    That one ends at the larger of their 99th percentiles, so that a sigma as large as the error has its colour.
-    """
+def fit_scales(panels: Sequence[FramePanel]) -> dict[str, ColourScale]:
+    """The scales of ``MAPS`` over all panels: depths between their 1st and 99th percentile; a sigma and its error share
+    one, from 0 to the larger of their 99th percentiles, so that a sigma as large as the error has its colour."""
     of = {name: [panel.maps[name] for panel in panels if name in panel.maps] for name in MAPS}
     depth = colours.robust_range([*of["depth"], *of["posterior"]], from_zero=False)
-    lengths = (of[name] for name in ("sigma", "error", "posterior_sigma", "posterior_error") if of[name])
-    high = max(colours.robust_range(maps, from_zero=True)[1] for maps in lengths)
-    return PanelScales(ColourScale(*depth, colours.DEPTH_MAP), ColourScale(0.0, high, colours.ERROR_MAP))
+
+    def length(*names: str) -> ColourScale:
+        high = max(colours.robust_range(of[name], from_zero=True)[1] for name in names if of[name] or name == names[0])
+        return ColourScale(0.0, high, colours.ERROR_MAP)
+
+    lengths = {"length": length("sigma", "error"), "posterior length": length("posterior_sigma", "posterior_error")}
+    return {"depth": ColourScale(*depth, colours.DEPTH_MAP), **lengths}
 
 
 def contact_sheet(

@@ -55,7 +55,7 @@ class Finished:
             frame: Frame | None = self.frames[record["index"]]
         except FrameError:  # it can be read no more
             frame = None
-        maps = {"depth": stored["depth"], "sigma": np.sqrt(stored["variance"])}
+        maps = {"depth": stored["depth"], "sigma": np.sqrt(stored["variance"]), "measured": stored["measured"]}
         note = f"K = {record['components']}"
         if "anchored" in stored:
             note += f", {record['anchors']['used']} anchors"
@@ -96,7 +96,7 @@ def common_columns(finished: Finished) -> list[MapColumn]:
 def draw_sheet(finished: Finished, columns: Sequence[MapColumn], title: str) -> None:
     """Write contact_sheet.png: frames spread over the run, the last one included.
 
-    The first is not, unless it is the only one: it was compared with nothing, so its disagreement is 0.
+    The first is not, unless it is the only one: it was compared with nothing.
     """
     wide = "posterior" in finished.records[-1]  # before and after
     numbers = finished.spread((POSTERIOR_ROWS if wide else SHEET_ROWS) + 1)

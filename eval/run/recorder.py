@@ -15,8 +15,8 @@ from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.run_folder import Checkpoint, RunFolder
 from ufmstar_torch.eval.run.summary import GOING_ON, NEAR_ZERO, write_summary
 
-_MAPS = ("depth", "variance", "disagreement", "anchored", "bias", "posterior_depth", "posterior_variance")
-_COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
+_MAPS = ("depth", "variance", "disagreement", "measured", "anchored", "bias", "posterior_depth", "posterior_variance")
+_COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured", "single_view")
 _SUMMARY_EVERY = 30.0  # [s] between two summaries of an unfinished run
 
 
@@ -59,12 +59,15 @@ class FrameRecorder(FrameSink):
 
     def _record(self, result: FrameResult) -> dict[str, Any]:
         """The frame's line of frames.jsonl, once its maps are written."""
-        about = {"index": result.index, "name": result.name}
+        about: dict[str, Any] = {"index": result.index, "name": result.name}
+        if result.frame is not None and result.frame.timestamp is not None:
+            about["timestamp"] = result.frame.timestamp
         if UFM not in result.rows:
             return {**about, "state": "skipped", "reason": result.skipped[UFM]}
         row, before = result.rows[UFM], perf_counter()
         maps = {name: getattr(row, name) for name in _MAPS}
-        saturated = {"saturated": self._folder.writer.write(result.name, valid=row.valid, **maps)}
+        camera = {"T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
+        saturated = {"saturated": self._folder.writer.write(result.name, valid=row.valid, camera=camera, **maps)}
         times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
         return {**about, "state": "done", **_figures(row), **saturated, **times, **_anchor_figures(row)}
 
@@ -79,6 +82,7 @@ def _figures(row: RowResult) -> dict[str, Any]:
     return {
         "size": list(row.size),
         "intrinsics": [K[0][0], K[1][1], K[0][2], K[1][2]],
+        "T_world_cam": row.T_world_cam,
         "member": row.member,
         **{count: int(getattr(statistics, count)[0]) for count in _COUNTS},
         "rotation_deviation": float(statistics.rotation_deviation[0]),
@@ -113,15 +117,16 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
     with a depth, and ``used`` agree with others. ``without`` is the reason where none is used. Of a map of landmarks,
     ``tracked`` counts all, and ``found`` those in view.
     """
-    anchors, statistics = row.anchors, row.statistics
-    if anchors is None or statistics is None or row.anchored is None or row.bias is None:
+    landmarks, statistics = row.landmarks, row.statistics
+    if landmarks is None or statistics is None or row.anchored is None or row.bias is None:
         return {}
     assert statistics.anchors is not None
     assert statistics.anchors_used is not None
     used, usable = int(statistics.anchors_used[0]), int(statistics.anchors[0])
-    counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
+    found = len(landmarks.depth)
+    counts = {"tracked": landmarks.tracked, "found": found, "usable": usable, "used": used}
     return {
-        "anchors": {**counts, "without": None if used else why_none(anchors.triangulated, usable, anchors.none)},
+        "anchors": {**counts, "without": None if used else why_none(found, usable, landmarks.none)},
         "mean_anchored": _mean(row.anchored, row.valid),
         "mean_bias": _mean(row.bias, row.valid),
         **_posterior_figures(row),

@@ -1,7 +1,7 @@
 """The output folder of ``ufmstar run``, and its checkpoint, from which an interrupted run continues.
 
 ```
-OUT/frames.jsonl       one line per frame, in order: counts, means, times; or why it was skipped
+OUT/frames.jsonl       one line per frame, in order: pose, intrinsics, counts, means, times; or why it was skipped
 OUT/resume/run.json    what the run was started with
 OUT/resume/state.pt    the checkpoint, replaced every few seconds and at the end
 OUT/resume/lock        locked during a run
@@ -32,7 +32,7 @@ from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
 
 # Outputs that are made from the finished frames.
 _MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json")
-_FRAMES = ("frames/*.npz", "depth/*.png", "sigma/*.png")
+_FRAMES = ("frames/*.npz", "depth/*.png", "sigma/*.png", "network_depth/*.png", "network_sigma/*.png")
 CHECKPOINT_EVERY = 2.0  # [s]
 # Raised by torch and zipfile for a damaged checkpoint.
 _DAMAGED = (OSError, EOFError, RuntimeError, LookupError, TypeError, ValueError, UnpicklingError, zipfile.BadZipFile)
@@ -40,7 +40,7 @@ RUN = FolderKind(
     program="ufmstar run",
     noun="run",
     manifest="resume/run.json",
-    format=2,
+    format=3,
     lock="resume/lock",
     clear=remover(*_FRAMES, "summary.json", RECORDS, "resume/state.pt", *_MADE_AT_END),
     temporary=(".*.tmp", "*/.*.tmp", ".preview.*.tmp.mp4"),

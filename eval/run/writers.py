@@ -1,11 +1,14 @@
-"""The files of every frame of ``ufmstar run``: an npz and two 16-bit PNGs.
+"""The files of every frame of ``ufmstar run``: an npz and 16-bit PNGs.
 
 ```
-OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2] float32 and valid bool, each [H, W]; with
-                      anchors also anchored [m^2] (B) and bias (r: depth (1 + r) is the depth corrected), with a
-                      posterior also posterior_depth [m] and posterior_variance [m^2]
-OUT/depth/NAME.png    depth, 16 bit, 0 = invalid; metres per count in the PNG's text
-OUT/sigma/NAME.png    standard deviation, likewise
+OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2], measured (the share of the disagreement that
+                      rests on two views or more) float32 and valid bool, each [H, W]; with anchors also anchored
+                      [m^2] (B) and bias (r: depth (1 + r) is the depth corrected), with a posterior also
+                      posterior_depth [m] and posterior_variance [m^2]; T_world_cam [4, 4] camera-to-world [m] and
+                      intrinsics [3, 3] of the maps [px]
+OUT/depth/NAME.png    depth, the posterior's if there is one; 16 bit, 0 = invalid; metres per count in the PNG's text
+OUT/sigma/NAME.png    its standard deviation, likewise; the text "unmeasured" counts pixels that no two views compared
+OUT/network_depth/NAME.png, OUT/network_sigma/NAME.png   with a posterior: those before it
 ```
 Every file is complete or absent. Nothing here keeps more than one frame in memory.
 """
@@ -13,13 +16,18 @@ Every file is complete or absent. Nothing here keeps more than one frame in memo
 from __future__ import annotations
 
 import io
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch import unmeasured
+from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.run.files import write_together
 
 # Metres per count that a run may choose from, finest first: up to 65.5 m, 256 m (KITTI's), 655 m, 6.6 km.
@@ -29,6 +37,7 @@ FULL = 65535
 # the row above, takes six tenths of the time of a choice for every row, and the files are as large.
 PNG_LEVEL = 1
 _AFTER_HEADER = 33  # bytes: signature and IHDR
+_NO_CAMERA: Mapping[str, NDArray[Any]] = MappingProxyType({})
 
 
 class FrameWriter:
@@ -49,7 +58,7 @@ class FrameWriter:
             (self.out_dir / folder).mkdir(parents=True, exist_ok=True)
 
     def paths(self, name: str) -> dict[str, Path]:
-        """The files of a frame by kind (depth, sigma, frames), in the order in which they are written. Raises
+        """The files of every frame by kind (depth, sigma, frames), in the order in which they are written. Raises
         ValueError: the name is not usable as a file name."""
         if not name or name.startswith(".") or any(c in name for c in "/\\\0"):
             raise ValueError(f"name must be a plain file name without its ending, got {name!r}")
@@ -60,10 +69,13 @@ class FrameWriter:
         """True if all files of the frame are there, and so complete."""
         return all(path.is_file() for path in self.paths(name).values())
 
-    def write(self, name: str, *, valid: Tensor, **given: Tensor | None) -> dict[str, int]:
+    def write(
+        self, name: str, *, valid: Tensor, camera: Mapping[str, NDArray[Any]] = _NO_CAMERA, **given: Tensor | None
+    ) -> dict[str, int]:
         """Write one frame; none of its files appears before all are written. The maps are [H, W]; those that are None
-        are left out, and ``valid`` is True where the pixel was used. Returns how many valid pixels of "depth" and
-        "sigma" lie beyond the PNGs' range and are stored as its largest value.
+        are left out, ``valid`` is True where the pixel was used, and ``camera`` has the arrays of its pose and
+        intrinsics. Returns how many valid pixels of "depth" and "sigma" lie beyond the PNGs' range and are stored as
+        its largest value.
 
         Raises:
             ValueError: shapes or types disagree.
@@ -77,28 +89,40 @@ class FrameWriter:
                 raise ValueError(f"{label} must have the depth's shape {d.shape}, got {value.shape}")
         if used.dtype != np.bool_:
             raise ValueError(f"valid must be a bool mask (True = use), got {used.dtype}")
-        paths, unit = self.paths(name), self.unit or fitting_unit(d[used])
+        pairs = {"": (d, v)}
+        if "posterior_depth" in maps:
+            pairs = {"network_": (d, v), "": (maps["posterior_depth"], maps["posterior_variance"])}
+        paths, unit = self.paths(name), self.unit or fitting_unit(pairs[""][0][used])
         self.unit = unit
-        sigma = np.sqrt(np.where(v >= 0, v, np.nan))
-        depth_png, lost_d = encode_length_png(d, used, unit, quantity="depth")
-        sigma_png, lost_s = encode_length_png(sigma, used, unit / 10, quantity="sigma")
-        write_together(
-            {
-                paths["depth"]: lambda file: file.write(depth_png),
-                paths["sigma"]: lambda file: file.write(sigma_png),
-                # Not compressed: float noise shrinks by a quarter only and takes 40 times as long (224x224:
-                # 0.65 MB in 0.6 ms against 0.50 MB in 27 ms).
-                paths["frames"]: lambda file: np.savez(file, allow_pickle=False, **maps),
-            }
-        )
-        return {"depth": lost_d, "sigma": lost_s}
+        files: dict[Path, Callable[[BinaryIO], object]] = {}
+        saturated = {}
+        blind = np.count_nonzero(maps["measured"] < unmeasured.HALF) if "measured" in maps else 0
+        notes = {"depth": {}, "sigma": {"unmeasured": str(blind)}}
+        for prefix, (depth, variance) in pairs.items():
+            sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
+            for kind, values, counts in (("depth", depth, unit), ("sigma", sigma, unit / 10)):
+                content, saturated[prefix + kind] = encode_length_png(
+                    values, used, counts, quantity=kind, **notes[kind]
+                )
+                folder = self.out_dir / (prefix + kind)
+                folder.mkdir(exist_ok=True)
+                files[folder / paths[kind].name] = partial(_write, content)
+        # Not compressed: float noise shrinks by a quarter only and takes 40 times as long (224x224: 0.65 MB in 0.6 ms
+        # against 0.50 MB in 27 ms).
+        files[paths["frames"]] = lambda file: np.savez(file, allow_pickle=False, **maps, **camera)
+        write_together(files)
+        return {kind: saturated[kind] for kind in ("depth", "sigma")}
+
+
+def _write(content: bytes, file: BinaryIO) -> None:
+    file.write(content)
 
 
 def read_frame(path: str | Path) -> dict[str, NDArray[Any]]:
     """The maps of a frame's npz: depth [m], variance [m^2], disagreement [m^2], valid, each [H, W]; with anchors
-    also anchored [m^2] and bias, with a posterior its depth and variance."""
-    with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+    also anchored [m^2] and bias, with a posterior its depth and variance; and T_world_cam [4, 4] [m] and intrinsics
+    [3, 3] [px]. Errors as ``read_npz_whole``."""
+    return read_npz_whole(path)
 
 
 def fitting_unit(depth: NDArray[Any]) -> float:
@@ -112,15 +136,13 @@ def fitting_unit(depth: NDArray[Any]) -> float:
     return next((unit for unit in DEPTH_UNITS if far <= FULL * unit), DEPTH_UNITS[-1])
 
 
-def encode_length_png(
-    values: NDArray[Any], valid: NDArray[np.bool_], unit: float, *, quantity: str
-) -> tuple[bytes, int]:
+def encode_length_png(values: NDArray[Any], valid: NDArray[np.bool_], unit: float, **notes: str) -> tuple[bytes, int]:
     """Lengths [H, W] [m] as a 16-bit PNG with its scale ``unit`` [m per count] as text: the file's content, and the
     number of saturated pixels.
 
     count = round(value / unit), 0 = invalid or not finite. A valid value below half a unit becomes 1, so that it is not
     taken for invalid; one beyond the range becomes 65535. Text keys: ``depth_scale`` = metres per count (also for
-    sigma: it is a depth's), ``unit``, ``quantity`` (a note for the reader), ``invalid``, ``saturated``.
+    sigma: it is a depth's), ``unit``, ``invalid``, ``saturated``, and the ``notes`` for the reader.
     """
     import cv2
     from PIL.PngImagePlugin import PngInfo, putchunk
@@ -133,7 +155,7 @@ def encode_length_png(
     how = (cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP)
     pixels = cv2.imencode(".png", coded, how)[1].tobytes()
     text, content = PngInfo(), io.BytesIO()
-    entries = {"depth_scale": repr(float(unit)), "unit": "metres per count", "quantity": quantity}
+    entries = {"depth_scale": repr(float(unit)), "unit": "metres per count", **notes}
     for key, value in {**entries, "invalid": "0", "saturated": str(saturated)}.items():
         text.add_text(key, value)
     content.write(pixels[:_AFTER_HEADER])

@@ -91,6 +91,10 @@ class Entry:
     load_image: Loader | None
     load_depth: Loader | None = None
     timestamp: float | None = None
+    # Its own camera, where a sequence has several or one that zooms; None: the sequence's.
+    intrinsics: np.ndarray | None = None
+    depth_intrinsics: np.ndarray | None = None
+    image_size: Size | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +114,8 @@ class FrameSequence:
     # can be judged but nothing that compares views.
     posed: bool = True
     folder: Path | None = None  # where it lies; None where it is no recording
+    metric: bool = True  # False: the unit of the poses is not known, as of structure from motion
+    pose_scale: float = 1.0  # by which the recording's positions were multiplied [m per unit]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -135,13 +141,17 @@ class FrameSequence:
         return Frame(
             index=index % len(self.entries),
             name=entry.name,
-            image=_load(entry.name, "image", entry.load_image, self.image_size),
+            image=_load(entry.name, "image", entry.load_image, entry.image_size or self.image_size),
             depth=_load(entry.name, "depth map", entry.load_depth, self.depth_size),
             T_world_cam=entry.T_world_cam.copy(),
-            intrinsics=self.intrinsics.copy(),
-            depth_intrinsics=None if self.depth_intrinsics is None else self.depth_intrinsics.copy(),
+            intrinsics=self.intrinsics_of(entry).copy(),
+            depth_intrinsics=_copy(self.depth_intrinsics if entry.depth_intrinsics is None else entry.depth_intrinsics),
             timestamp=entry.timestamp,
         )
+
+    def intrinsics_of(self, entry: Entry) -> np.ndarray:
+        """[3, 3] of an entry's image [px]: its own, or the sequence's."""
+        return self.intrinsics if entry.intrinsics is None else entry.intrinsics
 
     def __iter__(self) -> Iterator[Frame]:
         """All frames in order; the first that cannot be decoded raises :class:`FrameError`."""
@@ -168,8 +178,10 @@ def make_sequence(
     depth_intrinsics: np.ndarray | None = None,
     depth_size: Size | None = None,
     posed: bool = True,
+    metric: bool = True,
 ) -> FrameSequence:
-    """Sorts frames into usable and skipped and checks that the intrinsics fit the sizes (H, W); ``posed`` as there.
+    """Sorts frames into usable and skipped and checks that the intrinsics fit the sizes (H, W); ``posed`` and
+    ``metric`` as there.
 
     Raises:
         ValueError: no frame is usable (the reasons are counted in the message); two frames share a name;
@@ -194,8 +206,21 @@ def make_sequence(
     check_intrinsics("intrinsics", intrinsics, image_size)
     if depth_intrinsics is not None:
         check_intrinsics("depth_intrinsics", depth_intrinsics, depth_size)
+    for entry in entries:
+        if entry.intrinsics is not None:
+            check_intrinsics(f"intrinsics of {entry.name}", entry.intrinsics, entry.image_size or image_size)
     return FrameSequence(
-        name, layout, entries, intrinsics, image_size, depth_intrinsics, depth_size, skipped, names, posed
+        name,
+        layout,
+        entries,
+        intrinsics,
+        image_size,
+        depth_intrinsics,
+        depth_size,
+        skipped,
+        names,
+        posed,
+        metric=metric,
     )
 
 
@@ -213,6 +238,10 @@ def in_memory(sequence: FrameSequence, progress: Callable[[int], object] = lambd
 
 def _same(array: Any) -> Any:
     return array
+
+
+def _copy(array: np.ndarray | None) -> np.ndarray | None:
+    return None if array is None else array.copy()
 
 
 def parse_slice(text: str | None) -> slice:

@@ -39,7 +39,10 @@ TRAJECTORIES = (
     *("CameraTrajectory.txt", "KeyFrameTrajectory.txt", "cam0_to_world.txt"),
 )
 INTRINSICS = ("K.txt", "intrinsics.txt", "intrinsic.txt", "camera.txt")
-LOOKED_FOR = f"images ({', '.join(IMAGES)}/ or a video), a trajectory ({', '.join(TRAJECTORIES)}), {INTRINSICS[0]}"
+LOOKED_FOR = (
+    f"images ({', '.join(IMAGES)}/ or a video), a trajectory ({', '.join(TRAJECTORIES)}; `ufmstar poses` computes one "
+    f"from images alone), {INTRINSICS[0]}"
+)
 
 
 def detect(path: Path) -> bool:
@@ -55,7 +58,7 @@ def read(path: Path, options: Options) -> FrameSequence:
 
     Without timestamps in the trajectory, pose i belongs to the i-th image (numbers sorted by value).
     With them, an image's time is, in this order: its line in ``rgb.txt`` beside the images or their folder;
-    index / ``fps`` (a video has its own fps); its name as a number [s, or us or ns if as large]; each plus
+    index / ``fps``; its timestamp in a video's container; its name as a number [s, or us or ns if as large]; each plus
     ``time_offset``. The pose is interpolated as for TUM RGB-D.
     Depth maps belong to the image with the same stem or the same numbers in their names, or else, where
     their names are timestamps too, to the nearest within ``max_time_difference``, one-to-one.
@@ -65,7 +68,7 @@ def read(path: Path, options: Options) -> FrameSequence:
             images; no image has a pose (both time ranges are given); depth maps that fit no image.
     """
     root = path if path.is_dir() else path.parent
-    images, size, times = _images(path, options)
+    images, size, times = open_images(path, options)
     trajectory = read_trajectory(_given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
     frames = attach(_with_depth(images, root, times, options, options.depth_scale), times, trajectory, options)
     K, size_of_depth = _intrinsics(root, options), depth_size(frames)
@@ -101,7 +104,7 @@ def open_unposed(path: Path, options: Options) -> FrameSequence:
     if not has_images_and_depth(path):
         raise ValueError(f"{path} must hold one of {', '.join(IMAGES)} and one of {', '.join(DEPTHS)}")
     first = next(name for name in IMAGES if (path / name).is_dir())
-    images, size, times = _images(path, replace(options, images=options.images or path / first))
+    images, size, times = open_images(path, replace(options, images=options.images or path / first))
     scale = options.depth_scale
     if scale is None and (path / "depth.txt").is_file():
         scale = TUM_SCALE
@@ -125,7 +128,7 @@ def _intrinsics(root: Path, options: Options) -> np.ndarray:
     return read_intrinsics(_given_or_found(root, None, INTRINSICS, "intrinsics") if given is None else given)
 
 
-def _images(path: Path, options: Options) -> tuple[list[Entry], Size | None, np.ndarray | None]:
+def open_images(path: Path, options: Options) -> tuple[list[Entry], Size | None, np.ndarray | None]:
     """The images without poses and depth, their (H, W), and timestamps [N] [s] (None where they are not known)."""
     source = path
     if options.images is not None:
@@ -139,7 +142,8 @@ def _images(path: Path, options: Options) -> tuple[list[Entry], Size | None, np.
     if source.is_file():
         video = Video(source)
         images = [Entry(f"{i:06d}", UNKNOWN, partial(video.read, i)) for i in range(len(video))]
-        return images, video.size, np.arange(len(video)) / (options.fps or video.fps) + options.time_offset
+        times = video.times() if options.fps is None else np.arange(len(video)) / options.fps
+        return images, video.size, times + options.time_offset
     files = list_images(source)
     if not files:
         raise ValueError(f"{source} holds no image ({', '.join(IMAGE_SUFFIXES)})")
@@ -153,17 +157,24 @@ def _image_sources(path: Path) -> list[Path]:
     return folders or ([path] if list_images(path) else list_files(path, VIDEO_SUFFIXES))
 
 
-def _image_times(folder: Path, files: list[Path], options: Options) -> np.ndarray | None:
+def listed_times(folder: Path, files: list[Path]) -> np.ndarray | None:
+    """Timestamps [N] [s] of images by the ``rgb.txt`` beside them or their folder; None without one. Raises ValueError:
+    it has none of an image."""
     listing = next((f / "rgb.txt" for f in (folder, folder.parent) if (f / "rgb.txt").is_file()), None)
-    if listing is not None:
-        listed = {Path(name).name: time for time, name in zip(*read_file_list(listing), strict=True)}
-        absent = [file.name for file in files if file.name not in listed]
-        if absent:
-            raise ValueError(f"{listing} has no timestamp for {len(absent)} images: {absent[:3]}")
-        times: np.ndarray | None = np.array([listed[file.name] for file in files])
-    elif options.fps is not None:
+    if listing is None:
+        return None
+    listed = {Path(name).name: time for time, name in zip(*read_file_list(listing), strict=True)}
+    absent = [file.name for file in files if file.name not in listed]
+    if absent:
+        raise ValueError(f"{listing} has no timestamp for {len(absent)} images: {absent[:3]}")
+    return np.array([listed[file.name] for file in files])
+
+
+def _image_times(folder: Path, files: list[Path], options: Options) -> np.ndarray | None:
+    times = listed_times(folder, files)
+    if times is None and options.fps is not None:
         times = np.arange(len(files)) / options.fps
-    else:
+    elif times is None:
         times = stem_times([file.stem for file in files])
     return None if times is None else times + options.time_offset
 
@@ -201,5 +212,6 @@ def _given_or_found(root: Path, given: str | Path | None, names: tuple[str, ...]
     result = [root / name for name in names if (root / name).is_file()]
     if len(result) != 1:
         listing = f"found {[file.name for file in result]}" if result else f"looked for {', '.join(names)}"
-        raise ValueError(f"{root}: pass {option}, exactly one file must be it ({listing})")
+        hint = "; `ufmstar poses` computes poses from images alone" if option == "trajectory" and not result else ""
+        raise ValueError(f"{root}: pass {option}, exactly one file must be it ({listing}){hint}")
     return result[0]

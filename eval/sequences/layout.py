@@ -6,7 +6,19 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-from ufmstar_torch.eval.sequences import generic, kitti360, nyu, scannet, sens, seven_scenes, tartanair, tum
+from ufmstar_torch.eval.sequences import (
+    colmap,
+    euroc,
+    generic,
+    kitti360,
+    nyu,
+    scannet,
+    sens,
+    seven_scenes,
+    tartanair,
+    transforms,
+    tum,
+)
 
 # Each module has ``detect(path)``, ``read(path, options)`` and LOOKED_FOR, the files that it detects.
 READERS: dict[str, ModuleType] = {
@@ -17,6 +29,9 @@ READERS: dict[str, ModuleType] = {
     "tartanair": tartanair,
     "kitti360": kitti360,
     "nyu": nyu,
+    "colmap": colmap,
+    "transforms": transforms,
+    "euroc": euroc,
     "generic": generic,
 }
 LAYOUTS = ("auto", *READERS)

@@ -7,8 +7,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from ufmstar_torch.eval.sequences import tum
 from ufmstar_torch.eval.sequences.frame import FrameSequence
+from ufmstar_torch.eval.sequences.images import within
 from ufmstar_torch.eval.sequences.layout import READERS, layout_of
+from ufmstar_torch.eval.sequences.lens import OWN, parse_distortion, undistort
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
@@ -23,7 +26,10 @@ _REFUSED = {
     "sens": "images depth T_color_depth",
     "tartanair": "images depth depth_intrinsics T_color_depth",
     "kitti360": "images T_color_depth",
-    "nyu": "trajectory images depth depth_intrinsics fps T_color_depth",
+    "nyu": "trajectory images depth depth_intrinsics fps T_color_depth distortion",
+    "colmap": "depth_intrinsics T_color_depth distortion",
+    "transforms": "images depth depth_intrinsics T_color_depth distortion",
+    "euroc": "images depth depth_intrinsics T_color_depth distortion",
     "generic": "T_color_depth",
 }
 
@@ -33,8 +39,8 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
 
     Args:
         path: the sequence's folder, a video file, or ``tour:SEED`` with the options of a rendered tour in its name.
-        layout: ``auto``, ``tum``, ``7scenes``, ``scannet``, ``sens``, ``tartanair``, ``kitti360``, ``nyu`` or
-            ``generic``.
+        layout: ``auto``, ``tum``, ``7scenes``, ``scannet``, ``sens``, ``tartanair``, ``kitti360``, ``nyu``, ``colmap``,
+            ``transforms``, ``euroc`` or ``generic``.
         poses: how they are written: ``camera-to-world`` (x right, y down, z forward), ``world-to-camera``, ``ned``
             (camera-to-world, x forward, y right, z down) or ``opengl`` (x right, y up, z backward); what is
             customary for a layout (TartanAir's NED) is known.
@@ -67,7 +73,27 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
     if chosen.trajectory is None and layout != "generic":
         chosen.reject(layout, "fps")
     sequence = READERS[layout].read(path, chosen)
-    return convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), poses)
+    if chosen.distortion is not None:
+        own = chosen.distortion in (OWN, (OWN,), [OWN])
+        if own and layout != "tum":
+            raise ValueError(f"distortion {OWN!r} is known for layout 'tum' only; give its coefficients")
+        coefficients = tum.distortion(path) if own else parse_distortion(chosen.distortion)
+        sequence = undistort(sequence, *coefficients, depth_too=chosen.depth_intrinsics is None)
+    sequence = convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), poses)
+    if chosen.max_truth is not None:
+        entries = [replace(entry, load_depth=within(entry.load_depth, chosen.max_truth)) for entry in sequence.entries]
+        sequence = replace(sequence, entries=tuple(entries))
+    return sequence if chosen.pose_scale is None else scale_poses(sequence, chosen.pose_scale)
+
+
+def scale_poses(sequence: FrameSequence, metres: float) -> FrameSequence:
+    """The sequence with positions in metres, of which a unit of its poses has ``metres``."""
+    scaled = []
+    for entry in sequence.entries:
+        T = entry.T_world_cam.copy()
+        T[:3, 3] *= metres
+        scaled.append(replace(entry, T_world_cam=T))
+    return replace(sequence, entries=tuple(scaled), metric=True, pose_scale=metres * sequence.pose_scale)
 
 
 def convert_poses(sequence: FrameSequence, convention: str) -> FrameSequence:

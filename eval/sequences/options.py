@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,6 +36,10 @@ class Options:
     time_offset: float = 0.0  # added to the images' times [s]
     register: bool = True  # warp 7-Scenes' depth into the colour camera
     T_color_depth: np.ndarray | None = None  # [4, 4] depth to colour camera [m] (7-Scenes)
+    # Of the images' lens: k1 k2 p1 p2 [k3 [k4 k5 k6]], "fisheye" k1 k2 k3 k4, or "own": TUM's published one.
+    distortion: str | Sequence[str | float] | None = None
+    pose_scale: float | None = None  # metres per unit of the poses, and of a file of landmarks
+    max_truth: float | None = None  # depths beyond are no ground truth [m]: what a window shows
     drive: str | int | None = None  # name or number of the drive, where the path is KITTI-360's root
     # Laser scans of as many frames before and after a frame that are added to its own (KITTI-360); moving things smear.
     scans: int | None = None
@@ -46,6 +51,10 @@ class Options:
                 raise ValueError(f"{name} must be a time of at least 0 s, got {getattr(self, name)}")
         if self.fps is not None and not self.fps > 0:
             raise ValueError(f"fps must be positive frames per second, got {self.fps}")
+        for name, unit in (("pose_scale", "metres per unit of the poses"), ("max_truth", "metres")):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < np.inf:
+                raise ValueError(f"{name} must be a positive number of {unit}, got {value}")
         if self.scans is not None and (self.scans < 0 or self.scans != int(self.scans)):
             raise ValueError(f"scans must be a number of laser scans on either side, at least 0, got {self.scans}")
 

@@ -22,7 +22,13 @@ from ufmstar_torch.eval.sequences.poses import associate, numbered_lines, read_t
 LOOKED_FOR = "rgb.txt and groundtruth.txt"
 SCALE = 1 / 5000
 _NATIVE_SIZE = (480, 640)
-# The colour cameras' published calibration, by robot; their distortion is left in the images.
+# The colour cameras' published calibration, by robot; their distortion (k1 k2 p1 p2 k3) is left in the images unless it
+# is asked for, and depth is registered to the distorted image.
+_DISTORTION = {
+    "1": (0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    "2": (0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    "3": (),
+}
 _INTRINSICS = {"1": (517.3, 516.5, 318.6, 255.3), "2": (520.9, 521.0, 325.1, 249.7), "3": (535.4, 539.2, 320.1, 247.6)}
 
 
@@ -85,13 +91,23 @@ def _paired_depth(path: Path, color_times: np.ndarray, max_difference: float) ->
     return {i: file for i, file in files.items() if file.is_file()}
 
 
+def distortion(path: Path) -> tuple[tuple[float, ...], bool]:
+    """The published coefficients of the sequence's camera, as ``parse_distortion`` returns them. Raises ValueError: the
+    camera is not named."""
+    return _DISTORTION[_robot(path)], False
+
+
 def _default_intrinsics(path: Path, size: Size | None) -> np.ndarray:
-    """The camera's K, known from ``freiburgN`` in the folder's name or in the header of rgb.txt."""
+    return scale_intrinsics(pinhole(*_INTRINSICS[_robot(path)]), _NATIVE_SIZE, size)
+
+
+def _robot(path: Path) -> str:
+    """1, 2 or 3, known from ``freiburgN`` in the folder's name or in the header of rgb.txt."""
     header = "\n".join(text for _, text in numbered_lines(path / "rgb.txt"))[:500]
     for text in (path.resolve().name, header):
         found = re.search(r"freiburg([123])", text)
         if found:
-            return scale_intrinsics(pinhole(*_INTRINSICS[found[1]]), _NATIVE_SIZE, size)
+            return found[1]
     raise ValueError(
         f"intrinsics: neither the folder name {path.resolve().name!r} nor rgb.txt names the camera "
         "(freiburg1, 2 or 3); pass intrinsics as fx fy cx cy"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +23,6 @@ class Video:
 
     Attributes:
         path: the file.
-        fps: frames per second that the file names.
         size: (H, W).
 
     Raises:
@@ -40,17 +42,27 @@ class Video:
         self._next = 0
         import cv2
 
-        self.fps = float(capture.get(cv2.CAP_PROP_FPS))
         height, width = capture.get(cv2.CAP_PROP_FRAME_HEIGHT), capture.get(cv2.CAP_PROP_FRAME_WIDTH)
         self.size: Size = int(height), int(width)
         named = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        self._length = named if named > 0 else self._count()
+        self._length = named if named > 0 else len(self._decoded_times())
         if self._length == 0 or 0 in self.size:
             raise ValueError(f"{self.path}: the video has no frame that can be decoded")
 
     def __len__(self) -> int:
         """Number of frames stated in the file; a truncated file ends earlier, with :class:`FrameError`."""
         return self._length
+
+    def times(self) -> np.ndarray:
+        """[N] when each frame is shown [s], from 0 on, by the timestamps in the container: a phone's frames are not
+        equally far apart. Where those are not as many as the frames (an edited video), the file is decoded once. Raises
+        FrameError: the file ends before its last frame."""
+        stamps = _container_times(self.path)
+        if len(stamps) != self._length:
+            stamps = self._decoded_times()
+        if len(stamps) < self._length:
+            raise FrameError(self.path, f"it states {self._length} frames, of which {len(stamps)} can be decoded")
+        return stamps[: self._length] - stamps[0]
 
     def read(self, index: int) -> np.ndarray:
         """Frame ``index`` as [H, W, 3] uint8 RGB. Raises FrameError: the file ends, or cannot be decoded, before that
@@ -69,12 +81,15 @@ class Video:
             raise FrameError(self.path, f"frame {index} cannot be read, decoding stops at frame {self._next}")
         self._next += 1
 
-    def _count(self) -> int:
-        """Frames of a file that does not say how many it has (a browser's recording), by decoding it."""
-        capture, count = self._open(), 0
+    def _decoded_times(self) -> np.ndarray:
+        """[N] timestamps [s] of all frames, by decoding the file: of one that does not say how many it has (a browser's
+        recording), or not when they are shown."""
+        import cv2
+
+        capture, times = self._open(), []
         while capture.grab():
-            count += 1
-        return count
+            times.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+        return np.array(times)
 
     def _open(self) -> Any:
         import cv2
@@ -87,3 +102,18 @@ class Video:
     def __getstate__(self) -> dict[str, Any]:
         """A decoder cannot be pickled: a worker process opens its own."""
         return {**self.__dict__, "_capture": None, "_next": 0}
+
+
+def _container_times(path: Path) -> np.ndarray:
+    """[N] timestamps [s] of the packets of a file's first video stream, sorted, without decoding any; empty where
+    ffmpeg cannot read it."""
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    command = [get_ffmpeg_exe(), "-v", "error", "-nostdin", "-i", str(path.resolve())]
+    command += ["-map", "0:v:0", "-c", "copy", "-copyts", "-f", "framecrc", "-"]
+    listed = subprocess.run(command, capture_output=True, check=False).stdout.decode(errors="replace")
+    unit = re.search(r"^#tb 0: (\d+)/(\d+)$", listed, re.MULTILINE)
+    stamps = [int(line.split(",")[2]) for line in listed.splitlines() if re.match(r"0,\s*-?\d+,\s*-?\d+,", line)]
+    if unit is None or int(unit[2]) == 0:
+        return np.zeros(0)
+    return np.sort(np.array(stamps, dtype=np.float64)) * float(Fraction(int(unit[1]), int(unit[2])))

@@ -3,11 +3,12 @@
 Written while a sequence is evaluated, below its folder::
 
     examples/FRAME.npz      image [h, w, 3] uint8, truth [h, w] float32 [m] (0 = none), K [3, 3] [px], index
-    examples/FRAME@ROW.npz  depth [m], and where the row has them variance, aleatoric, epistemic, disagreement [m^2],
-                            each [h, w] float32; image, truth and K too where the row's are others than the frame's
+    examples/FRAME@ROW.npz  depth [m], and where the row has them variance, aleatoric, epistemic, disagreement [m^2] and
+                            measured (share of the disagreement that rests on two views), each [h, w] float32;
+                            image, truth and K too where the row's are others than the frame's
     room/ROW_FRAME.npz      UfM*'s mixture after the frame in the world: mean_world [K, 3] [m], covariance_world
-                            [K, 3, 3] [m^2], weight [K] [px], disagreement [K] [m^2]; T_world_cam [4, 4]; path [n, 3]
-                            where the camera has been until then [m]
+                            [K, 3, 3] [m^2], weight [K] [px], disagreement [K] [m^2], count [K]; T_world_cam
+                            [4, 4]; path [n, 3] where the camera has been until then [m]
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from ufmstar_torch.eval.sequences.intrinsics import scale_intrinsics
 # Shares of the frames after which the mixture is stored; it is stored again at the end.
 ROOM_SHARES = (0.25, 0.5)
 _POINTS = 4  # along each side of a pixel, for the picture
-_MAPS = ("depth", "variance", "aleatoric", "epistemic", "disagreement")
+_MAPS = ("depth", "variance", "aleatoric", "epistemic", "disagreement", "measured")
 
 
 class ExampleWriter(FrameSink):
@@ -110,6 +111,7 @@ def _room(estimator: Gaussians) -> dict[str, NDArray]:
         "covariance_world": world.covariance,
         "weight": world.weight,
         "disagreement": world.disagreement,
+        "count": world.count,
     }
     return {name: value[0][world.valid[0]].cpu().numpy() for name, value in named.items()}
 

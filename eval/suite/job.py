@@ -30,6 +30,8 @@ class EvalJob:
     items: tuple[WorkItem, ...]  # the sequences
     out: Path  # the folder for everything that is written
     missing_bases: tuple[str, ...] = ()  # bases of rows that were left out
+    # Networks of other architectures, by base, whose time, energy and memory are measured as well.
+    further: tuple[Mapping[str, NetworkChoice], ...] = ()
     frames: slice = field(default_factory=lambda: slice(None))  # which of each sequence
     cache: Path | None = None  # folder of predictions; None = in ``out``
     device: str = "cpu"  # "cpu", "cuda", "cuda:1"
@@ -46,11 +48,12 @@ class EvalJob:
         """Bases with a network that no row of the suite has."""
         return tuple(base for base in self.networks if base not in self.suite.bases)
 
-    def load(self, device: torch.device) -> dict[str, DepthSource]:
-        """The networks that the rows need. Raises FileNotFoundError, ValueError, ImportError, see
-        ``NetworkChoice.load``."""
+    def load(self, device: torch.device, networks: Mapping[str, NetworkChoice] | None = None) -> dict[str, DepthSource]:
+        """Load those networks (None: of the evaluated ones) that the rows need. Raises FileNotFoundError, ValueError,
+        ImportError, see ``NetworkChoice.load``."""
         passes = {} if self.samples is None else {"samples": self.samples}
-        needed = [self.networks[base] for base in self.suite.bases]
+        networks = self.networks if networks is None else networks
+        needed = [networks[base] for base in self.suite.bases if base in networks]
         inference = Inference(self.runtime, self.precision)
         return {choice.base: choice.load(device, inference=inference, **passes) for choice in needed}
 

@@ -23,7 +23,8 @@ class Record:
     network: str  # as shown, "FastDepth" or "ResNet50-Monodepth2"
     method: str  # the row's name, ``Method.name``
     setting: Mapping[str, Any] = field(default_factory=dict)  # ``Setting.to_dict()``; {} = as the paper runs it
-    # "selected", "done", "skipped" (counts) and "reasons" (count by reason).
+    # "selected", "done", "judged", "skipped" (counts) and "reasons" (count by reason); of UfM* "without_segment" and
+    # "without_match", frames that added nothing to the mixture or met nothing in it.
     frames: Mapping[str, Any] = field(default_factory=dict)
     # ``SequenceMetrics.compute()``: "delta1", "nll", "ece_delta", ... (NaN is kept as None).
     figures: Mapping[str, float | None] = field(default_factory=dict)

@@ -42,10 +42,13 @@ class WorkItem:
         return f"{self.dataset}/{self.sequence}"
 
     def open(self) -> FrameSequence:
-        """Open it. Raises FileNotFoundError, ValueError: it cannot be opened."""
+        """Open it. Raises FileNotFoundError, ValueError: it cannot be opened, or its scale is not known."""
+        from ufmstar_torch.eval.run.scale import require_metric
         from ufmstar_torch.eval.sequences.open import open_sequence
 
-        return open_sequence(self.path, self.layout, **dict(self.opening))
+        sequence = open_sequence(self.path, self.layout, **dict(self.opening))
+        require_metric(sequence)
+        return sequence
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,12 @@ ALL = Shard()
 
 
 def find_work(
-    roots: Iterable[str], *, sample: int | None = None, seed: int = 0, only: Iterable[str] | None = None
+    roots: Iterable[str],
+    *,
+    sample: int | None = None,
+    seed: int = 0,
+    only: Iterable[str] | None = None,
+    layout: str = "auto",
 ) -> list[WorkItem]:
     """All sequences below the roots, sorted.
 
@@ -93,13 +101,14 @@ def find_work(
         sample: of each data set, take as many at random (all where it has fewer).
         seed: of the sample: the same names give the same sample, wherever they lie.
         only: names of sequences (or DATASET/NAME) to take, instead of all; the sample is drawn from them.
+        layout: the only one to look for; "auto": any.
 
     Raises:
         FileNotFoundError: no such root.
         ValueError: no sequence below a root, a name in ``only`` that is not there, one name twice in a data set, a
             sample below 1.
     """
-    items = sorted({item for root in roots for item in _below(root)})
+    items = sorted({item for root in roots for item in _below(root, layout)})
     twice = [key for key, n in Counter(item.folder for item in items).items() if n > 1]
     if twice:
         paths = ", ".join(item.path for item in items if item.folder == twice[0])
@@ -143,7 +152,7 @@ def content_digest(sequence: FrameSequence) -> str:
     return digest.hexdigest()
 
 
-def _below(root: str) -> list[WorkItem]:
+def _below(root: str, layout: str) -> list[WorkItem]:
     """The sequences of one root."""
     match = _ROOT.fullmatch(root)
     dataset, path = (match["dataset"], match["path"]) if match else (None, root)
@@ -151,7 +160,7 @@ def _below(root: str) -> list[WorkItem]:
         return [WorkItem(dataset or TOUR, path, path, "auto")]
     from ufmstar_torch.eval.sequences.layout import find_sequences
 
-    sequences = find_sequences(path)
+    sequences = find_sequences(path, layout=layout)
     if not sequences:
         raise ValueError(f"--root {root}: no sequence of a known layout is there or below")
     return [WorkItem(dataset or f.layout, f.name, str(f.path.absolute()), f.layout) for f in sequences]

@@ -23,7 +23,7 @@ SWAY = 0.04  # of the hand, at most, on either axis [m]
 _GLANCE, _PITCH, _ROLL = np.radians(22.0), np.radians(4.0), np.radians(1.2)
 
 
-def tour_path(tour: Tour, frames: int, seed: int | None = None) -> Tensor:
+def tour_path(tour: Tour, frames: int, seed: int | None = None, *, pan: bool = False) -> Tensor:
     """[N, 4, 4] float64 camera-to-world poses [m] of a camera that walks through the rooms and comes back.
 
     Without ``seed``, it starts in the first room, walks to the farthest one that the frames allow and back, and
@@ -34,6 +34,7 @@ def tour_path(tour: Tour, frames: int, seed: int | None = None) -> Tensor:
         tour: where.
         frames: at least 1.
         seed: of the start, the sway of the hand and the glances; None = the tour's own.
+        pan: the camera stays at the start and turns, with the sway of the hand as its only baseline.
 
     Raises:
         ValueError: no frame, or a negative seed.
@@ -51,7 +52,12 @@ def tour_path(tour: Tour, frames: int, seed: int | None = None) -> Tensor:
         way = way if rng.random() < 0.5 else way[::-1].copy()
         way = np.roll(way, -int(rng.integers(len(way))), axis=0)
         s = _samples(way, frames, min(1.0, frames / _effort(way)[-1]))
-    return torch.from_numpy(_poses(tour, way, s, rng))
+    poses = _poses(tour, way, s, rng)
+    if pan:
+        sway = np.stack([_waves(_STEP * np.arange(frames), rng, 0.35, 1.1) for _ in range(3)], 1)
+        poses[:, :3, 3] = poses[0, :3, 3] + 0.7 * SWAY * sway
+        poses[:, :3, :3] = np.stack([turn(i * _TURN / 2) @ poses[0, :3, :3] for i in range(frames)])
+    return torch.from_numpy(poses)
 
 
 def _way_within(tour: Tour, frames: int) -> tuple[Array, float]:

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.tour.tour import Tour, make_tour
 from ufmstar_torch.eval.tour.view import TourView, intrinsics, render
 
 PREFIX = "tour:"
-_FORM = "tour:SEED or tour:SEED?option=value&..., with the options style, frames, size, fov, path and sensor"
+_FORM = "tour:SEED or tour:SEED?option=value&..., with the options style, frames, size, fov, path, pan and sensor"
 FPS = 15.0  # of the timestamps
 _KEPT = 4  # rendered frames kept, so that a frame's image and depth come from one rendering
 
@@ -25,8 +25,8 @@ _KEPT = 4  # rendered frames kept, so that a frame's image and depth come from o
 def open_tour(name: str) -> FrameSequence:
     """The tour of a name.
 
-    Options: ``style`` (home, hall, mixed), ``frames``, ``size`` (HxW), ``fov`` (degrees), ``path`` (seed of the way)
-    and ``sensor`` (1, or 0 for a perfect camera).
+    Options: ``style`` (home, hall, mixed, blank), ``frames``, ``size`` (HxW), ``fov`` (degrees), ``path`` (seed of the
+    way), ``pan`` (1: the camera turns in place) and ``sensor`` (1, or 0 for a perfect camera).
 
     Raises:
         ValueError: another form, an unknown option, or a value that it does not take.
@@ -57,6 +57,7 @@ def tour_sequence(
     style: str = "home",
     fov: float = 70.0,
     path_seed: int | None = None,
+    pan: bool = False,
     sensor: bool = True,
 ) -> FrameSequence:
     """A tour as a sequence; frames are rendered when they are indexed.
@@ -65,9 +66,9 @@ def tour_sequence(
         seed: of the rooms, see :func:`make_tour`.
         frames: at least 1.
         size: (H, W) of images and depth maps.
-        style: ``home``, ``hall`` or ``mixed``.
+        style: ``home``, ``hall``, ``mixed`` or ``blank``.
         fov: horizontal field of view [degrees], 20 to 120.
-        path_seed: see :func:`tour_path`.
+        path_seed, pan: see :func:`tour_path`.
         sensor: whether images have a sensor's exposure, vignetting and noise.
 
     Raises:
@@ -78,7 +79,7 @@ def tour_sequence(
     if not 20 <= fov <= 120:
         raise ValueError(f"fov must be 20 to 120 degrees, got {fov}")
     tour = make_tour(seed, style)
-    poses = tour_path(tour, frames, path_seed)
+    poses = tour_path(tour, frames, path_seed, pan=pan)
     K = intrinsics(size[0], size[1], fov)
     renderer = _Renderer(tour, poses, K, size, sensor)
     entries = [
@@ -155,5 +156,6 @@ _OPTIONS: dict[str, tuple[str, Callable[[str], Any], str]] = {
     "size": ("size", parse_size, "HxW in pixels, 160x224 say"),
     "fov": ("fov", float, "a number of degrees, 20 to 120"),
     "path": ("path_seed", _whole, "a number of at least 0"),
+    "pan": ("pan", {"0": False, "1": True}.__getitem__, "0 or 1"),
     "sensor": ("sensor", {"0": False, "1": True}.__getitem__, "0 or 1"),
 }

@@ -1,7 +1,8 @@
 """The styles of a tour's rooms: sizes, surfaces and light.
 
 ``home`` is the distribution that a network can be trained on; ``hall`` lies outside of it: larger rooms and
-things, darker and colder light, and textures that no home has. ``mixed`` begins at home and ends in a hall.
+things, darker and colder light, and textures that no home has. ``mixed`` begins at home and ends in a hall. ``blank``
+is a home of plain surfaces, full of furniture: most walls and floors show nothing to measure.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ MIXED = TourStyle(
     room_size=(3.2, 4.4),
     last=replace(HALL, rooms=(1, 1), room_size=(7.0, 9.0), ceiling=(3.6, 4.6), scale=(1.4, 1.7), furniture=0.22),
 )
-STYLES = {"home": HOME, "hall": HALL, "mixed": MIXED}
+BLANK = replace(HOME, name="blank", textures=("plain",) * 4 + ("stripes", "books", "painting", "window"), furniture=0.9)
+STYLES = {"home": HOME, "hall": HALL, "mixed": MIXED, "blank": BLANK}
 
 
 def style_of(style: str) -> TourStyle:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.optional import optional
+
 # Lucas-Kanade on patches 8 px wide and 16 high over four octaves, at most ten iterations each. OpenCV computes eight
 # pixels of a row at once and the rest one by one: a patch of 11 x 11, no larger, takes longer by a third. On six
 # rendered tours this one followed as many corners, and their depths erred no more on average.
@@ -61,7 +63,7 @@ def _there_and_back(
     levels: int, back_tolerance: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
     """As :func:`follow`, from a first guess of the positions over so many octaves beyond the first."""
-    import cv2
+    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
 
     # The first flag asks for the patch's eigenvalue in place of the difference of the patches, which would be computed
     # in a pass of its own; neither is used.
@@ -91,7 +93,7 @@ def find(gray: NDArray[np.uint8], count: int, spacing: float, followed: NDArray[
     Returns:
         [n, 2] positions (u, v) [px]: the best of every cell of the image, then the second best, and so on.
     """
-    import cv2
+    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
 
     # A large image is searched at half its size: a tenth of the time, and a corner need not be met exactly, only be the
     # same from frame to frame.

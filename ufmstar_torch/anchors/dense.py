@@ -25,6 +25,7 @@ from ufmstar_torch.anchors.dense_poses import PoseErrors
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker, TrackerConfig, checked
 from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.optional import optional
 
 if TYPE_CHECKING:
     from ufmstar_torch.kernels.dense_cpu import Search, Views
@@ -178,7 +179,7 @@ class DenseEvidence(SavedState):
     ) -> Landmarks:
         """The depths of a reduced image: landmarks that it shows, measured again where the camera has moved, new ones
         in the cells between them, and corners where none is. The running estimates follow."""
-        from ufmstar_torch.kernels.beside_cpu import beside  # kernels compile when they are first needed
+        from ufmstar_torch.kernels.anchor_check_cpu import check_anchors  # kernels compile when they are first needed
         from ufmstar_torch.kernels.dense_cpu import measure
 
         cell, K = _cell(small.shape[1]), self._errors.camera(K)
@@ -214,7 +215,7 @@ class DenseEvidence(SavedState):
             self._depth *= float(np.exp(step))
         shared = self._tracker.shared(max(self._baseline, self._tracker.baseline))
         stated = variance[kept] + self._memory.apart * np.square(rho[kept]) + shared
-        surface, alone = beside(small, pixel[kept], rho[kept], stated, cell)
+        surface, alone = check_anchors(small, pixel[kept], rho[kept], stated, cell)
         far = self._apart(corners, surface, small.shape[1]) if trusted else np.zeros(0, np.int64)
         depth = np.concatenate([1 / rho[kept], corners.depth[far]])
         spread = np.concatenate([(stated + alone) * depth[: len(kept)] ** 4, corners.variance[far]])
@@ -258,7 +259,7 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
     """An image no wider than ``width``, and [3, 3] its pixels from those of ``gray``."""
     if gray.shape[1] <= width:
         return gray, np.eye(3)
-    import cv2
+    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
 
     size = (width, max(round(gray.shape[0] * width / gray.shape[1]), 1))
     small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.saved_state import SavedState
+from ufmstar_torch.anchors.saved_state import SavedState, saved_image
 
 # A frame becomes a keyframe where the camera has moved by this share of the median depth, or turned so far [rad].
 _MOVED, _TURNED = 0.015, np.deg2rad(4.0)
@@ -119,5 +119,6 @@ class Keyframes(SavedState):
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Continue where :meth:`state` was taken; ValueError: another number of keyframes."""
+        images = [saved_image(state, f"image{i}") for i in range(self._count)]
         super().load_state(state)
-        self._image = [state[f"image{i}"].numpy() for i in range(self._count)]
+        self._image = images

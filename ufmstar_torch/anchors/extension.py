@@ -19,7 +19,7 @@ from ufmstar_torch.anchors.evidence import SUMS, Evidence, inliers, means, obser
 from ufmstar_torch.camera import unproject_at
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Columns, Distribute, Extension, FrameExtension, Tensors, Total
-from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.frame import LARGEST, FrameInput
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import StepOutput
 from ufmstar_torch.state import UfMStarState
@@ -208,6 +208,12 @@ class AnchorExtension(Extension):
     def by_stream(self, streams: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, Tensor]:
         """``overall_evidence`` [B, 3], sums over anchors of the stream."""
         return {"overall_evidence": torch.zeros(streams, SUMS, dtype=dtype, device=device)}
+
+    def require_state(self, state: Tensors) -> None:
+        """See :meth:`Extension.require_state`."""
+        for name in ("evidence", "overall_evidence"):
+            if bool((state[name][..., 0] < 0).any()) or bool((state[name].abs() > LARGEST).any()):
+                raise ValueError(f"{name} holds negative weights or values beyond {LARGEST:g}")
 
     def of_frame(
         self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool

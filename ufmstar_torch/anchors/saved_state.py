@@ -7,7 +7,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+# No coordinate, count or information of a stream exceeds it.
+LARGEST = 1e12
+
+
+def saved_image(state: Mapping[str, Tensor], name: str) -> NDArray[np.uint8]:
+    """A grey image [H, W] of a saved state; raises ValueError: it is none."""
+    image = state[name]
+    if image.dtype != torch.uint8 or image.dim() != 2:
+        raise ValueError(f"state[{name!r}] must be an image uint8 [H, W], got {image.dtype} {tuple(image.shape)}")
+    return image.numpy()
 
 
 class SavedState:
@@ -27,15 +39,17 @@ class SavedState:
         """Continue where :meth:`state` was taken.
 
         Raises:
-            ValueError: an array of another shape, or a value that is not finite; nothing has changed then.
+            ValueError: an array of another shape or dtype, or a value that is impossible; nothing has changed then.
         """
         values: dict[str, Any] = {}
         for attribute, name in self.HELD.items():
-            value, expected = np.array(state[name].numpy()), np.shape(getattr(self, attribute))
-            if value.shape != expected:
-                raise ValueError(f"state[{name!r}] must have shape {expected}, got {value.shape}")
-            if not np.isfinite(value).all():
-                raise ValueError(f"state[{name!r}] must be finite: the state is damaged, start with reset()")
+            value, own = np.array(state[name].numpy()), np.asarray(getattr(self, attribute))
+            if value.shape != own.shape or value.dtype != own.dtype:
+                expected = f"{own.dtype} of shape {own.shape}"
+                raise ValueError(f"state[{name!r}] must be {expected}, got {value.dtype} {value.shape}")
+            if not (np.abs(value, dtype=np.float64) <= LARGEST).all():  # NaN is not
+                text = f"finite and within {LARGEST:g}: the state is damaged, start with reset()"
+                raise ValueError(f"state[{name!r}] must be {text}")
             values[attribute] = value if value.ndim else value.item()
         for attribute, value in values.items():
             setattr(self, attribute, value)

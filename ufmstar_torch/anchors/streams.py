@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -20,7 +21,8 @@ _CAUSES = (
     "Are poses camera-to-world, of the images' times, and the intrinsics the images'? Does the video stand still? "
     "(said once)"
 )
-Given = str | Path | LandmarkSource
+# A file may be named by a str too; type checkers then find no misspelt word.
+Given = Literal["corners", "dense"] | Path | LandmarkSource
 _PARTS = ("pixel", "depth", "variance", "valid", "pose_error", "shared")
 
 
@@ -47,7 +49,13 @@ class StreamLandmarks:
         self._warned = set[int]()
 
     def update(
-        self, image: Tensor | None, pose: Tensor, intrinsics: Tensor, rotation_tolerance: float | None = None
+        self,
+        image: Tensor | None,
+        pose: Tensor,
+        intrinsics: Tensor,
+        rotation_tolerance: float | None = None,
+        *,
+        skip: bool = True,
     ) -> Anchors:
         """Anchors of the next image of every stream, in its pixels. Where it raises, no source has changed.
 
@@ -55,14 +63,15 @@ class StreamLandmarks:
             image: [B, 3, H, W] RGB, uint8, or floating-point in [0, 1]; None: the sources need none.
             pose: [B, 4, 4] or [4, 4] camera-to-world [m].
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px].
-            rotation_tolerance: a stream whose pose or intrinsics have a fault (``frame.FRAME_FAULTS``) skips the image:
-                it has no anchors and its source stays as it is. None = the source raises.
+            rotation_tolerance: of poses; None = the sources check them.
+            skip: a stream whose pose or intrinsics have a fault (``frame.FRAME_FAULTS``) skips the image: it has no
+                anchors and its source stays as it is. Otherwise a fault is an error.
 
         Returns:
             [B, N], padded and masked, on the image's device.
 
         Raises:
-            ValueError: another number of streams than sources, an image of another kind, or as
+            ValueError: another number of streams than sources, an image of another kind, a fault, or as
                 :meth:`LandmarkSource.update`.
         """
         b = len(self._sources) if image is None else len(image)
@@ -75,6 +84,8 @@ class StreamLandmarks:
         if rotation_tolerance is not None:
             size = (torch.inf, torch.inf) if pictures is None else pictures.shape[1:3]
             faults = _faults(torch.from_numpy(T), K, size, rotation_tolerance)
+        if not skip and (bad := [f"stream {i}: {FRAME_FAULTS[fault]}" for i, fault in enumerate(faults) if fault]):
+            raise ValueError("; ".join(bad))
         try:
             result = [
                 Landmarks.skipped(FRAME_FAULTS[fault])

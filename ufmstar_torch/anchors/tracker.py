@@ -17,8 +17,9 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.corners import find, follow
-from ufmstar_torch.anchors.saved_state import SavedState
+from ufmstar_torch.anchors.saved_state import SavedState, saved_image
 from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.optional import optional
 
 if TYPE_CHECKING:
     from ufmstar_torch.kernels.triangulate_cpu import Triangulated
@@ -208,8 +209,9 @@ class LandmarkTracker(SavedState):
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Continue where :meth:`state` was taken; ValueError: another ``max_points`` or ``window``."""
+        gray = saved_image(state, "gray")
         super().load_state(state)
-        self._gray = state["gray"].numpy()
+        self._gray = gray
         self._triangulated()
 
     def update(
@@ -441,6 +443,6 @@ def checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[ND
         raise ValueError("K must be a finite 3x3 matrix with positive focal lengths [px]")
     if image.ndim == 2:
         return np.ascontiguousarray(image), T, K
-    import cv2
+    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
 
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), dtype=np.uint8), T, K

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.extension import AnchorFrame
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.extension import Extension, FrameExtension, Total
+from ufmstar_torch.extension import Extension, FrameExtension, Tensors, Total
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.output import StepOutput
-from ufmstar_torch.posterior.running import SIZE
+from ufmstar_torch.posterior.running import SIZE, Running
 from ufmstar_torch.posterior.update import Posterior, PosteriorUpdate
 from ufmstar_torch.state import UfMStarState
 
@@ -49,9 +49,10 @@ class PosteriorFrame(FrameExtension):
         return state.with_tensors({"posterior": learnt}), replace(out, statistics=statistics)
 
     def outputs(self) -> dict[str, Tensor]:
-        """The corrected depth and its variance."""
+        """The corrected depth, its variance, and the probability of another surface."""
         assert self._posterior is not None
-        return {"posterior_depth": self._posterior.depth, "posterior_variance": self._posterior.variance}
+        names = ("depth", "variance", "outlier")
+        return {f"posterior_{name}": getattr(self._posterior, name) for name in names}
 
 
 class PosteriorExtension(Extension):
@@ -70,6 +71,13 @@ class PosteriorExtension(Extension):
     def by_stream(self, streams: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, Tensor]:
         """``posterior`` [B, S] float64, what was learnt of the stream (``posterior.running``)."""
         return {"posterior": torch.zeros(streams, SIZE, dtype=torch.float64, device=device)}
+
+    def require_state(self, state: Tensors) -> None:
+        """See :meth:`Extension.require_state`."""
+        assert self._config.posterior is not None
+        packed = state["posterior"]
+        started = torch.cat([packed[:, :1].clamp_min(1), packed[:, 1:]], 1)  # what is stored, not the start
+        Running.of(torch.where(packed.any(1, keepdim=True), started, packed), self._config.posterior).require()
 
     def of_frame(
         self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool

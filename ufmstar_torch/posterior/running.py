@@ -9,7 +9,7 @@ not decide.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -19,6 +19,9 @@ from ufmstar_torch.posterior.config import PosteriorConfig
 
 FEATURES = 4  # 1, log d - m_0, u and v from -1 to 1
 _MATRIX = FEATURES * FEATURES
+# Beyond what any run reaches: of m_0, the log of the largest depth that is accepted (``frame.DEPTH_RANGE``); of the
+# others, which count anchors and frames or are squares of logs.
+LARGEST_LOG, LARGEST = 14.0, 1e9
 
 
 class Ratio(NamedTuple):
@@ -53,9 +56,9 @@ class Running:
     Attributes:
         config: of the posterior.
         frames: [B] that had anchors.
-        mean: [B] m_0 of the last of them.
+        mean: [B] m_0 of the last frame.
         above, below: by name of :func:`ratios`, [B] sums whose quotient is the ratio.
-        coefficients: [B, 4] of the features in the last of them.
+        coefficients: [B, 4] of the features in the last frame.
         covariance: [B, 4, 4] of these.
     """
 
@@ -86,6 +89,26 @@ class Running:
         """[B, SIZE], for :meth:`of`."""
         scalars = [self.frames, self.mean, *self.above.values(), *self.below.values()]
         return torch.cat([torch.stack(scalars, 1), self.coefficients, self.covariance.flatten(1)], 1)
+
+    def drifted(self, mean: Tensor) -> Tensor:
+        """[B, SIZE] after a frame without anchors whose m_0 is ``mean`` [B]; zeros before the first anchor."""
+        coefficients, covariance = self.expected(mean)
+        packed = replace(self, mean=mean, coefficients=coefficients, covariance=covariance).packed()
+        return torch.where(self.frames[:, None] > 0, packed, torch.zeros_like(packed))
+
+    def require(self) -> None:
+        """Raise a ValueError unless anchors can have taught these numbers."""
+        sums = torch.stack([*self.above.values(), *self.below.values(), self.frames])
+        scale = self.covariance.abs().amax((1, 2)).clamp(1e-300, 1e300)
+        low = torch.linalg.eigvalsh(self.covariance / scale[:, None, None])[:, 0]
+        wrong = {
+            f"values beyond {LARGEST:g}": self.packed().abs() > LARGEST,
+            "negative sums": sums < 0,
+            "a mean of logs that no depth has": self.mean.abs() > LARGEST_LOG,
+            "a covariance that is none": low < -1e-6,
+        }
+        if names := [name for name, bad in wrong.items() if bool(bad.any())]:
+            raise ValueError(f"posterior holds impossible values: {', '.join(names)}")
 
     def ratio(self, name: str) -> Tensor:
         """[B] within its range; 0/0 is the prior's value."""

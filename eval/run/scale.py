@@ -1,0 +1,88 @@
+"""The unit of poses from structure from motion, by a depth network's own scale (``--scale-from network``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
+from ufmstar_torch.eval.sequences.colmap import read_landmarks
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+
+_MOST_FRAMES, _FEWEST_FRAMES = 24, 3
+_FEWEST_LANDMARKS = 10  # of a frame that counts
+_NO_SCALE = (
+    "sequence {name!r}: the unit of its poses is not known, which structure from motion cannot measure. Give "
+    "--pose-scale M (metres per unit), make it with `ufmstar poses --length A B METRES` (or --trajectory), or accept "
+    "the network's own scale with --scale-from network"
+)
+
+
+@dataclass(frozen=True)
+class NetworkScale:
+    """A scale that makes landmarks as far away as a network predicts.
+
+    Attributes:
+        metres: per unit of the poses: the median over frames of their median d / z, d [m] the predicted depth and z
+            that of a landmark.
+        spread: half the range of the middle 68 % of the frames' medians, as a share of ``metres``.
+        frames: number of frames.
+    """
+
+    metres: float
+    spread: float
+    frames: int
+
+
+def require_metric(sequence: FrameSequence) -> None:
+    """Raises ValueError where the unit of the poses is not known; the message names the options that help."""
+    if not sequence.metric:
+        raise ValueError(_NO_SCALE.format(name=sequence.name))
+
+
+def network_scale(sequence: FrameSequence, source: DepthSource, indices: range) -> NetworkScale:
+    """The scale of a COLMAP model's poses by the depths of a source, on at most 24 of the frames ``indices``.
+
+    Raises:
+        ValueError: the poses are metric, or are no COLMAP model's; or fewer than three frames see ten landmarks each.
+    """
+    if sequence.metric or sequence.folder is None or sequence.layout != "colmap":
+        raise ValueError(
+            "--scale-from network is for COLMAP models whose scale is not known, which have landmarks to compare with"
+        )
+    landmarks = read_landmarks(sequence.folder)
+    medians = []
+    spaced = np.linspace(0, len(indices) - 1, min(_MOST_FRAMES, len(indices))).round().astype(int)
+    for turn, number in enumerate(np.unique(spaced).tolist()):
+        entry = sequence.entries[indices[number]]
+        points = landmarks.get(entry.name, np.zeros((0, 3)))
+        try:
+            predicted = source.one(sequence[indices[number]], source.turn(turn))
+        except FrameError:  # counted when its turn comes
+            continue
+        ratios = _ratios(points, entry.T_world_cam, predicted)
+        if len(ratios) >= _FEWEST_LANDMARKS:
+            medians.append(float(np.median(ratios)))
+    if len(medians) < _FEWEST_FRAMES:
+        raise ValueError(
+            f"--scale-from network: {len(medians)} frames see {_FEWEST_LANDMARKS} landmarks of the model, at least "
+            f"{_FEWEST_FRAMES} are needed"
+        )
+    metres = float(f"{np.median(medians):.4g}")  # the same in a continued run, whatever the last bits of a network
+    low, high = np.percentile(medians, [16, 84])
+    return NetworkScale(metres, float(high - low) / 2 / metres, len(medians))
+
+
+def _ratios(points: np.ndarray, T_world_cam: np.ndarray, predicted: Predicted) -> np.ndarray:
+    """[M] predicted depth over landmark's, of those in the map."""
+    T_cam_world = np.linalg.inv(T_world_cam)
+    in_camera = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+    in_camera = in_camera[in_camera[:, 2] > 0]
+    K, depth = predicted.intrinsics[0].numpy(), predicted.maps.depth[0].detach().float().cpu().numpy()
+    pixel = np.rint((in_camera @ K.T)[:, :2] / in_camera[:, 2:])
+    inside = ((pixel >= 0) & (pixel < depth.shape[::-1])).all(axis=1)
+    column, row = pixel[inside].astype(int).T
+    found, z = depth[row, column], in_camera[inside, 2]
+    usable = np.isfinite(found) & (found > 0)
+    return np.asarray(found[usable] / z[usable])

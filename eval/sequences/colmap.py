@@ -1,0 +1,262 @@
+"""COLMAP: ``sparse/0/{cameras,images,points3D}.{bin,txt}`` beside ``images/``, of any number of cameras.
+
+Poses are world-to-camera in a unit of their own: metres only where ``ufmstar poses`` wrote so (``poses.json``), or with
+``pose_scale``. The first pixel's centre is (0.5, 0.5) there. Depth maps may lie in ``depth/``. The files are read here,
+not by pycolmap, which accepts truncated cameras and does not return from truncated images.
+https://colmap.github.io/format.html
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.attach import pair_depth
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped
+from ufmstar_torch.eval.sequences.generic import DEPTHS, listed_times
+from ufmstar_torch.eval.sequences.images import depth_loader, natural_key, read_color
+from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
+from ufmstar_torch.eval.sequences.options import Options, resolve
+from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_quaternions
+
+LOOKED_FOR = "cameras and images (.bin or .txt) in sparse/0/, sparse/ or the folder itself"
+SCALE_FILE, MODEL = "poses.json", "sparse/0"
+# By COLMAP's number: name, and of its parameters how many are focal lengths and how many distortion coefficients; the
+# others are the principal point. Models without a number of coefficients are not OpenCV's.
+_MODELS: tuple[tuple[str, int, int | None], ...] = (
+    *(("SIMPLE_PINHOLE", 1, 0), ("PINHOLE", 2, 0), ("SIMPLE_RADIAL", 1, 1), ("RADIAL", 1, 2), ("OPENCV", 2, 4)),
+    *(("OPENCV_FISHEYE", 2, 4), ("FULL_OPENCV", 2, 8), ("FOV", 2, None), ("SIMPLE_RADIAL_FISHEYE", 1, 1)),
+    *(("RADIAL_FISHEYE", 1, 2), ("THIN_PRISM_FISHEYE", 2, None)),
+)
+_NORM_TOLERANCE = 0.02  # of a quaternion
+_NO_POINT = 2**64 - 1
+
+
+class _View(NamedTuple):
+    """An image of a model: its name, camera, pose as qw qx qy qz tx ty tz (world-to-camera), and its points' ids."""
+
+    name: str
+    camera: int
+    pose: tuple[float, ...]
+    points: np.ndarray
+
+
+def detect(path: Path) -> bool:
+    """Whether a model lies in the folder."""
+    return _model_folder(path) is not None
+
+
+def read(path: Path, options: Options) -> FrameSequence:
+    """Opens a model's images in the order of their names. ``images`` and ``depth`` name other folders than ``images/``
+    and ``depth/``; an image that is not there is skipped and counted. Times come from ``rgb.txt`` beside the images.
+
+    Raises:
+        ValueError: a file is truncated or malformed (named), a camera model that is not OpenCV's, or no usable frame.
+    """
+    model = _model_folder(path)
+    assert model is not None
+    root = next((f for f in (path, *model.parents[:2]) if (f / "images").is_dir()), path)
+    folder = resolve(path, options.images) if options.images is not None else root / "images"
+    cameras = _cameras(_file(model, "cameras"))
+    views = sorted(_views(_file(model, "images")), key=lambda view: natural_key(Path(_frame_name(view))))
+    if not views:
+        raise ValueError(f"{_file(model, 'images')} holds no image")
+    names = [_frame_name(view) for view in views]
+    depths = next((root / name for name in DEPTHS if (root / name).is_dir()), None)
+    depths = resolve(path, options.depth) if options.depth is not None else depths
+    depth_of = {} if depths is None else pair_depth(names, depths)
+    times = listed_times(folder, [Path(view.name) for view in views])
+    frames: list[Entry | Skipped] = []
+    lenses = {}
+    for number, (view, name) in enumerate(zip(views, names, strict=True)):
+        if view.camera not in cameras:
+            raise ValueError(f"{_file(model, 'images')}: image {view.name!r} has the camera {view.camera}, not listed")
+        if not (folder / view.name).is_file():
+            frames.append(Skipped(name, "missing image file"))
+            continue
+        lenses[name] = cameras[view.camera]
+        load_depth = depth_loader(depth_of.get(name), options.depth_scale)
+        time = None if times is None else float(times[number])
+        frames.append(Entry(name, _pose(view, model), partial(read_color, folder / view.name), load_depth, time))
+    name = path.resolve().name
+    metric = _metric(root) and model == root / MODEL
+    return sequence_of_lenses(name, "colmap", frames, lenses, path, options, times=times, metric=metric)
+
+
+def read_landmarks(path: Path) -> dict[str, np.ndarray]:
+    """The triangulated points [N, 3] that each frame sees, by its name, in the axes and unit of the model's poses.
+    Raises ValueError: no model there, or a file is truncated or malformed."""
+    model = _model_folder(path)
+    if model is None:
+        raise ValueError(f"{path} holds no COLMAP model: looked for {LOOKED_FOR}")
+    points = _points(_file(model, "points3D"))
+    return {
+        _frame_name(view): np.array([points[key] for key in view.points.tolist() if key in points]).reshape(-1, 3)
+        for view in _views(_file(model, "images"))
+    }
+
+
+def _model_folder(path: Path) -> Path | None:
+    for folder in (path / MODEL, path / "sparse", path):
+        if all(any((folder / f"{part}{end}").is_file() for end in (".bin", ".txt")) for part in ("cameras", "images")):
+            return folder
+    return None
+
+
+def _file(model: Path, part: str) -> Path:
+    return next((f for f in (model / f"{part}.bin", model / f"{part}.txt") if f.is_file()), model / f"{part}.bin")
+
+
+def _frame_name(view: _View) -> str:
+    """The image's name without ending; its folders become part of it."""
+    return str(Path(view.name).with_suffix("")).strip("/").replace("/", "__")
+
+
+def _metric(root: Path) -> bool:
+    with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
+        return json.loads((root / SCALE_FILE).read_text())["scale_from"] is not None
+    return False
+
+
+def _pose(view: _View, model: Path) -> np.ndarray:
+    """[4, 4] camera-to-world, NaN where it is not finite."""
+    quaternion, position = np.array(view.pose[:4]), np.array(view.pose[4:])
+    if not np.isfinite(view.pose).all():
+        return np.full((4, 4), np.nan)
+    if abs(np.linalg.norm(quaternion) - 1) > _NORM_TOLERANCE:
+        raise ValueError(f"{model}: the quaternion of image {view.name!r} is {quaternion}, expected a norm of 1")
+    return np.asarray(np.linalg.inv(poses_from_quaternions(position[None], np.roll(quaternion, -1)[None])[0]))
+
+
+def _lens(file: Path, model: str, size: tuple[int, int], values: tuple[float, ...]) -> Lens:
+    """A camera of (W, H) ``size``. Raises ValueError: a model that OpenCV does not have, or other parameters."""
+    focal, count = next(((f, c) for name, f, c in _MODELS if name == model), (0, None))
+    if count is None:
+        known = ", ".join(name for name, _, c in _MODELS if c is not None)
+        raise ValueError(f"{file}: camera model {model[:60]!r} is none of {known}: let COLMAP undistort the images")
+    if len(values) != focal + 2 + count or not np.isfinite(values).all() or min(size) < 1:
+        raise ValueError(f"{file}: a camera {model} has {focal + 2 + count} finite parameters and a size, got {values}")
+    (fx, fy), (cx, cy) = (values[0], values[focal - 1]), values[focal : focal + 2]
+    coefficients = values[focal + 2 :]
+    if 0 < count < 4:
+        coefficients = (*coefficients, *[0.0] * (4 - count))
+    return Lens((fx, fy, cx - 0.5, cy - 0.5), (size[1], size[0]), coefficients, "FISHEYE" in model)
+
+
+class _Bytes:
+    """The values of a binary file, one after the other."""
+
+    def __init__(self, file: Path) -> None:
+        self.file, self.data, self.at = file, file.read_bytes(), 0
+
+    def take(self, form: str) -> tuple[Any, ...]:
+        """Raises ValueError: the file ends before."""
+        size = struct.calcsize("<" + form)
+        if self.at + size > len(self.data):
+            raise ValueError(f"{self.file} is truncated: {len(self.data):,} bytes, more are stated")
+        self.at += size
+        return struct.unpack_from("<" + form, self.data, self.at - size)
+
+    def array(self, dtype: list[tuple[str, str]], count: int) -> np.ndarray:
+        """[count] records. Raises ValueError: the file ends before."""
+        size = np.dtype(dtype).itemsize * count
+        if self.at + size > len(self.data):
+            raise ValueError(f"{self.file} is truncated: {len(self.data):,} bytes, more are stated")
+        self.at += size
+        return np.frombuffer(self.data, dtype, count, self.at - size)
+
+    def text(self) -> str:
+        """Up to a zero. Raises ValueError: there is none, or it is no UTF-8."""
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise ValueError(f"{self.file} is truncated within an image's name")
+        self.at, start = end + 1, self.at
+        return self.data[start:end].decode()
+
+
+def _cameras(file: Path) -> dict[int, Lens]:
+    if file.suffix == ".txt":
+        cameras = {}
+        for number, words in _lines(file):
+            if words:
+                key, width, height, *values = _numbers([words[0], *words[2:]], file, number, whole=3)
+                cameras[int(key)] = _lens(file, words[1], (int(width), int(height)), tuple(values))
+        return cameras
+    stored, cameras = _Bytes(file), {}
+    for _ in range(stored.take("Q")[0]):
+        key, model, width, height = stored.take("IiQQ")
+        if not 0 <= model < len(_MODELS):
+            raise ValueError(f"{file}: unknown camera model {model}")
+        name, focal, count = _MODELS[model]
+        cameras[key] = _lens(file, name, (width, height), stored.take(f"{focal + 2 + (count or 0)}d"))
+    return cameras
+
+
+def _views(file: Path) -> Iterator[_View]:
+    if file.suffix == ".txt":
+        yield from _views_of_text(file)
+        return
+    stored = _Bytes(file)
+    for _ in range(stored.take("Q")[0]):
+        _, *pose, camera = stored.take("I7dI")
+        name, count = stored.text(), stored.take("Q")[0]
+        points = stored.array([("x", "<f8"), ("y", "<f8"), ("id", "<u8")], count)["id"]
+        yield _View(name, camera, tuple(pose), points[points != _NO_POINT].astype(np.int64))
+
+
+def _views_of_text(file: Path) -> Iterator[_View]:
+    lines = list(_lines(file))
+    lines += [(0, [])] * (len(lines) % 2)  # the last image's points, where it has none
+    for (number, words), (below, points) in zip(lines[::2], lines[1::2], strict=True):
+        if not words and not points:
+            continue
+        if len(words) < 10:
+            text = " ".join(words)[:60]
+            raise ValueError(f"{file}:{number}: expected 'ID QW QX QY QZ TX TY TZ CAMERA NAME', got {text!r}")
+        camera, *pose = _numbers([words[8], *words[1:8]], file, number, whole=1)
+        if len(points) % 3:
+            raise ValueError(f"{file}:{below}: expected 'X Y POINT' for every point, got {len(points)} numbers")
+        keys = np.array(_numbers(points[2::3], file, below, whole=len(points) // 3))
+        yield _View(" ".join(words[9:]), int(camera), tuple(pose), keys[keys >= 0].astype(np.int64))
+
+
+def _points(file: Path) -> dict[int, np.ndarray]:
+    if not file.is_file():
+        raise ValueError(f"{file}: no such file, the model has no points")
+    points = {}
+    if file.suffix == ".txt":
+        for number, words in _lines(file):
+            if words:
+                key, *position = _numbers(words[:4], file, number, whole=1)
+                points[int(key)] = np.array([*position, np.nan, np.nan, np.nan])[:3]
+        return points
+    stored = _Bytes(file)
+    for _ in range(stored.take("Q")[0]):
+        key, x, y, z, *_, length = stored.take("Q3d3BdQ")
+        stored.array([("image", "<u4"), ("index", "<u4")], length)
+        points[key] = np.array([x, y, z])
+    return points
+
+
+def _lines(file: Path) -> Iterator[tuple[int, list[str]]]:
+    """Numbers from 1 and words of the lines that are no comments, empty ones included."""
+    return ((number, text.split()) for number, text in numbered_lines(file) if not text.startswith("#"))
+
+
+def _numbers(words: list[str], file: Path, line: int, whole: int) -> list[float]:
+    """The first ``whole`` ones are there, and below 2^53."""
+    try:
+        values = [float(word) for word in words]
+        if len(values) < whole or not all(abs(value) < 2**53 for value in values[:whole]):
+            raise ValueError
+    except ValueError:
+        text = " ".join(words)[:60]
+        raise ValueError(f"{file}:{line}: expected numbers, {whole} of them whole, got {text!r}") from None
+    return values

@@ -1,0 +1,146 @@
+"""EuRoC and other recordings in ASL's layout (TUM-VI): ``mav0/cam0/{data.csv, sensor.yaml, data/}``.
+
+Poses are those of ``mav0/state_groundtruth_estimate0`` (or ``mocap0``, ``vicon0``, ``leica0`` with an orientation), of
+the body, moved to the camera by both sensors' ``T_BS`` and interpolated at the images' times. Images are undistorted.
+https://projects.asl.ethz.ch/datasets/kmavvisualinertialdatasets
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped
+from ufmstar_torch.eval.sequences.images import first_image_size, read_color
+from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens, sequence_of_lenses
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.poses import Trajectory, numbered_lines, poses_from_quaternions
+
+LOOKED_FOR = "mav0/cam0/data.csv and sensor.yaml (also in mav0, or in a camera's folder itself)"
+_TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "leica0")
+_RADIAL = ("radial-tangential", "radtan", "plumb_bob", "none", "")
+_FISHEYES = ("equidistant", FISHEYE)
+_NANOSECOND = 1e-9
+_LARGEST_YAML = 100_000  # [bytes]
+
+
+def detect(path: Path) -> bool:
+    """Whether a camera's folder is there."""
+    return _camera_folder(path) is not None
+
+
+def read(path: Path, options: Options) -> FrameSequence:
+    """Opens the recording of one camera; ``path`` may be the folder of another one than ``cam0``.
+
+    Raises:
+        ValueError: a malformed file (named), no ground truth and no ``trajectory``, or no usable frame.
+    """
+    folder = _camera_folder(path)
+    assert folder is not None
+    rows = _rows(folder / "data.csv")
+    frames: list[Entry | Skipped] = []
+    times = []
+    for words, where in rows:
+        image = folder / "data" / (words[1] if len(words) > 1 else f"{words[0]}.png")
+        times.append(_numbers(words[:1], where)[0] * _NANOSECOND)
+        if image.is_file():
+            frames.append(Entry(image.stem, UNKNOWN, partial(read_color, image), timestamp=times[-1]))
+        else:
+            frames.append(Skipped(image.stem, "missing image file"))
+    stamps = np.array(times)
+    if options.trajectory is None and frames:
+        frames = attach(frames, stamps + options.time_offset, _trajectory(folder), options)
+    lens = _lens(folder / "sensor.yaml", first_image_size(folder / "data" / words[-1] for words, _ in rows))
+    lenses = dict.fromkeys((frame.name for frame in frames), lens)
+    name = folder.parent.parent.resolve().name if folder.parent.name == "mav0" else folder.resolve().name
+    return sequence_of_lenses(name, "euroc", frames, lenses, path, options, times=stamps)
+
+
+def _camera_folder(path: Path) -> Path | None:
+    for folder in (path / "mav0" / "cam0", path / "cam0", path):
+        if (folder / "data.csv").is_file() and (folder / "sensor.yaml").is_file() and (folder / "data").is_dir():
+            return folder
+    return None
+
+
+def _trajectory(camera: Path) -> Trajectory:
+    """The camera's poses. Raises ValueError: no ground truth with an orientation lies beside it."""
+    truth = next((camera.parent / name for name in _TRUTHS if (camera.parent / name / "data.csv").is_file()), None)
+    if truth is None:
+        raise ValueError(f"{camera.parent}: none of {', '.join(_TRUTHS)} holds poses; pass trajectory")
+    rows = [(_numbers(words[:8], where), where) for words, where in _rows(truth / "data.csv")]
+    for values, where in rows:
+        if len(values) < 8:
+            raise ValueError(f"{where}: expected a time [ns], x y z [m] and qw qx qy qz; pass trajectory")
+    table = np.array([values for values, _ in rows]).reshape(-1, 8)
+    table = table[np.isfinite(table).all(axis=1) & (np.linalg.norm(table[:, 4:], axis=1) > 0.5)]
+    stamps, first = np.unique(table[:, 0], return_index=True)
+    if not stamps.size:
+        raise ValueError(f"{truth / 'data.csv'}: no pose with finite values")
+    T_world_sensor = poses_from_quaternions(table[first, 1:4], np.roll(table[first, 4:], -1, axis=1))
+    to_camera = _extrinsics(camera / "sensor.yaml")
+    if (truth / "sensor.yaml").is_file():
+        to_camera = np.linalg.inv(_extrinsics(truth / "sensor.yaml")) @ to_camera
+    return Trajectory(stamps * _NANOSECOND, T_world_sensor @ to_camera)
+
+
+def _extrinsics(file: Path) -> np.ndarray:
+    """T_BS [4, 4] of a sensor's file: points of the sensor in the body's frame [m]; the identity where it has none."""
+    value = _yaml(file).get("T_BS", np.eye(4).tolist())
+    try:
+        T = np.array(value["data"] if isinstance(value, Mapping) else value, dtype=np.float64).reshape(4, 4)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file}: T_BS must be 4x4 numbers: {error}") from error
+    if not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
+        raise ValueError(f"{file}: T_BS must be a rotation and a position, got {T.tolist()}")
+    return T
+
+
+def _lens(file: Path, size: Size | None) -> Lens:
+    values = _yaml(file)
+    model = str(values.get("distortion_model", "")).lower()
+    if model not in (*_RADIAL, *_FISHEYES) or str(values.get("camera_model", "pinhole")).lower() != "pinhole":
+        raise ValueError(f"{file}: expected a pinhole camera with one of {', '.join(_RADIAL[:3])}, {_FISHEYES[0]}")
+    try:
+        fx, fy, cx, cy = (float(value) for value in values["intrinsics"])
+        coefficients = tuple(float(value) for value in values.get("distortion_coefficients") or ())
+        width, height = values.get("resolution") or (size or (0, 0))[::-1]
+        return Lens((fx, fy, cx, cy), (int(height), int(width)), coefficients, model in _FISHEYES)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file}: expected intrinsics fu fv cu cv and resolution W H [px]: {error}") from error
+
+
+def _yaml(file: Path) -> dict[str, Any]:
+    import yaml
+
+    text = file.read_bytes()[: _LARGEST_YAML + 1]
+    try:
+        # "%YAML:1.0", as OpenCV writes it, is no directive of YAML
+        content = yaml.safe_load(text.decode().removeprefix("%YAML:1.0")) if len(text) <= _LARGEST_YAML else None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{file}: expected YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{file}: expected a sensor's YAML of names and values, below {_LARGEST_YAML:,} bytes")
+    return content
+
+
+def _rows(file: Path) -> list[tuple[list[str], str]]:
+    """The words of each line that has any, and FILE:LINE of each; ``#`` starts a comment line."""
+    lines = ((text.strip(), f"{file}:{number}") for number, text in numbered_lines(file))
+    return [
+        ([word.strip() for word in text.replace(";", ",").split(",")], where)
+        for text, where in lines
+        if text and not text.startswith("#")
+    ]
+
+
+def _numbers(words: list[str], where: str) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        raise ValueError(f"{where}: expected numbers separated by commas, got {','.join(words)[:60]!r}") from None

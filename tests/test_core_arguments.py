@@ -1,0 +1,204 @@
+"""What the core takes as an image, a map, a pose and intrinsics, and what it refuses: each error names the argument."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from modules import CONFIG, H, K, W, frame, same
+from PIL import Image
+from torch import nn
+
+from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch.models import Preprocess, wrap_network
+from ufmstar_torch.networks_in_turn import combine
+from ufmstar_torch.recalibrate import Recalibration
+
+DEPTH, POSE, _ = frame(0)
+IMAGE = torch.randint(0, 255, (1, 3, H, W), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+PICTURE = IMAGE[0].permute(1, 2, 0).contiguous().numpy()
+FX, FY, CX, CY = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+K4 = torch.eye(4, dtype=torch.float64)
+K4[:3, :3] = K
+
+
+class Brightness(nn.Module):
+    """Depth is the mean colour."""
+
+    def forward(self, image):
+        return DepthPrediction(1 + image.float().mean(1) / 100)
+
+
+def ufm(*frame, **options):
+    return UfMStar(CONFIG)(*frame, **options)
+
+
+def model(image, *camera, network=None, **options):
+    return UncertainDepth(network or Brightness(), CONFIG, **options)(image, *(camera or (POSE, K)))
+
+
+def seen_two():
+    module = UfMStar(CONFIG)
+    module(DEPTH, POSE, K)
+    return module(DEPTH.expand(2, H, W), POSE, K)
+
+
+REFUSED = {
+    "depth as a single map": (lambda: ufm(DEPTH[0], POSE, K), ValueError, r"depth must .* single map is depth\[None\]"),
+    "depth of five dimensions": (lambda: ufm(DEPTH[:, None, None], POSE, K), ValueError, "depth must be"),
+    "depth without rows": (lambda: ufm(DEPTH[:, :0], POSE, K), ValueError, "depth must be"),
+    "depth in millimetres": (lambda: ufm(DEPTH.short(), POSE, K), TypeError, "depth must have a floating-point dtype"),
+    "depth as a list": (lambda: ufm([[1.0]], POSE, K), TypeError, "depth must be a torch.Tensor or a NumPy array"),
+    "depth of objects": (lambda: ufm(np.array([None]), POSE, K), TypeError, "depth .*got an array of object"),
+    "depth of other streams": (seen_two, ValueError, r"depth has 2 streams .*call reset\(\)"),
+    "pose of 3 x 3": (lambda: ufm(DEPTH, torch.eye(3), K), ValueError, r"pose must be camera-to-world \[B, 4, 4\]"),
+    "pose of other streams": (lambda: ufm(DEPTH, POSE.expand(3, 4, 4), K), ValueError, "pose must have depth's 1"),
+    "pose as text": (lambda: ufm(DEPTH, ["a"], K), TypeError, "pose must hold numbers"),
+    "pose and intrinsics swapped": (lambda: ufm(DEPTH, K, POSE), ValueError, "pose must be"),
+    "intrinsics that are a pose": (lambda: ufm(DEPTH, POSE, frame(3)[1]), ValueError, "intrinsics .*is this the pose"),
+    "intrinsics of 2 x 3": (lambda: ufm(DEPTH, POSE, K[:2]), ValueError, "intrinsics must be .*fx, fy, cx, cy"),
+    "intrinsics of three numbers": (lambda: ufm(DEPTH, POSE, (FX, CX, CY)), ValueError, "intrinsics must be"),
+    "intrinsics of an image twice as large": (
+        lambda: ufm(DEPTH, POSE, (2 * FX, 2 * FY, 2 * W, 2 * H)), ValueError, "principal point outside the depth map"
+    ),
+    "intrinsics that are missing": (lambda: ufm(DEPTH, POSE, None), TypeError, "intrinsics must be a torch.Tensor or"),
+    "aleatoric of another size": (lambda: ufm(DEPTH, POSE, K, DEPTH[:, 1:]), ValueError, "aleatoric must have shape"),
+    "aleatoric elsewhere": (lambda: ufm(DEPTH, POSE, K, DEPTH.to("meta")), ValueError, "aleatoric must lie on"),
+    "epistemic in whole numbers": (lambda: ufm(DEPTH, POSE, K, None, DEPTH.int()), TypeError, "epistemic must have"),
+    "valid as a weight": (lambda: ufm(DEPTH, POSE, K, valid=DEPTH), TypeError, "valid must be a torch.bool"),
+    "valid of another size": (lambda: ufm(DEPTH, POSE, K, valid=DEPTH[:, 1:] > 0), ValueError, "valid must have"),
+    "features that are off": (lambda: ufm(DEPTH, POSE, K, features=DEPTH[:, None]), ValueError, "features must have"),
+    "features that are missing": (
+        lambda: UfMStar(CONFIG.replace(features=1))(DEPTH, POSE, K), ValueError, "features must be given"
+    ),
+    "anchors that are off": (lambda: ufm(DEPTH, POSE, K, anchors=1), ValueError, "anchors must be None where"),
+    "an argument of no extension": (lambda: ufm(DEPTH, POSE, K, ancors=1), TypeError, "takes no argument 'ancors'"),
+    "a config that is a dict": (lambda: UfMStar({}), TypeError, "config must be a UfMStarConfig"),
+    "a state in half precision": (lambda: UfMStar(dtype=torch.float16), ValueError, "dtype must be torch.float32"),
+    "an image of one channel": (lambda: model(IMAGE[:, :1]), ValueError, r"image must be \[B, 3, H, W\]"),
+    "a tensor with channels last": (lambda: model(torch.tensor(PICTURE)[None]), ValueError, "image .*permute"),
+    "an array with channels first": (lambda: model(IMAGE.numpy()), ValueError, r"image as a NumPy array .*\[H, W, 3\]"),
+    "an array with transparency": (
+        lambda: model(np.zeros((H, W, 4), np.uint8)), ValueError, r"image as a NumPy array must be .*\(30, 40, 4\)"
+    ),
+    "an image that is a file's name": (lambda: model("a.png"), TypeError, "image must be .*Pillow image, got str"),
+    "bytes for a network of floats": (
+        lambda: model(IMAGE, network=nn.Conv2d(3, 1, 1)), TypeError, r"image of torch.uint8: give floats.*wrap_network"
+    ),
+    "a network that returns a tensor": (
+        lambda: model(IMAGE / 255, network=nn.Identity()), TypeError, r"DepthPrediction, got Tensor: wrap.*wrap_network"
+    ),
+    "a function as network": (
+        lambda: UncertainDepth(ufm, CONFIG), TypeError, r"networks .*got a function; wrap .*wrap_network\(function\)"
+    ),
+    "a function among networks": (lambda: UncertainDepth([ufm]), TypeError, "networks must be an nn.Module"),
+    "a number as network": (lambda: UncertainDepth(3, CONFIG), TypeError, "networks .*sequence of them, got a int$"),
+    "no network": (lambda: UncertainDepth([]), ValueError, "networks must hold at least one"),
+    "no networks for an image": (
+        lambda: UncertainDepth(None)(IMAGE, POSE, K), ValueError, "no networks: give the predictions to update"
+    ),
+    "an unknown mode": (lambda: model(IMAGE, mode="all"), ValueError, "mode must be 'alternate' or 'full'"),
+    "all of one network": (lambda: model(IMAGE, mode="full"), ValueError, "mode 'full' needs several networks"),
+    "samples in turn": (lambda: model(IMAGE, samples=10), ValueError, "samples must be at least 2"),
+    "samples of several": (
+        lambda: UncertainDepth([Brightness()] * 2, mode="full", samples=3), ValueError, "samples must be at least 2"
+    ),
+    "a source of anchors that is off": (lambda: model(IMAGE, anchors="corners"), ValueError, "anchors go with"),
+    "an unknown source of anchors": (
+        lambda: UncertainDepth(Brightness(), UfMStarConfig(anchors=AnchorConfig()), anchors="cornes"),
+        ValueError, "anchors: 'cornes' is neither 'corners', 'dense' nor a file",
+    ),
+    "a size in place of a height": (lambda: Preprocess((224, 224)), ValueError, r"resize_height .*size=\(224, 224"),
+    "no prediction": (lambda: combine([]), ValueError, "predictions must not be empty"),
+    "a prediction without streams": (lambda: DepthPrediction(torch.ones(2, 2)), ValueError, "depth must be"),
+    "a prediction of a list": (lambda: DepthPrediction([1.0]), TypeError, "depth must be a torch.Tensor or a NumPy"),
+    "a variance of another size": (
+        lambda: DepthPrediction(DEPTH, DEPTH[:, 1:]), ValueError, "aleatoric_variance must have the depth's shape"
+    ),
+    "a map without knots": (lambda: Recalibration((), ()), ValueError, "Recalibration needs knots"),
+    "an unknown kind of map": (lambda: Recalibration((1.0,), (1.0,), kind="a"), ValueError, "Recalibration.kind must"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "error", "message"), REFUSED.values(), ids=REFUSED)
+def test_refusals_name_the_argument(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_a_refusal_leaves_no_state():
+    module = UfMStar(CONFIG)
+    for broken in (DEPTH[0], DEPTH.int()):
+        with pytest.raises((TypeError, ValueError), match="depth"):
+            module(broken, POSE, K)
+    assert module.mean.shape[0] == 0
+
+
+POSES_TAKEN = {"array": POSE.numpy(), "3x4": POSE[0, :3], "array 3x4": POSE[:, :3].numpy(), "lists": POSE[0].tolist()}
+CAMERAS_TAKEN = {
+    "array": K.numpy(), "fx fy cx cy": (FX, FY, CX, CY), "four numbers": torch.tensor([FX, FY, CX, CY], dtype=K.dtype),
+    "4x4": K4, "array 4x4": K4[None].numpy(), "lists": K.tolist(),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("pose", "intrinsics"),
+    [*((pose, K) for pose in POSES_TAKEN.values()), *((POSE, camera) for camera in CAMERAS_TAKEN.values())],
+    ids=[*POSES_TAKEN, *CAMERAS_TAKEN],
+)
+def test_every_form_of_a_camera_is_the_same_camera(pose, intrinsics):
+    expected = ufm(DEPTH, POSE, K, DEPTH / 100)
+    depth = DEPTH.numpy()
+    depth.flags.writeable = False
+    got = ufm(depth, pose, intrinsics, DEPTH.numpy() / 100, valid=np.ones((1, H, W), bool))
+    assert same(got.variance, expected.variance)
+    assert same(got.depth, DEPTH)
+
+
+def test_whole_numbers_are_intrinsics():
+    whole = np.array([[40, 0, 20], [0, 40, 15], [0, 0, 1]])
+    assert same(ufm(DEPTH, POSE, whole).variance, ufm(DEPTH, POSE, torch.tensor(whole).double()).variance)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [IMAGE[0], PICTURE, PICTURE[None], PICTURE[:, ::-1][:, ::-1], Image.fromarray(PICTURE)],
+    ids=["tensor", "array", "batch of arrays", "array of negative strides", "Pillow"],
+)
+def test_every_form_of_an_image_is_the_same_image(image):
+    network = wrap_network(Brightness(), preprocess=Preprocess(size=(H // 2, W // 2)))
+    models = [UncertainDepth(network, CONFIG, preprocess=network.preprocess) for _ in range(2)]
+    expected, got = (m(x, POSE.numpy(), (FX, FY, CX, CY)) for m, x in zip(models, (IMAGE, image), strict=True))
+    assert torch.equal(got.depth, expected.depth)
+    assert same(got.variance, expected.variance)
+    assert torch.equal(got.intrinsics, expected.intrinsics)
+
+
+def test_arrays_that_a_network_returns_are_tensors():
+    class Arrays(nn.Module):
+        def forward(self, image):
+            return {"depth": 1 + image.mean(1).numpy(), "spread": np.full((1, H, W), 0.1, np.float32)}
+
+    network = wrap_network(Arrays(), "depth", aleatoric="spread", aleatoric_kind="std")
+    prediction = network(IMAGE / 255)
+    torch.testing.assert_close(prediction.aleatoric_variance, torch.full((1, H, W), 0.01))
+
+
+def test_a_forgotten_preprocessing_is_named(caplog):
+    """A network that states the size of its input and gets another one; once, and not where it is right."""
+    network = wrap_network(Brightness(), preprocess=Preprocess(size=(H // 2, W // 2)))
+    right, forgotten = UncertainDepth(network, preprocess=network.preprocess), UncertainDepth(network)
+    with caplog.at_level("WARNING", "ufmstar_torch"):
+        for _ in range(2):
+            right(IMAGE, POSE, K)
+        assert not [m for m in caplog.messages if "preprocess" in m]
+        for _ in range(2):
+            forgotten(IMAGE / 255, POSE, K)
+    (said,) = [m for m in caplog.messages if "preprocess" in m]
+    assert "(15, 20) px and gets (30, 40)" in said
+
+
+def test_a_posterior_without_a_source_of_anchors_is_dense():
+    assert UncertainDepth(Brightness(), posterior=True).landmarks._sources[0].identity["anchors"] == "dense"
+    assert UncertainDepth(Brightness(), posterior=True, anchors="corners").landmarks._sources[0].identity != "dense"
+    assert UncertainDepth(None, posterior=True).landmarks is None

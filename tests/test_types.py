@@ -1,0 +1,101 @@
+"""What a type checker and an installation without extras say of a user's own script."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from ufmstar_torch.optional import EXTRAS
+
+ROOT = Path(__file__).parent.parent
+SCRIPT = """
+import numpy as np
+import torch
+from ufmstar_torch import UfMStar, UncertainDepth
+image, pose, K = np.zeros((48, 64, 3), np.uint8), np.eye(4), (50.0, 50.0, 32.0, 24.0)
+model = UncertainDepth(torch.nn.Identity(), posterior=True, anchors="dense")
+reveal_type(model(image, pose, K))
+reveal_type(UfMStar()(torch.ones(1, 48, 64), pose, K).std)
+model(image, pose)
+UncertainDepth(torch.nn.Identity(), mode="al", anchors="cornes")
+"""
+# Runs where no package of an extra can be imported.
+BARE = """
+import sys
+from importlib.abc import MetaPathFinder
+class Absent(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in EXTRAS:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Absent())
+import numpy as np, torch
+def trajectory():
+    from ufmstar_torch.eval.sequences import interpolate_pose
+def hugging_face():
+    from ufmstar_torch.models import from_hugging_face
+    from_hugging_face("a/b")
+def corners():
+    from ufmstar_torch.anchors import LandmarkTracker
+    LandmarkTracker().update(np.zeros((48, 64, 3), np.uint8), np.eye(4), np.eye(3) + np.eye(3, k=2) * 9)
+def command():
+    from ufmstar_torch.cli import main
+    main(["run", "a", "--depth", "b", "--out", "c"])
+def own_network():
+    from ufmstar_torch import UncertainDepth
+    from ufmstar_torch.models import wrap_network
+    model = UncertainDepth(wrap_network(lambda x: x[:, :1] + 1))
+    print(model(torch.ones(1, 3, 48, 64), torch.eye(4), (50.0, 50.0, 32.0, 24.0)).std.median())
+for call in (own_network, trajectory, hugging_face, corners, command):
+    try:
+        call()
+    except ModuleNotFoundError as error:
+        print(call.__name__, error)
+"""
+
+
+def test_every_package_of_an_extra_is_known():
+    """The table of packages and extras is pyproject's."""
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        extras = tomllib.load(file)["project"]["optional-dependencies"]
+    imported = {"opencv-python-headless": "cv2", "pillow": "PIL"}
+    for extra in ("models", "eval", "viz", "train", "energy", "cluster"):
+        for line in extras[extra]:
+            package = line.partition(">")[0].partition("[")[0]
+            name = imported.get(package, package.replace("-", "_"))
+            assert name in EXTRAS, line
+            assert extra == EXTRAS[name] or package in str(extras[EXTRAS[name]])
+
+
+def test_what_is_missing_without_extras_is_named():
+    script = f"EXTRAS = {set(EXTRAS)}\n{BARE}"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=200, check=False)
+    said = done.stdout + done.stderr
+    assert done.returncode == 0, said
+    assert "tensor(" in said, said
+    for who, package, extra in (
+        ("trajectory ufmstar_torch.eval.sequences.interpolate_pose", "scipy", "eval"),
+        ("hugging_face", "transformers", "models"),
+        ("ufmstar run: failed: this command", "scipy", "eval"),
+    ):
+        (line,) = (line for line in said.splitlines() if line.startswith(who))
+        assert f"needs the package {package}: pip install 'ufmstar-torch[{extra}]'" in line
+    assert "corners landmarks of images need OpenCV: pip install 'ufmstar-torch[eval]'" in said
+
+
+@pytest.mark.slow
+def test_a_type_checker_knows_what_a_call_returns(tmp_path):
+    (tmp_path / "own.py").write_text(SCRIPT)
+    mypy = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "--cache-dir", str(tmp_path), "own.py"]
+    environment = os.environ | {"MYPYPATH": str(ROOT)}
+    said = subprocess.run(mypy, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False).stdout
+    assert 'own.py:7: note: Revealed type is "ufmstar_torch.pipeline.UncertainPrediction"' in said, said
+    assert 'own.py:8: note: Revealed type is "torch._tensor.Tensor"' in said, said
+    assert "own.py:9: error: Too few arguments" in said, said
+    assert 'own.py:10: error: Argument "mode"' in said, said
+    assert 'own.py:10: error: Argument "anchors"' in said, said
+    assert said.count("error:") == 3, said

@@ -1,0 +1,158 @@
+"""A state is whole: as it was where a frame raises or a saved state is refused, also when warnings are errors."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from modules import DEPTHS, POSES, H, K, W, same
+from torch import nn
+from walks import SPGF
+
+from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStarConfig, UncertainDepth
+from ufmstar_torch.extension import Extension
+
+KINDS = {
+    "plain": {},
+    "anchored": {"config": UfMStarConfig(segment=SPGF, anchors=AnchorConfig()), "anchors": "corners"},
+    "dense": {"config": UfMStarConfig(segment=SPGF, anchors=AnchorConfig()), "anchors": "dense"},
+    "posterior": {"posterior": True},
+}
+# A texture that moves with the camera, so that landmarks have something to follow.
+_TEXTURE = np.random.default_rng(0).integers(0, 255, (H + 8, W + 8, 3), dtype=np.uint8)
+
+
+class Warner(Extension):
+    """Warns once the step is through, where ``loud``."""
+
+    loud = False
+
+    def map_variance(self, variance):
+        if self.loud:
+            warnings.warn("after the step", RuntimeWarning, stacklevel=2)
+        return variance
+
+
+class Network(nn.Module):
+    """Depth of a rendered scene: the frame's number stands in the first pixel."""
+
+    def __init__(self):
+        super().__init__()
+        self.factor = nn.Parameter(torch.ones(1))
+
+    def forward(self, image):
+        number = int(image[0, 0, 0, 0])
+        return DepthPrediction(torch.tensor(DEPTHS[number], dtype=torch.float32)[None] * self.factor)
+
+
+def frame(i):
+    image = np.ascontiguousarray(_TEXTURE[i : i + H, i : i + W])
+    image[0, 0] = i
+    return image, POSES[i], K
+
+
+def model_of(kind, frames=0):
+    model = UncertainDepth(Network(), recalibration=Warner(), **({"config": UfMStarConfig(segment=SPGF)} | KINDS[kind]))
+    for i in range(frames):
+        model(*frame(i))
+    return model
+
+
+def snapshot(model):
+    return {name: value.clone() for name, value in model.state_dict().items()} | {"next": torch.tensor(model._next)}
+
+
+def unchanged(model, before):
+    now = snapshot(model)
+    return now.keys() == before.keys() and all(same(now[n].double(), v.double()) for n, v in before.items())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_frame_that_raises_leaves_everything_as_it_was(kind):
+    model, twin = model_of(kind, 3), model_of(kind, 3)
+    before = snapshot(model)
+    image, pose, intrinsics = frame(3)
+    broken = pose.copy()
+    broken[0, 3] = np.nan
+    warner = model.ufm._extensions.each[-1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ValueError, match="stream 0: pose holds NaN"):
+            model(image, broken, intrinsics)
+        assert unchanged(model, before)
+        warner.loud = True
+        with pytest.raises(RuntimeWarning, match="after the step"):
+            model(image, pose, intrinsics)
+        assert unchanged(model, before)
+        with pytest.raises(RuntimeWarning, match="after the step"):
+            model.mean_uncertainty(image, pose, intrinsics)
+        assert unchanged(model, before)
+        warner.loud = False
+        assert same(model(image, pose, intrinsics).variance, twin(image, pose, intrinsics).variance)
+
+
+def at_end(change):
+    """The last number of a tensor replaced."""
+
+    def damaged(value):
+        value = value.clone()
+        value.view(-1)[-1] = change
+        return value
+
+    return damaged
+
+
+DAMAGED = {
+    "a posterior of 1e300": ("posterior", "ufm.posterior", at_end(1e300), "posterior"),
+    "a posterior of -1e10": ("posterior", "ufm.posterior", at_end(-1e10), "posterior holds impossible values"),
+    "a posterior that is NaN": ("posterior", "ufm.posterior", at_end(torch.nan), "posterior holds NaN"),
+    "evidence of 1e300": ("anchored", "ufm.overall_evidence", at_end(1e30), "overall_evidence holds"),
+    "a Gaussian of NaN": ("anchored", "ufm.mean", at_end(torch.nan), "mean holds NaN"),
+    "a count below 0": ("plain", "image_index", at_end(-1), "image_index must be a whole number"),
+    "a count in floats": ("plain", "image_index", torch.Tensor.double, "image_index must be a whole number"),
+    "corners at NaN": ("anchored", "landmarks.0.pixel", at_end(torch.nan), r"state\['pixel'\] must be finite"),
+    "corners at 1e300": ("anchored", "landmarks.0.pixel", at_end(1e300), r"state\['pixel'\] must be finite"),
+    "an image in floats": ("anchored", "landmarks.0.gray", torch.Tensor.double, r"state\['gray'\] must be an image"),
+    "a key frame in floats": (
+        "dense",
+        "landmarks.0.image0",
+        torch.Tensor.double,
+        r"state\['image0'\] must be an image",
+    ),
+    "depths of infinity": ("dense", "landmarks.0.landmark_sigma", at_end(torch.inf), "landmark_sigma.* must be finite"),
+    "another network": ("plain", "networks.0.factor", lambda value: value.repeat(2), "size mismatch"),
+}
+
+
+@pytest.mark.parametrize(("kind", "name", "damage", "message"), DAMAGED.values(), ids=DAMAGED)
+def test_a_damaged_state_is_refused_as_a_whole(kind, name, damage, message):
+    model, saved = model_of(kind, 1), model_of(kind, 4).state_dict()
+    with torch.no_grad():
+        saved["networks.0.factor"] = torch.full((1,), 2.0)
+    before = snapshot(model)
+    with pytest.raises(RuntimeError, match=message):
+        model.load_state_dict(saved | {name: damage(saved[name])})
+    assert unchanged(model, before)
+    model.load_state_dict(saved)
+    assert model.networks[0].factor.tolist() == [2]
+    assert model._next == 4
+
+
+def test_a_warning_about_the_config_that_is_an_error_changes_nothing():
+    model, other = model_of("plain", 1), UncertainDepth(Network(), UfMStarConfig(segment=SPGF, eta=0.4))
+    other(*frame(0)), other(*frame(1))
+    before = snapshot(model)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(UserWarning, match=r"eta was 0\.4, is 0\.5"):
+            model.ufm.load_state_dict(other.ufm.state_dict())
+        assert unchanged(model, before)
+        with pytest.raises(UserWarning, match=r"eta was 0\.4, is 0\.5"):
+            model.load_state_dict(other.state_dict())
+        assert unchanged(model, before)
+    with pytest.warns(UserWarning, match="eta was"):
+        model.load_state_dict(copy.deepcopy(other.state_dict()))
+    assert model._next == 2

@@ -1,0 +1,141 @@
+"""Step 1: depth networks in turn, or all of them on every image.
+
+Section "Single DNN inference": one inference per image, by the members of an ensemble in turn, by a
+stochastic network, or by a single one; or, for comparison, by all of them at once ("Full").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from ufmstar_torch.prediction import DepthPrediction, infer, stated_range
+
+# image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
+Preprocess = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+class NetworksInTurn(nn.Module):
+    """Depth networks that take the same input: one of them per image, in turn, or all of them on every image.
+
+    Nothing is stored between images: the caller counts them and calls :meth:`turn`. The networks stay in eval mode,
+    whatever the caller's training flag is.
+
+    Args:
+        networks: one network or a sequence of them. Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`; one
+            with an attribute ``takes_intrinsics = True`` is called with the intrinsics of that image as well.
+        samples: passes of a single stochastic network that :meth:`every` combines; None: one pass of each network.
+        preprocess: maps image and intrinsics to the networks' input; None passes both through.
+
+    Raises:
+        TypeError: something that is no ``nn.Module``.
+        ValueError: no network, or ``samples`` of several.
+    """
+
+    def __init__(
+        self,
+        networks: nn.Module | Sequence[nn.Module] | None,
+        *,
+        samples: int | None = None,
+        preprocess: Preprocess | None = None,
+    ) -> None:
+        super().__init__()
+        members = [] if networks is None else modules_of(networks)
+        if samples is not None and (samples < 1 or len(members) > 1):
+            raise ValueError(f"samples must be at least 1 and goes with one network, got {samples} of {len(members)}")
+        self.networks = nn.ModuleList(members).eval()
+        self.samples = samples
+        self.preprocess = preprocess
+
+    @property
+    def max_depth(self) -> float | None:
+        """[m] The largest depth that the networks can predict, where each of them states one."""
+        return stated_range(self.networks)
+
+    @property
+    def passes(self) -> int:
+        """Inferences that :meth:`every` takes."""
+        return len(self.networks) if self.samples is None else self.samples
+
+    def turn(self, images: int) -> int:
+        """The member whose turn it is after ``images`` images, both counted from 0."""
+        return images % len(self.networks)
+
+    def prepare(self, image: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+        """The networks' input [B, 3, h, w] and its intrinsics [B, 3, 3] [px]."""
+        return (image, intrinsics) if self.preprocess is None else self.preprocess(image, intrinsics)
+
+    def member(self, x: Tensor, intrinsics: Tensor, n: int) -> DepthPrediction:
+        """One inference of member ``n``, or sample ``n`` of a single network, on what :meth:`prepare` returned.
+
+        Raises:
+            TypeError: the network takes no uint8, or returns something else than a :class:`DepthPrediction`.
+        """
+        try:
+            prediction = infer(self.networks[n % len(self.networks)], x, intrinsics)
+        except RuntimeError as error:
+            if x.is_floating_point():
+                raise
+            raise TypeError(
+                f"network {n} does not take an image of {x.dtype}: give floats, or UncertainDepth(network, "
+                "preprocess=network.preprocess) with network = ufmstar_torch.models.wrap_network(network)"
+            ) from error
+        if not isinstance(prediction, DepthPrediction):
+            raise TypeError(
+                f"network {n} must return a DepthPrediction, got {type(prediction).__name__}: wrap it with "
+                "ufmstar_torch.models.wrap_network(network), which declares what its output means"
+            )
+        return prediction
+
+    def every(self, x: Tensor, intrinsics: Tensor) -> DepthPrediction:
+        """All members, or samples, on what :meth:`prepare` returned, combined (:func:`combine`)."""
+        return combine([self.member(x, intrinsics, n) for n in range(self.passes)])
+
+    def train(self, mode: bool = True) -> Self:
+        """The networks stay in eval mode: a prediction must not depend on the caller's training flag."""
+        super().train(mode)
+        self.networks.eval()
+        return self
+
+
+def modules_of(networks: object) -> list[nn.Module]:
+    """One network or a sequence of them as a list.
+
+    Raises:
+        TypeError: something else.
+        ValueError: an empty sequence.
+    """
+    members = list(networks) if isinstance(networks, Iterable) and not isinstance(networks, nn.Module) else [networks]
+    if not members:
+        raise ValueError("networks must hold at least one network")
+    if wrong := [member for member in members if not isinstance(member, nn.Module)]:
+        raise TypeError(
+            f"networks must be an nn.Module or a sequence of them, got a {type(wrong[0]).__name__}"
+            + ("; wrap a function with ufmstar_torch.models.wrap_network(function)" if callable(wrong[0]) else "")
+        )
+    return [member for member in members if isinstance(member, nn.Module)]
+
+
+def combine(predictions: Sequence[DepthPrediction]) -> DepthPrediction:
+    """The mixture of an ensemble's predictions (Lakshminarayanan et al. 2017).
+
+    depth = mean d_n; A = mean A_n (None unless every member has one); E = the variance of d_n between
+    the members, 1/N sum d_n^2 - (mean d_n)^2, plus the mean of their own E_n where every member has one.
+
+    Raises:
+        ValueError: no prediction.
+    """
+    if not predictions:
+        raise ValueError("predictions must not be empty")
+    depth = torch.stack([p.depth for p in predictions])
+    aleatoric = [p.aleatoric_variance for p in predictions if p.aleatoric_variance is not None]
+    stated = [p.epistemic_variance for p in predictions if p.epistemic_variance is not None]
+    between = depth.var(0, correction=0)
+    return DepthPrediction(
+        depth.mean(0),
+        torch.stack(aleatoric).mean(0) if len(aleatoric) == len(depth) else None,
+        between + torch.stack(stated).mean(0) if len(stated) == len(depth) else between,
+    )
