@@ -99,6 +99,9 @@ REFUSED = {
     "bytes for a network of floats": (
         lambda: model(IMAGE, network=nn.Conv2d(3, 1, 1)), TypeError, r"image of torch.uint8: give floats.*wrap_network"
     ),
+    "an array for a wrapped network": (
+        lambda: wrap_network(Brightness())(PICTURE), TypeError, r"image must be a tensor .*network.preprocess"
+    ),
     "a network that returns a tensor": (
         lambda: model(IMAGE / 255, network=nn.Identity()), TypeError, r"DepthPrediction, got Tensor: wrap.*wrap_network"
     ),

@@ -331,7 +331,9 @@ class UncertainDepth(NetworksInTurn):
         """The prediction for the next image, or, with ``ahead``, for the one after that."""
         if not self.networks:
             raise ValueError("UncertainDepth(None) has no networks: give the predictions to update")
-        image, T, K_image = as_image(image), as_pose(pose), as_intrinsics(intrinsics)
+        given, image, T, K_image = image, as_image(image), as_pose(pose), as_intrinsics(intrinsics)
+        if not isinstance(given, Tensor):  # a tensor's device is the caller's choice
+            image = image.to(next((p.device for p in self.networks.parameters()), image.device))
         member = None if self.mode == "full" else self.turn(self._next + ahead)
         with torch.no_grad():
             x, K = self.prepare(image, K_image.expand(len(image), 3, 3))
