@@ -331,12 +331,12 @@ class UncertainDepth(NetworksInTurn):
         """The prediction for the next image, or, with ``ahead``, for the one after that."""
         if not self.networks:
             raise ValueError("UncertainDepth(None) has no networks: give the predictions to update")
-        given, image, T, K_image = image, as_image(image), as_pose(pose), as_intrinsics(intrinsics)
-        if not isinstance(given, Tensor):  # a tensor's device is the caller's choice
-            image = image.to(next((p.device for p in self.networks.parameters()), image.device))
+        picture, T, K_image = as_image(image), as_pose(pose), as_intrinsics(intrinsics)
+        if not isinstance(image, Tensor):  # a tensor's device is the caller's choice
+            picture = picture.to(next((p.device for p in self.networks.parameters()), picture.device))
         member = None if self.mode == "full" else self.turn(self._next + ahead)
         with torch.no_grad():
-            x, K = self.prepare(image, K_image.expand(len(image), 3, 3))
+            x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
             self._warn_of_size(x)
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
         H = None if features is None else as_tensor("features", features)
@@ -350,7 +350,7 @@ class UncertainDepth(NetworksInTurn):
         (depth, *variances, K_there, H), ready = _copied(parts, self.multiview_device)
         assert depth is not None
         assert K_there is not None
-        return _Predicted(image, T, K_image, DepthPrediction(depth, *variances), K_there, member, H, ready)
+        return _Predicted(picture, T, K_image, DepthPrediction(depth, *variances), K_there, member, H, ready)
 
     def _warn_of_size(self, x: Tensor) -> None:
         """Name a network that states the size of its input and gets another one, as where ``preprocess`` was
