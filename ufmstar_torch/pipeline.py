@@ -355,8 +355,10 @@ class UncertainDepth(NetworksInTurn):
     def _warn_of_size(self, x: Tensor) -> None:
         """Name a network that states the size of its input and gets another one, as where ``preprocess`` was
         forgotten; once."""
+        if self._warned or self.preprocess is not None:
+            return
         sizes = {getattr(getattr(network, "preprocess", None), "size", None) for network in self.networks}
-        if self.preprocess is None and not self._warned and not sizes & {None, tuple(x.shape[-2:])}:
+        if not sizes & {None, tuple(x.shape[-2:])}:
             self._warned = True
             LOGGER.warning(
                 "the network states an input of %s px and gets %s: UncertainDepth(..., preprocess=network.preprocess) "
