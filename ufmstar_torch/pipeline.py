@@ -362,7 +362,7 @@ class UncertainDepth(NetworksInTurn):
             self._warned = True
             LOGGER.warning(
                 "the network states an input of %s px and gets %s: UncertainDepth(..., preprocess=network.preprocess) "
-                "resizes and normalises images (said once)", *sizes, tuple(x.shape[-2:]),
+                "resizes and normalises images (said once)", " or ".join(map(str, sizes)), tuple(x.shape[-2:]),
             )  # fmt: skip
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
