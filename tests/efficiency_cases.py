@@ -8,8 +8,6 @@ import numpy as np
 import torch
 from tiny_networks import Linear
 
-from ufmstar_torch.eval.methods.method import Method
-from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, make_sequence
 from ufmstar_torch.models.heads import UncertaintyNetwork, with_head
@@ -17,10 +15,6 @@ from ufmstar_torch.models.network import Backbone
 from ufmstar_torch.models.preprocess import Preprocess
 
 SIZE = (64, 96)
-
-
-def rows_of(*names: str) -> list[Row]:
-    return [Row(Method.parse(name)) for name in names]
 
 
 def network(

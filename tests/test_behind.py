@@ -14,7 +14,7 @@ from runs import Brightness, networks
 
 from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import Gaussians
-from ufmstar_torch.eval.engine.prefetch import Prefetch
+from ufmstar_torch.eval.engine.prefetch import prefetch
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream
 from ufmstar_torch.eval.engine.writer_thread import WriterThread
@@ -31,8 +31,8 @@ def sequence(tmp_path_factory):
 class Slow(FrameSink):
     """Takes its time, in a thread that is not the loop's; breaks at a frame."""
 
-    def __init__(self, at=None, error=None, stage="writing"):
-        self.stage, self.at, self.error = stage, at, error
+    def __init__(self, at=None, error=None):
+        self.at, self.error = at, error
         self.results, self.threads, self.ended = [], set(), False
 
     def take(self, result):
@@ -61,7 +61,7 @@ def test_every_frame_comes_in_order_with_the_state_after_it(sequence):
 
     plain = stream_of(sequence)
     plain.drive([States()])
-    first, second = Slow(), Slow(stage="saving")
+    first, second = Slow(), Slow()
     with WriterThread([first, second]) as behind:
         stream_of(sequence).drive([behind])
     assert [r.number for r in first.results] == [r.number for r in second.results] == list(range(FRAMES))
@@ -72,8 +72,7 @@ def test_every_frame_comes_in_order_with_the_state_after_it(sequence):
     for result, state in zip(first.results, expected, strict=True):
         assert result.state["row"].keys() == state.keys()
         assert all(torch.equal(value, state[name]) for name, value in result.state["row"].items())
-        assert result.ms.keys() == {"read", "predict", "truth", "cycle", "writing", "saving"}
-        assert result.ms["writing"] >= 10
+        assert result.ms.keys() == {"read", "predict", "truth", "cycle"}
 
 
 @pytest.mark.parametrize("error", [OSError("full"), ValueError("a mistake")], ids=["disk", "program"])
@@ -121,13 +120,11 @@ def test_frames_are_read_ahead_in_order_by_one_thread(sequence):
         return entry.load_image()
 
     entries = [replace(e, load_image=lambda i=i, e=e: load(i, e)) for i, e in enumerate(sequence.entries)]
-    with Prefetch(replace(sequence, entries=tuple(entries)), [1, 3, 4, 6]) as frames:
-        assert frames.next().index == 1
-        with pytest.raises(FrameError, match="cannot be decoded"):
-            frames.next()
-        assert [frames.next().index, frames.next().index] == [4, 6]
-        with pytest.raises(StopIteration):
-            frames.next()
+    frames = prefetch(replace(sequence, entries=tuple(entries)), [1, 3, 4, 6])
+    assert next(frames).result().index == 1
+    with pytest.raises(FrameError, match="cannot be decoded"):
+        next(frames).result()
+    assert [frame.result().index for frame in frames] == [4, 6]
     assert [i for i, _ in read] == [1, 3, 4, 6]
     assert {thread for _, thread in read} != {threading.get_ident()}
     assert len({thread for _, thread in read}) == 1

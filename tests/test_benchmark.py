@@ -15,9 +15,9 @@ from layouts import write_tum
 from onnx_files import small_network, write_fastdepth
 
 from ufmstar_torch import cli
-from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, TimedCalls, pinned_threads
+from ufmstar_torch.eval.bench.parts import TimedParts
+from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, paired_ratio, pinned_threads, spread
 from ufmstar_torch.eval.commands.bench import main, read
-from ufmstar_torch.eval.engine.clock import CallTimes, paired_ratio, spread
 
 # ---- statistics and clocks ----
 
@@ -44,22 +44,11 @@ def test_paired_ratio_cancels_a_common_slowdown():
             paired_ratio(a, b)
 
 
-def test_processor_time_does_not_count_waiting():
-    watch = CallTimes()
-    for _ in range(3):
-        assert watch.time("sleep", lambda x: (time.sleep(0.02), x)[1], 7) == 7
-    assert watch.spread("sleep")["min_ms"] >= 20
-    assert watch.spread("sleep")["cpu_median_ms"] < 15
-    watch.drop(2)
-    assert watch.spread("sleep")["count"] == 1
-
-
 @pytest.fixture
 def work(monkeypatch):
-    """Moves ``time.perf_counter`` and ``time.process_time``, which stand still otherwise, by so many seconds."""
+    """Moves ``time.perf_counter``, which stands still otherwise, by so many seconds."""
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    monkeypatch.setattr(time, "process_time", lambda: now[0])
 
     def move(seconds):
         now[0] += seconds
@@ -68,14 +57,14 @@ def work(monkeypatch):
     return move
 
 
-def test_calls_alternate(work):
-    log = []
-    calls = {name: lambda n=name, s=s: log.append(n) or work(s) for name, s in (("a", 1.0), ("b", 3.0))}
-    timed = TimedCalls()
-    for _ in timed.frames(range(3), warm_up=1):
-        assert timed.call(calls) == {"a": 1.0, "b": 3.0}
+def test_parts_alternate(work):
+    log, parts = [], TimedParts(warm_up=1)
+    calls = {("row", name): lambda n=name, s=s: log.append(n) or work(s) for name, s in (("a", 1.0), ("b", 3.0))}
+    for number in range(3):
+        assert parts.run(number, calls, torch.device("cpu")) == {("row", "a"): 1.0, ("row", "b"): 3.0}
     assert log == list("abbaab")
-    assert timed.times.wall == {"a": [1000.0] * 2, "b": [3000.0] * 2}, "less the warm-up"
+    assert (parts.ms("row", "a"), parts.ms("row", "b")) == ([1000.0] * 2, [3000.0] * 2), "less the warm-up"
+    assert parts.ms("row", "c") == []
 
 
 def test_every_moment_belongs_to_the_stage_that_needs_it(work):
@@ -88,7 +77,8 @@ def test_every_moment_belongs_to_the_stage_that_needs_it(work):
                 self.observer.stage(name)
             return work(1000)  # the output's assembly
 
-    staged = StagedStep(Module())
+    module = Module()
+    staged = StagedStep(module, module)
     for seconds in (100, 1, 2, 3):
         staged(seconds)
     summary = staged.summary(warm_up=1)

@@ -264,7 +264,7 @@ def test_a_run_prints_its_table_and_outputs(ufmstar, path, tmp_path, brightness)
     assert lines[-1] == "ufmstar run: finished: 6 of 6 frames"
     assert [line for line in err.splitlines() if "frames" in line] == ["frames: 0 of 6", "frames: done, 6 of 6"]
     assert "%" not in err
-    assert [file["name"] for file in summary["source"]["weights"]] == ["first.pt", "second.pt"]
+    assert [file["name"] for file in summary["source"]["files"]] == ["first.pt", "second.pt"]
 
 
 def test_other_weights_under_the_same_name_do_not_go_on(ufmstar, path, tmp_path, brightness):
@@ -273,7 +273,7 @@ def test_other_weights_under_the_same_name_do_not_go_on(ufmstar, path, tmp_path,
     brightness.files[1].write_text("1.2")
     code, _, err = ufmstar(*words, "--resume")
     assert code == 2
-    assert "source.weights.1.sha256 was" in err
+    assert "source.files.1.sha256 was" in err
     assert ufmstar(*words)[0] == 2
     assert ufmstar(*words, "--overwrite")[0] == 0
 

@@ -150,7 +150,7 @@ class Collected(FrameSink):
 
 def walked(networks, frames, count=FRAMES, sinks=(), names=ROWS):
     """The first frames through rows of the suite: (frame, results by the row's name) of each."""
-    source = NetworkSource(NetworksInTurn(networks, preprocess=networks[0].preprocess), CPU, {}, seeding=None)
+    source = NetworkSource(NetworksInTurn(networks, preprocess=networks[0].preprocess), CPU, {})
     rows = [row for row in suite_named("demo").rows if NAMES[row.slug] in names]
     collected = Collected()
     judge = Judge({"aleatoric": source, "ensemble": source}, CPU, limit=slice(count))

@@ -9,17 +9,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from efficiency_cases import SIZE, network, room_sequence, rows_of
+from efficiency_cases import SIZE, network, room_sequence
 from tiny_networks import Linear
+from tiny_suite import rows_of
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.bench.energy import CPU, GPU
 from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
-from ufmstar_torch.eval.bench.parts import MULTIVIEW, MultiviewStep, StepInput, time_parts
-from ufmstar_torch.eval.methods.method import Method
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.bench.parts import MULTIVIEW, MultiviewStep, time_parts
+from ufmstar_torch.eval.engine.predictions import Predicted
+from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.any_network import wrap_network
 from ufmstar_torch.models.preprocess import Preprocess
 
@@ -75,21 +75,21 @@ def test_stages_add_up_and_warm_up_is_not_counted(timed):
     sums = np.sum([times[timed.warm_up :] for times in staged.stages.values()], axis=0)
     assert staged.summary(warm_up=timed.warm_up)["stages_total"]["median_ms"] == pytest.approx(np.median(sums))
     for owner, part in (("ensemble", DEPTH), ("ensemble", ONCE), ("ensemble", EVERY), ("UfM-Ensemble", MULTIVIEW)):
-        assert len(timed.ms(owner, part)) == 6
+        assert len(timed.ms(owner, part)) == 6, "less the warm-up"
     assert timed.ms("aleatoric", EVERY) == []  # nobody asked for it
 
 
 @pytest.mark.parametrize("anchors", ["tracked", "dense"])
 def test_rows_with_anchors_and_a_posterior_are_measured(sequence, anchors):
-    row = Row(Method.parse("UfM*-Aleatoric"), Setting(anchors=anchors, posterior=True))
+    (one,) = rows_of("UfM*-Aleatoric", anchors=anchors, posterior=True)
     aleatoric = {"aleatoric": TimedNetwork("aleatoric", [network()], "Linear")}
-    timed = parts_of([row], aleatoric, list(sequence)[:4], warm_up=1)
-    assert min(timed.ms(row.label, MULTIVIEW)) > 0
-    step, frame = MultiviewStep(row, torch.device("cpu")), sequence[0]
+    timed = parts_of([one], aleatoric, list(sequence)[:4], warm_up=1)
+    assert min(timed.ms(one.label, MULTIVIEW)) > 0
+    step, frame = MultiviewStep(one, torch.device("cpu")), sequence[0]
     x, K = aleatoric["aleatoric"].prepare(frame, torch.device("cpu"))
     prediction = aleatoric["aleatoric"].predict(ONCE, x, K)
-    depth, variance = step(StepInput((x, K), torch.from_numpy(frame.T_world_cam)[None], (x, K), prediction))[:2]
-    assert depth.shape == variance.shape == (1, *SIZE)
+    answer = step(image_tensor(frame), frame, Predicted(prediction, K))
+    assert answer["depth"].shape == answer["variance"].shape == (1, *SIZE)
 
 
 LOG: list[float] = []
@@ -179,7 +179,7 @@ def test_a_row_states_its_latency_and_memory(unpowered):
 
 def test_what_cannot_be_measured_is_left_out_and_named(sequence):
     one = {"ensemble": TimedNetwork("ensemble", [network()], "Linear")}
-    odd = [Row(Method.parse("UfM*-Ensemble"), Setting(**s)) for s in ({"skip": 2}, {"anchors": "truth"})]
+    odd = [*rows_of("UfM*-Ensemble", skip=2), *rows_of("UfM*-Ensemble", anchors="truth")]
     rows = [*rows_of("Ensemble", "UfM*-Ensemble", "Evidential"), *odd]
     message = measure(rows, one, sequence, plan=QUICK, meter=NO_METER)
     assert [row["row"] for row in message["rows"]] == ["UfM*-Ensemble"]

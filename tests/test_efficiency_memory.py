@@ -4,17 +4,28 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from efficiency_cases import network
 from onnx_files import small_network, write_fastdepth
 
-from ufmstar_torch.eval.bench.memory import overhead_percent, weight_bytes
-from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, depth_alone, timed_networks
-from ufmstar_torch.eval.bench.parts import MultiviewStep, StepInput
+from ufmstar_torch.eval.bench.measure import overhead_percent
+from ufmstar_torch.eval.bench.networks import (
+    DEPTH,
+    EVERY,
+    ONCE,
+    TimedNetwork,
+    depth_alone,
+    timed_networks,
+    weight_bytes,
+)
+from ufmstar_torch.eval.bench.parts import MultiviewStep
+from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.efficiency import megabytes
+from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble, converted_layers
 from ufmstar_torch.models.dropout import MonteCarloDropout
 from ufmstar_torch.models.ensemble import Ensemble, LazyMember
@@ -31,8 +42,8 @@ def step_memory(name, size, K):
     step = MultiviewStep(Row(Method.parse(name)), torch.device("cpu"))
     depth, variance, K = torch.full((1, *size), 2.0), torch.full((1, *size), 0.01), torch.tensor([K]).double()
     prediction = DepthPrediction(depth, aleatoric_variance=variance)
-    image = torch.zeros(1, 3, *size)
-    step(StepInput((image, K), torch.eye(4, dtype=torch.float64)[None], (image, K), prediction), first=True)
+    frame = Frame(0, "0", None, None, np.eye(4), K[0].numpy())
+    step(None, frame, Predicted(prediction, K), first=True)
     return step.memory()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from ufmstar_torch.eval.bench.energy import CPU, GPU, NOT_MEASURABLE
-from ufmstar_torch.eval.bench.memory import overhead_percent
+from ufmstar_torch.eval.bench.measure import overhead_percent
 from ufmstar_torch.eval.report.efficiency import efficiency_tables, megabytes
 from ufmstar_torch.eval.report.table import latex, markdown
 

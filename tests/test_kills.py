@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 import torch
 from demo_networks import write_members
-from suite_runs import TRUTH, kept, write_rooms
+from tiny_suite import TRUTH, kept, write_rooms
 from trainings import write_frames
 
 from ufmstar_torch.models.checkpoints import read_safetensors

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from runs import Brightness, job_of, outputs, read_summary
-from tiny_suite import Biased, evaluate, in_memory, row
+from tiny_suite import Biased, evaluate, row
 
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig, UncertainDepth, cli
 from ufmstar_torch.anchors import Anchors, LandmarkMap, LandmarkTracker, landmark_source
@@ -18,6 +18,7 @@ from ufmstar_torch.eval.engine.maps import MapSource
 from ufmstar_torch.eval.methods.setting import setting_from
 from ufmstar_torch.eval.report.text import run_table
 from ufmstar_torch.eval.run.run import run
+from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.tour.sequence import open_tour
 from ufmstar_torch.models import Preprocess
 
@@ -27,7 +28,7 @@ ON = UfMStarConfig(on_bad_frame="skip", anchors=AnchorConfig())
 
 @pytest.fixture(scope="module")
 def tour():
-    return in_memory(open_tour(TOUR), slice(None))
+    return in_memory(open_tour(TOUR))
 
 
 def survey(sequence, every=7):

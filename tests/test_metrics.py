@@ -6,14 +6,13 @@ import math
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from metric_maps import ALL, JUDGED, RANKING, UNCERTAIN, figures, maps
+from metric_maps import ALL, JUDGED, UNCERTAIN, figures, maps
 from scipy import stats
 
 from ufmstar_torch.eval.metrics import (
@@ -24,6 +23,7 @@ from ufmstar_torch.eval.metrics import (
     ECEDelta,
     ECEQuantile,
     EntropyHistogram,
+    NLLByError,
     SequenceMetrics,
     mean_and_ci,
 )
@@ -317,11 +317,10 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("make", "match"),
         [
-            (lambda: Delta1(0.0), "tolerance"),
             (lambda: ECEDelta(1.0), "delta must lie"),
             (lambda: ECEQuantile([0.5, 0.5]), "levels must rise"),
             (lambda: EntropyHistogram(low=1.0, high=1.0), "low < high"),
-            *((partial(kind, bins=0), "bins must be >= 1") for kind in RANKING),
+            (lambda: NLLByError(0), "percentiles, bins and levels must be >= 1"),
         ],
     )
     def test_settings(self, make: Callable[[], SumMetric], match: str) -> None:

@@ -131,7 +131,7 @@ def test_the_preprocessed_intrinsics_reach_the_networks_that_take_them(mode):
     if mode == "full":
         expected = (expected + half.apply_image(x)[:, 0]) / 2
     torch.testing.assert_close(model(x, POSES[0], K).depth, expected)
-    source = NetworkSource(NetworksInTurn(ByFocal(), preprocess=half), torch.device("cpu"), {}, seeding=None)
+    source = NetworkSource(NetworksInTurn(ByFocal(), preprocess=half), torch.device("cpu"), {})
     picture = (x[0] * 255).byte()
     frame = Frame(0, "0", picture.permute(1, 2, 0).numpy(), None, POSES[0].numpy(), K.numpy())
     depth = source.one(frame, 0).maps.depth

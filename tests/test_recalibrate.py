@@ -10,8 +10,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from suite_runs import write_rooms
-from tiny_suite import write_network
+from tiny_suite import write_network, write_rooms
 
 from ufmstar_torch import Recalibration, UfMStar, UfMStarConfig, cli
 from ufmstar_torch.eval.metrics.ranking import SpearmanCorrelation

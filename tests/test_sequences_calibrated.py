@@ -169,7 +169,7 @@ def test_colmap_landmarks_and_what_makes_it_metric(tmp_path, text):
     np.testing.assert_allclose(seen["3"], points[36:48])
     (path / "images" / "2.png").unlink()
     for content, metric in (('{"scale_from": "length"}', True), ('{"scale_from": null}', False), ("[", False)):
-        (path / "scale.json").write_text(content)
+        (path / "poses.json").write_text(content)
         sequence = open_sequence(path)
         assert sequence.metric == metric
     assert [(frame.name, frame.reason) for frame in sequence.skipped] == [("2", "missing image file")]

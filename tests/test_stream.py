@@ -21,6 +21,7 @@ from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream, Stopped
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
+from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.tour.sequence import open_tour
 
 FRAMES = 6
@@ -29,8 +30,8 @@ FRAMES = 6
 class Recorded(FrameSink):
     """Notes every call in a list that sinks share, and keeps the results."""
 
-    def __init__(self, name, calls, stage=None):
-        self.name, self.calls, self.stage, self.results = name, calls, stage, []
+    def __init__(self, name, calls):
+        self.name, self.calls, self.results = name, calls, []
 
     def begin(self, stream):
         self.calls.append((self.name, "begin", stream.position))
@@ -51,13 +52,7 @@ def sequence(tmp_path_factory):
 @pytest.fixture(scope="module")
 def tour():
     """Rendered frames in memory, with corners to track."""
-    rendered = open_tour("tour:5?frames=6&size=96x128")
-    frames = list(rendered)
-    entries = [
-        replace(entry, load_image=lambda f=f: f.image, load_depth=lambda f=f: f.depth)
-        for entry, f in zip(rendered.entries, frames, strict=True)
-    ]
-    return replace(rendered, entries=tuple(entries))
+    return in_memory(open_tour("tour:5?frames=6&size=96x128"))
 
 
 def counted(sequence, broken=()):
@@ -81,7 +76,7 @@ def in_turn(key="row", members=2, **options):
 
 def test_sinks_get_every_frame_in_their_order(sequence):
     calls = []
-    first, second = Recorded("first", calls, "writing"), Recorded("second", calls)
+    first, second = Recorded("first", calls), Recorded("second", calls)
     stream = FrameStream(sequence, range(1, FRAMES, 2), [in_turn()])
     stream.drive([first, second])
     assert calls[:2] == [("first", "begin", 0), ("second", "begin", 0)]
@@ -89,7 +84,7 @@ def test_sinks_get_every_frame_in_their_order(sequence):
     assert calls[-2:] == [("first", "end", None), ("second", "end", None)]
     assert [result.index for result in second.results] == [1, 3, 5]
     assert [result.name for result in second.results] == [sequence.names[i] for i in (1, 3, 5)]
-    assert all(result.ms.keys() == {"read", "predict", "truth", "writing"} for result in second.results)
+    assert all(result.ms.keys() == {"read", "predict", "truth"} for result in second.results)
     assert stream.position == 3
 
 
@@ -212,7 +207,7 @@ def test_a_state_taken_at_any_frame_gives_the_same_bits(tour):
 
 def test_the_state_of_another_estimator_is_refused(tour):
     gaussians = RowRunner("row", own_depth(), Gaussians(UfMStarConfig(), CPU))
-    with pytest.raises(ValueError, match=r"the saved state has .*mean.* too many"):
+    with pytest.raises(ValueError, match=r"has .*mean.* too many"):
         RowRunner("row", own_depth(), Alone()).load_state(gaussians.state())
     with pytest.raises(ValueError, match=r"the saved state lacks .*mean"):
         gaussians.load_state({"image_index": torch.tensor(0)})

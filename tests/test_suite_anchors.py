@@ -8,17 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_suite import Biased, base_network, evaluate, in_memory, row, unbatched, write_network
+from tiny_suite import Biased, base_network, evaluate, row, unbatched, write_network
 
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.eval.engine.anchors import TRUTH_SIGMA, AnchorSource, Tracks, anchor_sources
+from ufmstar_torch.eval.engine.anchors import TRUTH_SIGMA, AnchorSource, Tracks
 from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.data import setting_of
+from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.sequence import open_tour
 
@@ -30,7 +31,8 @@ FIGURES = ("delta1", "rmse", "nll", "ece_delta", "ece_q", "spearman")
 @pytest.fixture(scope="module")
 def tour():
     """Ten decoded frames: rendering them again for every test would take most of the time."""
-    return in_memory(open_tour("tour:300003?frames=16&size=96x128&sensor=0"), slice(10))
+    tour = open_tour("tour:300003?frames=16&size=96x128&sensor=0")
+    return in_memory(replace(tour, entries=tour.entries[:10], names_on_disk=tour.names_on_disk[:10]))
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +157,8 @@ def test_no_anchors_at_most_is_plain_ufm_star(tour, networks):
 
 
 def test_ground_truth_helps_a_network_whose_views_agree_on_what_is_wrong(tour):
-    rows = [row(NAME), row(NAME, anchors="truth"), row(NAME, anchors="truth", corrected=True)]
+    kinds = ({}, {"anchors": "truth"}, {"anchors": "truth", "corrected": True})
+    rows = [row(NAME, overrides={"unmeasured": "paper"}, **kind) for kind in kinds]
     plain, anchored, corrected = (r.figures for r in evaluate(tour, rows, {"depth_only": Biased()}).values())
     assert anchored["nll"] < 3 < plain["nll"]
     assert anchored["ece_delta"] < 0.75 * plain["ece_delta"]
@@ -173,9 +176,9 @@ def test_truth_is_exact_at_random_pixels_and_more_hold_the_fewer(tour):
 
     def drawn(count, seed=0):
         source = AnchorSource(Setting(anchors="truth", anchor_count=count, seed=seed), None)
-        result = source.of(frame, frame.T_world_cam, p, truth)
-        assert result.ms is None
-        return result.anchors
+        _, anchors, ms = source.of(frame, frame.T_world_cam, p, truth)
+        assert ms is None
+        return anchors
 
     few, many, default = drawn(20), drawn(300), drawn(None)
     assert [a.depth.shape[1] for a in (few, many, default)] == [20, 300, 100]
@@ -196,10 +199,10 @@ def test_track_noise_has_the_size_that_the_tracker_states_for_it(tour):
         pair = []
         for size, own in zip((0.0, 0.5), tracks, strict=True):
             source = AnchorSource(Setting(anchors="tracked", track_noise=size), own)
-            result = source.of(frame, frame.T_world_cam, p, None)
-            assert isinstance(result.anchors, Anchors)
-            assert result.ms > 0
-            pair.append(result.anchors)
+            _, anchors, ms = source.of(frame, frame.T_world_cam, p, None)
+            assert isinstance(anchors, Anchors)
+            assert ms > 0
+            pair.append(anchors)
         assert torch.equal(pair[0].variance, pair[1].variance), "the tracker does not know of the noise"
         clean.append(torch.cat([pair[0].pixel, pair[0].depth[..., None]], -1)[0])
         noisy.append(torch.cat([pair[1].pixel, pair[1].depth[..., None]], -1)[0])
@@ -208,15 +211,6 @@ def test_track_noise_has_the_size_that_the_tracker_states_for_it(tour):
     assert len(change) > 60
     assert change[:, :2].std() == pytest.approx(0.5, rel=0.2)
     assert (change[:, 2] / torch.cat(stated)).std() == pytest.approx(0.5, rel=0.25)
-
-
-def test_rows_of_the_same_poses_share_a_tracker():
-    alike = [row(NAME, anchors="tracked"), row(NAME, anchors="tracked", anchor_count=5, corrected=True)]
-    others = [row(NAME, anchors="tracked", rotation_noise=1.0, seed=seed) for seed in (0, 1)]
-    sources = anchor_sources([row(NAME), *alike, *others, row(NAME, anchors="tracked", skip=1)])
-    assert row(NAME) not in sources
-    assert sources[alike[0]].tracks is sources[alike[1]].tracks
-    assert len({id(source.tracks) for source in sources.values()}) == 4
 
 
 def test_tracking_needs_images(tour):

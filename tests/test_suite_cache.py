@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from layouts import truncate, write_generic, write_image
 from tiny_suite import CPU, base_network, evaluate, row, same, write_networks
 
-from ufmstar_torch.eval.engine.predictions import Predicted, PredictionKey, frame_digest, sequence_digest
+from ufmstar_torch.eval.engine.predictions import Predicted, frame_digest, sequence_digest
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.suite.cache import CacheError, PredictionCache
 from ufmstar_torch.prediction import DepthPrediction
 
 ROWS = [row(name) for name in ("Ensemble", "UfM*-Ensemble", "UfM*-MCD", "MC-Dropout", "Evidential", "UfM-DepthOnly")]
-KEY = PredictionKey("a" * 64, "b" * 64, "frame-7", "all", "c" * 64)
+PATH, CONTENT = Path("network", "sequence", "frame-7@all.maps"), "c" * 64
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +44,8 @@ class Counted(PredictionCache):
 
     hits = misses = 0
 
-    def load(self, key, device):
-        known = super().load(key, device)
+    def load(self, path, content, device):
+        known = super().load(path, content, device)
         self.hits += known is not None
         self.misses += known is None
         return known
@@ -54,9 +55,9 @@ class Counted(PredictionCache):
 def test_what_is_stored_is_read_bit_for_bit(tmp_path, left_out):
     cache, whole = Counted(tmp_path / "new" / "cache"), maps()
     written = whole._replace(maps=replace(whole.maps, **dict.fromkeys(left_out)))
-    assert cache.load(KEY, CPU) is None
-    cache.store(KEY, written)
-    read = cache.load(KEY, CPU)
+    assert cache.load(PATH, CONTENT, CPU) is None
+    cache.store(PATH, CONTENT, written)
+    read = cache.load(PATH, CONTENT, CPU)
     assert (cache.hits, cache.misses) == (1, 1)
     for name in ("depth", "aleatoric_variance", "epistemic_variance"):
         one, other = getattr(read.maps, name), getattr(written.maps, name)
@@ -65,27 +66,27 @@ def test_what_is_stored_is_read_bit_for_bit(tmp_path, left_out):
     assert read.ms is None
 
 
-def test_every_part_of_the_key_matters(tmp_path):
+def test_path_and_content_matter(tmp_path):
     cache = Counted(tmp_path)
-    cache.store(KEY, maps())
-    for name in ("network", "sequence", "frame", "member", "content"):
-        assert cache.load(replace(KEY, **{name: "d" * 20}), CPU) is None
-    assert (cache.hits, cache.misses) == (0, 5)
+    cache.store(PATH, CONTENT, maps())
+    assert cache.load(PATH.with_name("frame-7@0.maps"), CONTENT, CPU) is None
+    assert cache.load(PATH, "d" * 64, CPU) is None
+    assert (cache.hits, cache.misses) == (0, 2)
 
 
 @pytest.mark.parametrize("damage", ["flip", "cut", "empty", "short"])
 def test_a_damaged_file_is_noticed_and_replaced(tmp_path, damage):
     cache = Counted(tmp_path)
-    cache.store(KEY, maps())
-    file, content = tmp_path / KEY.path, (tmp_path / KEY.path).read_bytes()
+    cache.store(PATH, CONTENT, maps())
+    file, content = tmp_path / PATH, (tmp_path / PATH).read_bytes()
     if damage == "flip":
         at = len(content) // 2
         file.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
     else:
         truncate(file, {"cut": 0.9, "empty": 0.0, "short": 20 / len(content)}[damage])
-    assert cache.load(KEY, CPU) is None
-    cache.store(KEY, maps())
-    assert cache.load(KEY, CPU) is not None
+    assert cache.load(PATH, CONTENT, CPU) is None
+    cache.store(PATH, CONTENT, maps())
+    assert cache.load(PATH, CONTENT, CPU) is not None
     assert file.read_bytes()[32:] == content[32:]
 
 
@@ -94,8 +95,8 @@ def test_two_who_write_the_same_do_no_harm(tmp_path):
 
     def work(cache):
         for _ in range(25):
-            cache.store(KEY, written)
-            assert cache.load(KEY, CPU) is not None
+            cache.store(PATH, CONTENT, written)
+            assert cache.load(PATH, CONTENT, CPU) is not None
 
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(work, caches))
@@ -108,9 +109,9 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(CacheError, match="file"):
         PredictionCache(tmp_path / "file")
     cache = Counted(tmp_path / "cache")
-    (tmp_path / "cache" / KEY.path.parts[0]).write_text("in the way")
+    (tmp_path / "cache" / PATH.parts[0]).write_text("in the way")
     with pytest.raises(CacheError, match="cannot be written"):
-        cache.store(KEY, maps())
+        cache.store(PATH, CONTENT, maps())
 
 
 def test_from_the_cache_everything_is_as_from_the_networks(path, networks, tmp_path):

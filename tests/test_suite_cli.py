@@ -7,15 +7,13 @@ import logging
 import signal
 
 import pytest
-from suite_runs import TRUTH, Stub, write_rooms
-from tiny_suite import rows_of
+from tiny_suite import TRUTH, Stub, rows_of, write_rooms
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.bench import measure as measurement
 from ufmstar_torch.eval.commands import dry_run as dry
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.commands.terminal import warned_once
-from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.suite import names
 from ufmstar_torch.eval.suite import shards
 
@@ -171,11 +169,11 @@ class Members:
 
 
 def test_predictions_are_counted_once_however_many_rows_share_them():
-    rows = rows_of(["Ensemble", "UfM*-FullEnsemble", "UfM-Ensemble", "UfM*-Ensemble"])
+    rows = rows_of("Ensemble", "UfM*-FullEnsemble", "UfM-Ensemble", "UfM*-Ensemble")
     assert dry.predictions(rows[:1], Members(), 10) == 10
     assert dry.predictions(rows, Members(), 10) == 20
     # Every second frame: images 0, 2, 4, 6, 8 are member 0, 1, 2, 0, 1's; of the default row 0, 2, 1, 0, 2's.
-    skipping = rows_of(["UfM*-Ensemble"], Setting(skip=1))
+    skipping = rows_of("UfM*-Ensemble", skip=1)
     assert dry.predictions(skipping, Members(), 10) == 5
     assert dry.predictions([*rows[3:], *skipping], Members(), 10) == 10 + 3
 

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from pool_tasks import pool
-from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept
+from tiny_suite import NAMES, TRUTH, Stub, go, job_on, kept
 from trainings import SPEC
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read

@@ -37,12 +37,6 @@ from ufmstar_torch.train.member import WEIGHTS, make_data, new_network
 ONE_STEP = replace(RECIPE, max_steps=1)
 
 
-@pytest.fixture(scope="module")
-def frames(tmp_path_factory):
-    """A sequence. Nobody may change it."""
-    return write_frames(tmp_path_factory.mktemp("frames") / "walk")
-
-
 # ---- trainings ----
 
 

@@ -15,30 +15,17 @@ from pathlib import Path
 
 import pytest
 import torch
-from trainings import RECIPE, logged, tiny_job, with_network, write_frames
+from trainings import RECIPE, logged, tiny_job, with_network
 
 from ufmstar_torch.models.checkpoints import read_safetensors
-from ufmstar_torch.train.ensemble import share_of_time
-from ufmstar_torch.train.fit import fit
+from ufmstar_torch.train.fit import fit, share_of_time
 from ufmstar_torch.train.member import WEIGHTS, make_data
+
+# Sums depend on how many threads share them, and the processes that are compared have one.
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 # Without batch norm, whose statistics are those of each process's own part of the batch.
 PLAIN = replace(with_network(RECIPE, norm=False), epochs=1, learning_rate=0.002, clip=0.0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Sums depend on how many threads share them, and the processes that are compared have one."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="module")
-def frames(tmp_path_factory):
-    """A sequence. Nobody may change it."""
-    return write_frames(tmp_path_factory.mktemp("frames") / "walk")
 
 
 def command(job):

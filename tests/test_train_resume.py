@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from trainings import RECIPE, logged, tiny_job, with_network, write_frames
+from trainings import RECIPE, logged, tiny_job, with_network
 
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.models.checkpoints import read_safetensors
@@ -22,23 +22,11 @@ from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.member import RESULT, WEIGHTS
 
+# Sums depend on how many threads share them, and the processes that are compared have one.
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 # Dropout, batch norm, augmentation, a schedule and a running mean: whatever could be out of step.
 DROPOUT = with_network(method="mc_dropout", dropout=0.2)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Sums depend on how many threads share them, and the processes that are compared have one."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="module")
-def frames(tmp_path_factory):
-    """A sequence. Nobody may change it."""
-    return write_frames(tmp_path_factory.mktemp("frames") / "walk")
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -16,9 +17,8 @@ from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.models.trained import load_for_training, save_trained
-from ufmstar_torch.train.ensemble import read_result, train_members
 from ufmstar_torch.train.folder import SUMMARY, open_folder
-from ufmstar_torch.train.member import WEIGHTS, make_trainer, quiet_lightning
+from ufmstar_torch.train.member import RESULT, WEIGHTS, make_trainer, quiet_lightning, train_member
 from ufmstar_torch.train.presets import text_table
 from ufmstar_torch.train.progress import FIGURES
 from ufmstar_torch.train.settings import Job
@@ -82,6 +82,33 @@ def _meet(trainer: pl.Trainer, out: Path) -> None:
         raise FolderError(f"--out {out} does not exist: all machines must see the folder of the first process")
 
 
+def read_result(job: Job, member: int) -> dict[str, Any]:
+    """The content of a member's result.json; empty where there is none."""
+    file = job.folder(member) / RESULT
+    return dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
+
+
+def train_members(job: Job, *, end: float | None = None, asked: Callable[[], bool] | None = None) -> str | None:
+    """Train the members that are not finished, up to ``end``, in ``time.monotonic()``'s seconds, or until ``asked``
+    returns True. The remaining time is divided evenly among the members. Returns None when all are finished, otherwise
+    why not."""
+    members = [member for member in range(job.recipe.members) if not read_result(job, member).get("finished")]
+    first: str | None = None
+    for index, member in enumerate(members):
+        if asked is not None and asked():
+            return first or "stopped"
+        reason = train_member(job, member, deadline=share_of_time(end, len(members) - index), asked=asked)
+        first = first or reason
+    return first
+
+
+def share_of_time(end: float | None, members: int) -> float | None:
+    """End of the first of ``members`` equal parts of the time from now to ``end``, in ``time.monotonic()``'s
+    seconds."""
+    now = time.monotonic()
+    return None if end is None else now + max(0.0, end - now) / members
+
+
 def _conclude(job: Job, stopped: str | None, seconds: float, command: Sequence[str]) -> dict[str, Any]:
     """Write one file of all members that have weights, and the summary."""
     r, out = job.recipe, job.settings.out
@@ -112,8 +139,8 @@ def _conclude(job: Job, stopped: str | None, seconds: float, command: Sequence[s
 def _mean_figures(results: Sequence[dict[str, Any]]) -> dict[str, float]:
     """The members' last validation figures, averaged over members (not those of the ensemble)."""
     figures = [result["figures"] for result in results if result.get("figures")]
-    common = [name for name in FIGURES if figures and all(name in own for own in figures)]
-    return {name: sum(own[name] for own in figures) / len(figures) for name in common}
+    common = [name for name in FIGURES if figures and all(name in of_member for of_member in figures)]
+    return {name: sum(of_member[name] for of_member in figures) / len(figures) for name in common}
 
 
 def report(summary: dict[str, Any]) -> str:

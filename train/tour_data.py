@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ufmstar_torch.array_files import read_npy
 from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.eval.tour.style import style_of
 from ufmstar_torch.models.atomic import write_together
@@ -41,22 +42,15 @@ _FARTHEST = np.iinfo(np.uint16).max
 class TourSettings(Checked):
     """Settings of the stored frames of a tour, apart from its seed.
 
-    Attributes:
-        frames: of each tour.
-        stride: steps of the walk between two frames.
-        size: (height, width) [px].
-        style: of the rooms.
-        fov: horizontal field of view.
-
     Raises:
         ValueError: a number out of range, or no such style.
     """
 
-    frames: int = number(40, "N", "frames", 1)
-    stride: int = number(6, "N", "steps", 1)
-    size: tuple[int, int] = (160, 224)
-    style: str = "home"
-    fov: float = number(70.0, "fov", "degrees", 20, 120)
+    frames: int = number(40, "N", "frames", 1)  # of each tour
+    stride: int = number(6, "N", "steps", 1)  # of the walk between two frames
+    size: tuple[int, int] = (160, 224)  # (height, width) [px]
+    style: str = "home"  # of the rooms
+    fov: float = number(70.0, "fov", "degrees", 20, 120)  # horizontal field of view
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -111,8 +105,8 @@ class TourFrames:
     def _mapped(self, seed: int) -> tuple[NDArray[Any], ...]:
         if seed not in self._maps:
             image, depth, *small = tour_files(self.folder, seed)
-            maps = (np.load(file, mmap_mode="r") for file in (image, depth))
-            self._maps[seed] = (*maps, *map(np.load, small))
+            maps = (read_npy(file, mapped=True) for file in (image, depth))
+            self._maps[seed] = (*maps, *map(read_npy, small))
         return self._maps[seed]
 
 

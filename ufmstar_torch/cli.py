@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "report": ("eval.commands.report", "tables, figures and a page from the results of eval"),
     "bench": ("eval.commands.bench", "time per stage and memory, beside the depth network's own"),
     "train": ("train.command", "a network with an uncertainty head, or an ensemble of them"),
+    "poses": ("eval.commands.poses", "poses and landmarks of a video that has none, by structure from motion"),
     "recalibrate": ("eval.commands.recalibrate", "fit a map of the variance to sequences with ground truth"),
     "data": ("eval.commands.data", "check: do a sequence's poses, depth and images fit together?"),
 }
@@ -36,7 +37,7 @@ commands:
 
 ufmstar COMMAND --help shows a command's options, ufmstar --version the version.
 """
-# What a network, a file or a full disk may raise. A user gets one line, and the traceback with --debug.
+# Errors of a network, a file or a full disk. A user gets one line, and the traceback with --debug.
 _FAILURES = (ImportError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
 
 # OpenMP starts as many threads as it is told; thousands of them stall the machine and crash torch.

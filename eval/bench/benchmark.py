@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,14 +13,14 @@ from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.parts import MULTIVIEW
 from ufmstar_torch.eval.bench.settings import ARCHITECTURES, TOUR, BenchSettings
+from ufmstar_torch.eval.engine.load import load_members
 from ufmstar_torch.eval.methods.method import BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.run.machine import available_cores, require_device
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
-from ufmstar_torch.models import FastDepth, FastDepthWidths, MonodepthResNet, Preprocess, load_network
-from ufmstar_torch.models.ensemble import Ensemble
+from ufmstar_torch.models import FastDepth, FastDepthWidths, MonodepthResNet, Preprocess
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.prediction import DepthPrediction
@@ -102,13 +102,10 @@ def _random(options: BenchSettings, side: int, device: torch.device) -> TimedNet
 
 def _loaded(options: BenchSettings, threads: int, device: torch.device) -> TimedNetwork:
     """The network of the options, as ``ufmstar run`` runs it."""
-    assert options.weights is not None
     inference = Inference(runtime=options.runtime, threads=threads)
-    spec = {} if options.spec is None else {"spec": options.spec}
-    loaded = load_network(options.model, options.weights, **spec, **inference.options(options.model, device))
-    members = cast("list[DepthNetwork]", list(loaded.members)) if isinstance(loaded, Ensemble) else [loaded]
-    ready = [inference.ready(member, options.weights, device).to(device) for member in members]
-    return TimedNetwork("ensemble" if len(ready) > 1 else "depth_only", ready, options.model)
+    loaded = load_members(options.model, [str(options.weights)], spec=options.spec, inference=inference, device=device)
+    members = [member.to(device) for member in loaded]
+    return TimedNetwork("ensemble" if len(members) > 1 else "depth_only", members, options.model)
 
 
 def format_report(report: Mapping[str, Any]) -> str:

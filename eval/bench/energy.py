@@ -26,7 +26,7 @@ _NO_METER = {
 _CHIP = {GPU: ("gpu_energy_mj", "gpu_mj"), CPU: ("cpu_energy_mj", "cpu_total_mj")}
 _TRIAL = 0.2  # [s] A window that only shows which meters there are.
 Key = TypeVar("Key")
-# Of a part, per window and frame: what its unit's meter counted [J], and the time [s], [N, 2]; or why there is none.
+# [N, 2] energy [J] of a part on its unit's meter and time [s], per window and frame; or why there is none.
 Energy = NDArray[np.float64] | str
 
 

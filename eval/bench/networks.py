@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from ufmstar_torch.eval.bench.memory import weight_bytes
 from ufmstar_torch.eval.engine.networks import prepared_as
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.row import Row
@@ -88,6 +88,15 @@ class TimedNetwork:
         if not everything:
             return None
         return {"depth": alone, "uncertainty": 0 if self.base == "depth_only" else everything - alone}
+
+
+def weight_bytes(*modules: nn.Module) -> int:
+    """Bytes of the parameters and buffers of modules, and of files that ONNX Runtime runs; shared ones count once."""
+    graphs = {m.path for module in modules for m in module.modules() if isinstance(m, OnnxNetwork)}
+    tensors = (t for module in modules for t in (*module.parameters(), *module.buffers()) if t.numel())
+    return sum({(t.data_ptr(), t.nbytes): t.nbytes for t in tensors}.values()) + sum(
+        Path(path).stat().st_size for path in graphs
+    )
 
 
 def timed_networks(sources: Mapping[str, DepthSource], rows: Sequence[Row] = ()) -> dict[str, TimedNetwork]:

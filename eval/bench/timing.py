@@ -1,26 +1,22 @@
-"""Timed calls in alternating order, the stages of a step, and a fixed number of threads.
+"""Statistics of times, the stages of a step, and a fixed number of threads.
 
 Wall-clock times on a machine with other load have a long upper tail: the median and the quartiles, which the tail
-hardly moves, and the minimum are reported. The processor time is what the process itself computed, over all its
-threads (threads that wait by spinning included), without what other processes took.
+hardly moves, and the minimum are reported.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.eval.engine.clock import CallTimes, StageTimer, spread, synchronize
-
-F = TypeVar("F")
-Name = TypeVar("Name", bound=Hashable)
+from ufmstar_torch.eval.engine.clock import StageTimer
 
 # Every moment of a step belongs to one of these; see ``ufmstar_torch.step_parts.StepObserver``.
 STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
@@ -52,59 +48,63 @@ def pinned_threads(count: int) -> Iterator[None]:
             write(number)
 
 
-class TimedCalls:
-    """Calls on the same frames, one after the other, each timed; ``times`` has them by name.
+def spread(milliseconds: Sequence[float]) -> dict[str, float | int]:
+    """Median, interquartile range, quartiles and minimum [ms] of at least one measurement, and their count.
 
-    On odd frames the order is reversed: no call always follows the same neighbour, and a busy machine slows all calls
-    of a frame alike.
+    Quartiles are interpolated linearly between the sorted values (NumPy's default).
+
+    Raises:
+        ValueError: no measurement.
     """
+    if not len(milliseconds):
+        raise ValueError("milliseconds must hold at least one measurement")
+    low, middle, high = (float(q) for q in np.percentile(np.asarray(milliseconds, np.float64), (25, 50, 75)))
+    return {
+        "median_ms": middle,
+        "iqr_ms": high - low,
+        "q1_ms": low,
+        "q3_ms": high,
+        "min_ms": float(min(milliseconds)),
+        "count": len(milliseconds),
+    }
 
-    def __init__(self) -> None:
-        self.times = CallTimes()
-        self._number = 0
 
-    def frames(self, frames: Iterable[F], *, warm_up: int = 0) -> Iterator[F]:
-        """The frames; after the last one, the times of the first ``warm_up`` are dropped."""
-        for self._number, frame in enumerate(frames):
-            yield frame
-        self.times.drop(warm_up)
+def paired_ratio(numerator: Sequence[float], denominator: Sequence[float]) -> dict[str, float | int]:
+    """Median and quartiles of the ratios of measurements taken one right after the other.
 
-    def call(self, calls: Mapping[Name, Callable[[], Any]], device: torch.device = _CPU) -> dict[Name, Any]:
-        """Make every call on the current frame; the results by name.
+    Another program that slows both down for a while then cancels, as it does not in a ratio of medians.
 
-        Args:
-            calls: by name.
-            device: where they compute; it is waited for before and within the timed span.
-        """
-
-        def finished(call: Callable[[], Any]) -> Any:
-            result = call()
-            synchronize(device)
-            return result
-
-        results = {}
-        for name in list(calls)[:: -1 if self._number % 2 else 1]:
-            synchronize(device)
-            results[name] = self.times.time(name, finished, calls[name])
-        return results
+    Raises:
+        ValueError: the two differ in length or are empty.
+    """
+    if len(numerator) != len(denominator) or not len(numerator):
+        raise ValueError(f"expected as many numerators as denominators, got {len(numerator)} and {len(denominator)}")
+    ratios = np.asarray(numerator, np.float64) / np.asarray(denominator, np.float64)
+    low, middle, high = (float(q) for q in np.percentile(ratios, (25, 50, 75)))
+    return {"median": middle, "q1": low, "q3": high, "count": len(ratios)}
 
 
 class StagedStep:
-    """UfM* with the times of its steps' stages: the observer (``ufmstar_torch.step_parts.StepObserver``) of a module.
+    """Times the stages of UfM*'s steps: the observer (``ufmstar_torch.step_parts.StepObserver``) of a module.
 
-    The stages are those that the step names; what follows the last one, the output's assembly, belongs to none. The
-    module's device is waited for at both ends of every stage.
+    The stages are those that the step names; the output's assembly after the last one belongs to none. The module's
+    device is waited for at both ends of every stage.
+
+    Args:
+        module: is observed.
+        step: a call that runs one step of it.
+        device: of the module.
     """
 
-    def __init__(self, module: UfMStar, device: torch.device = _CPU) -> None:
-        self.module, self._timer = module, StageTimer(device)
+    def __init__(self, module: UfMStar, step: Callable[..., Any], device: torch.device = _CPU) -> None:
+        self.module, self._step, self._timer = module, step, StageTimer(device)
         self.stages: dict[str, list[float]] = {name: [] for name in STAGES}
         module.observer = self
 
     def __call__(self, *args: Any) -> Any:
-        """One step of the module."""
+        """Run one step."""
         self._timer.take()
-        return self.module(*args)
+        return self._step(*args)
 
     def stage(self, name: str) -> None:
         """A stage has ended; the last one ends the step."""

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 
 from ufmstar_torch.eval.bench.settings import BenchSettings
-from ufmstar_torch.eval.commands.options import UsageError, parse
+from ufmstar_torch.eval.commands.options import UsageError, reader
 
-
-def read(words: Sequence[str]) -> BenchSettings:
-    """The options of a command line; errors as :func:`parse`."""
-    return parse(BenchSettings, words, "ufmstar bench")
+read = reader(BenchSettings, "ufmstar bench")
 
 
 def main(options: BenchSettings) -> int:

@@ -6,7 +6,7 @@ last room has other sizes and textures.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -14,10 +14,13 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from ufmstar_torch.eval.commands.options import UsageError, as_dict, parse
+from ufmstar_torch.eval.commands.options import UsageError, as_dict, reader
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.engine.evaluate import RowFigures
+    import torch
+
+    from ufmstar_torch.eval.engine.judge import RowFigures
+    from ufmstar_torch.eval.engine.networks import NetworkSource
     from ufmstar_torch.eval.engine.progress import Progress
 
 _WEIGHTS = ("weights", "demo.safetensors")
@@ -57,9 +60,7 @@ class DemoOptions:
             raise ValueError(f"--seed must be at least 0, got {self.seed}")
 
 
-def read(words: Sequence[str]) -> DemoOptions:
-    """The options of a command line; errors as :func:`parse`."""
-    return parse(DemoOptions, words, "ufmstar demo")
+read = reader(DemoOptions, "ufmstar demo")
 
 
 def main(options: DemoOptions) -> int:
@@ -91,8 +92,6 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
 
     from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
     from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
-    from ufmstar_torch.eval.engine.load import sha256
-    from ufmstar_torch.eval.engine.networks import NetworkSource
     from ufmstar_torch.eval.engine.progress import Progress
     from ufmstar_torch.eval.engine.warm_up import warm_up_command
     from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
@@ -104,25 +103,20 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     from ufmstar_torch.eval.run.summary import versions
     from ufmstar_torch.eval.sequences.frame import in_memory
     from ufmstar_torch.eval.tour import make_tour, tour_sequence
-    from ufmstar_torch.models.trained import load_trained, read_info
-    from ufmstar_torch.networks_in_turn import NetworksInTurn
 
     started = perf_counter()
     device = torch.zeros((), device=options.device).device
-    with _weights(options.weights) as file:
-        info, members, digest = read_info(file), load_trained(file), sha256(file)
-    if info.spec.method == "depth":
-        raise ValueError("the demo needs networks with a variance of their own (an aleatoric or evidential head)")
+    networks, size, network = _networks(options.weights, device)
+    members = network["members"]
     kind = FolderKind(program="ufmstar demo", noun="demo", manifest="summary.json", clear=remover(*DEMO_FILES))
     OutputFolder.open(options.out, kind, {}, overwrite=options.overwrite).close()
-    tour: dict[str, Any] = {"seed": options.seed, "style": "mixed", "frames": options.frames, "size": info.spec.size}
+    tour: dict[str, Any] = {"seed": options.seed, "style": "mixed", "frames": options.frames, "size": size}
     config = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
     warm_up_command(config, device, lambda done, total: progress(Progress("kernels", done, total)), dense=True)
     progress(Progress("rooms", 0, options.frames))
     sequence = in_memory(tour_sequence(**tour), lambda done: progress(Progress("rooms", done, options.frames)))
-    networks = NetworkSource(NetworksInTurn(members, preprocess=members[0].preprocess), device, {}, seeding=None)
     suite = suite_named("demo")
-    names = {row.slug: name for row, name in zip(suite.rows[: 5 if len(members) > 1 else 4], ROWS, strict=False)}
+    names = {row.slug: name for row, name in zip(suite.rows[: 5 if members > 1 else 4], ROWS, strict=False)}
     rooms = make_tour(options.seed, "mixed")
     frames = DemoFrames(names, [surface_kinds(rooms, frame) for frame in sequence])
     results = evaluate_sequence(
@@ -132,7 +126,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         sinks=[frames],
         progress=progress,
     )
-    shown = demo_names(len(members))
+    shown = demo_names(members)
     progress(Progress("pictures", 0, 1))
     curves = {shown[names[one.row.slug]].strip(): _own_curves(one) for one in results}
     title = f"ufmstar demo: {options.frames} frames, seed {options.seed}"
@@ -141,13 +135,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         "out": str(options.out),
         "settings": {name: value for name, value in as_dict(options).items() if name not in ("threads", "debug")},
         "tour": tour,
-        "network": {
-            "file": info.path.name,
-            "sha256": digest,
-            "members": len(members),
-            "spec": info.spec.to_dict(),
-            "training": info.info,
-        },
+        "network": network,
         "methods": {names[one.row.slug]: _figures(one, frames.state_bytes(names[one.row.slug])) for one in results},
         "surfaces": frames.by_kind(),
         "components": frames.count(UFM_STAR),
@@ -162,20 +150,37 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     return plain
 
 
+def _networks(weights: Path | None, device: torch.device) -> tuple[NetworkSource, tuple[int, int], dict[str, Any]]:
+    """The demo's networks, the size (h, w) of their input, and what the summary says about them. Raises ValueError:
+    they predict no variance."""
+    from ufmstar_torch.eval.engine.load import sha256
+    from ufmstar_torch.eval.engine.networks import NetworkSource
+    from ufmstar_torch.models.trained import load_trained, read_info
+    from ufmstar_torch.networks_in_turn import NetworksInTurn
+
+    with _weights(weights) as file:
+        info, members, digest = read_info(file), load_trained(file), sha256(file)
+    if info.spec.method == "depth":
+        raise ValueError("the demo needs networks with a variance of their own (an aleatoric or evidential head)")
+    source = NetworkSource(NetworksInTurn(members, preprocess=members[0].preprocess), device, {})
+    about = {"file": info.path.name, "sha256": digest, "members": len(members), "spec": info.spec.to_dict()}
+    return source, info.spec.size, about | {"training": info.info}
+
+
 def _figures(result: RowFigures, state_bytes: int) -> dict[str, Any]:
     """A row of the table: figures, median times [ms] and the bytes of its state."""
     ms = result.ms
-    own = ms.get("anchors", 0.0) + ms["uncertainty"] if result.state else None
+    uncertainty_ms = ms.get("anchors", 0.0) + ms["uncertainty"] if result.state else None
     return {
         "figures": result.figures,
         "network_ms": ms["network"],
-        "uncertainty_ms": own,
+        "uncertainty_ms": uncertainty_ms,
         "state_bytes": state_bytes,
     }
 
 
 def _own_curves(result: RowFigures) -> dict[str, Any]:
-    """The curves of a row but for those that depend on other rows (``RowMetrics.curves``)."""
+    """The curves of a row but for those that depend on other rows (``RowJudge``)."""
     return {name: values for name, values in result.curves.items() if ":" not in name}
 
 
@@ -188,8 +193,8 @@ def _weights(path: Path | None) -> Iterator[Path]:
             raise FileNotFoundError(f"--weights: no such file: {path}")
         yield path
         return
-    own = files("ufmstar_torch.models").joinpath(*_WEIGHTS)
-    if not own.is_file():
+    packaged = files("ufmstar_torch.models").joinpath(*_WEIGHTS)
+    if not packaged.is_file():
         raise FileNotFoundError(f"the package was installed without {'/'.join(_WEIGHTS)}; --weights FILE names another")
-    with as_file(own) as file:
+    with as_file(packaged) as file:
         yield file

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig
 from ufmstar_torch.eval.commands.opening import OpeningOptions
-from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, parse
+from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, reader
 from ufmstar_torch.eval.sequences.frame import parse_slice
 
 PRESETS = ("paper", "default")
@@ -149,9 +148,7 @@ class EvalOptions:
             raise ValueError("--shard and --slurm contradict each other")
 
 
-def read(words: Sequence[str]) -> EvalOptions:
-    """The options of a command line; errors as :func:`parse`."""
-    return parse(EvalOptions, words, "ufmstar eval")
+read = reader(EvalOptions, "ufmstar eval")
 
 
 def main(options: EvalOptions) -> int:

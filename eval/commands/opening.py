@@ -13,7 +13,7 @@ LAYOUTS = (
     *("auto", "tum", "7scenes", "scannet", "sens", "tartanair", "kitti360", "nyu", "colmap", "transforms", "euroc"),
     "generic",
 )
-# What `open_sequence` calls the options whose names on the command line say that they are about ground truth.
+# Names in `open_sequence` of the options for ground truth.
 _TRUTH = {"truth": "depth", "truth_scale": "depth_scale"}
 
 

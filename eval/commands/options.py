@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import types
 from argparse import SUPPRESS, Action
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from functools import cache, reduce
@@ -115,6 +115,11 @@ def parse(options: type[T], words: Sequence[str], prog: str, defaults: Mapping[s
     except (ArgumentError, TypeError) as error:  # TypeError: a list where a configuration file should have a mapping
         raise ValueError(" ".join(str(error).split())) from error
     return _build(options, values)
+
+
+def reader(options: type[T], prog: str) -> Callable[[Sequence[str]], T]:
+    """The function ``read`` of a command: :func:`parse` of its words."""
+    return lambda words: parse(options, words, prog)
 
 
 def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser:
@@ -300,12 +305,12 @@ def _settings(wanted: _Fields, values: Mapping[str, Any]) -> dict[str, Any]:
     *path, _ = wanted.prefix.split(".")
     for key in path:
         values = values[key]
-    own = {f.name: values.get(f.name) for f in fields(wanted.config) if f.name not in wanted.without}
+    settings = {f.name: values.get(f.name) for f in fields(wanted.config) if f.name not in wanted.without}
     for f in fields(wanted.config):
-        section = own.get(f.name)
+        section = settings.get(f.name)
         if _default(f) is None and isinstance(section, Mapping):  # off unless one of its values is given
-            own[f.name] = {name: value for name, value in section.items() if value is not None} or None
-    return {name: value for name, value in own.items() if not (wanted.unset and value is None)}
+            settings[f.name] = {name: value for name, value in section.items() if value is not None} or None
+    return {name: value for name, value in settings.items() if not (wanted.unset and value is None)}
 
 
 @cache

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ufmstar_torch.eval.commands.options import UsageError, option, parse, positional
+from ufmstar_torch.eval.commands.options import UsageError, option, positional, reader
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.methods.row import Row
@@ -39,9 +39,7 @@ class RecalibrateOptions:
     debug: bool = False
 
 
-def read(words: Sequence[str]) -> RecalibrateOptions:
-    """The options of a command line; errors as :func:`parse`."""
-    return parse(RecalibrateOptions, words, "ufmstar recalibrate")
+read = reader(RecalibrateOptions, "ufmstar recalibrate")
 
 
 def main(options: RecalibrateOptions) -> int:
@@ -56,8 +54,8 @@ def main(options: RecalibrateOptions) -> int:
         rows = [row for row in results.rows if row.method.fusion == UFM_STAR and not row.setting.recalibration]
         row = next((row for row in rows if row.label == options.row), None)
         if row is None:
-            known = ", ".join(row.label for row in rows) or "(none: no row of UfM*)"
-            raise ValueError(f"--row must be one of {known}, got {options.row!r}")
+            labels = ", ".join(row.label for row in rows) or "(none: no row of UfM*)"
+            raise ValueError(f"--row must be one of {labels}, got {options.row!r}")
         counts = _counts(results, row)
         fitted = fit(list(counts.values()), options.kind)
         _about(fitted, results, row).save(options.to)

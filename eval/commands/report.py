@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ufmstar_torch.eval.commands.options import UsageError, option, parse, positional
+from ufmstar_torch.eval.commands.options import UsageError, option, positional, reader
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,9 +28,7 @@ class ReportOptions:
     debug: bool = False
 
 
-def read(words: Sequence[str]) -> ReportOptions:
-    """The options of a command line; errors as :func:`parse`."""
-    return parse(ReportOptions, words, "ufmstar report")
+read = reader(ReportOptions, "ufmstar report")
 
 
 def main(options: ReportOptions) -> int:

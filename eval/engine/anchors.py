@@ -5,7 +5,7 @@ bound.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -31,18 +31,7 @@ from ufmstar_torch.eval.sequences.options import resolve
 TRUTH_COUNT, TRUTH_SIGMA = 100, 0.01
 # Third number of the seeds for the choice of anchors and for noise. Poses have a seed of two numbers.
 _TAKEN, _NOISE = 1, 2
-
-
-@dataclass(frozen=True, eq=False)
-class FrameAnchors:
-    """The anchors of one frame."""
-
-    # [1, N] in the pixels of the depth map, on its device; None where there is no image to track in.
-    anchors: Anchors | None
-    tracked: int = 0  # corners that were followed from the frame before; 0 of ground truth
-    triangulated: int = 0  # those of them with a depth; of ground truth, all
-    ms: float | None = None  # of the tracker [ms]; None of ground truth
-    none: str = ""  # why nothing was triangulated, where that is so
+_NO_IMAGE = Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked=0, none="no image")
 
 
 class Tracks:
@@ -53,7 +42,7 @@ class Tracks:
     """
 
     def __init__(self, source: LandmarkSource | None = None) -> None:
-        self._streams = StreamLandmarks(CORNERS if source is None else source)
+        self._streams = StreamLandmarks(landmark_source(CORNERS) if source is None else source)
         self._last: tuple[Frame, Landmarks, float] | None = None
 
     def of(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:
@@ -107,29 +96,38 @@ class AnchorSource:
 
     def of(
         self, frame: Frame, T_world_cam: NDArray[np.float64], predicted: Predicted, truth: NDArray[np.float32] | None
-    ) -> FrameAnchors:
-        """The anchors of the next frame, at the pose [4, 4] that the row sees [m], in the camera of the prediction;
-        ``truth`` [h, w] is the ground truth at its pixels [m], 0 = none, or None."""
-        device = predicted.maps.depth.device
+    ) -> tuple[Landmarks, Anchors | None, float | None]:
+        """The landmarks of the next frame, the same as anchors, and the time that they took [ms].
+
+        Args:
+            frame: its image is tracked in.
+            T_world_cam: [4, 4] the pose that the row sees [m].
+            predicted: has the camera of the anchors' pixels.
+            truth: [h, w] ground truth at its pixels [m], 0 = none, or None.
+
+        Returns:
+            The landmarks in the pixels of the image (of ground truth, in those of the depth map); anchors [1, N] in the
+            pixels of the depth map, None without an image to track in; None for the time if nothing was tracked.
+        """
+        device, K = predicted.maps.depth.device, predicted.intrinsics[0]
         if self.tracks is None:
             depth = np.zeros(predicted.size, np.float32) if truth is None else truth
-            sampled = self._sampled(depth, frame.index).to(device)
-            return FrameAnchors(sampled, triangulated=sampled.depth.shape[1], none="no ground truth")
+            drawn = self._sampled(depth, frame.index)
+            values = (torch.from_numpy(part)[None] for part in (drawn.pixel, drawn.depth, drawn.variance))
+            return drawn, Anchors(*values).to(device), None
         tracked = self.tracks.of(frame, T_world_cam)
         if tracked is None:
-            return FrameAnchors(None, none="no image")
-        landmarks, ms = self._thinned(self._disturbed(tracked[0], frame.index), frame.index), tracked[1]
-        anchors = landmarks.anchors(frame.intrinsics, predicted.intrinsics[0]).to(device)
-        return FrameAnchors(anchors, landmarks.tracked, len(landmarks.depth), ms, landmarks.none)
+            return _NO_IMAGE, None, None
+        landmarks = self._thinned(self._disturbed(tracked[0], frame.index), frame.index)
+        return landmarks, landmarks.anchors(frame.intrinsics, K).to(device), tracked[1]
 
-    def _sampled(self, truth: NDArray[np.float32], index: int) -> Anchors:
+    def _sampled(self, truth: NDArray[np.float32], index: int) -> Landmarks:
         v, u = np.nonzero(truth > 0)
         count = TRUTH_COUNT if self._setting.anchor_count is None else self._setting.anchor_count
         chosen = self._drawn(index, _TAKEN).permutation(len(v))[:count]
         depth = truth[v[chosen], u[chosen]].astype(np.float64)
         pixel = np.stack([u[chosen], v[chosen]], axis=-1).astype(np.float64)
-        values = (pixel, depth, np.square(TRUTH_SIGMA * depth))
-        return Anchors(*(torch.from_numpy(array)[None] for array in values))
+        return Landmarks(pixel, depth, np.square(TRUTH_SIGMA * depth), tracked=0, none="no ground truth")
 
     def _disturbed(self, landmarks: Landmarks, index: int) -> Landmarks:
         size = self._setting.track_noise

@@ -9,23 +9,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
-from statistics import median
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.estimators import make_estimator
-from ufmstar_torch.eval.engine.judge import RowMetrics, references
+from ufmstar_torch.eval.engine.judge import RowFigures, RowJudge, RowJudges, SequenceError, references
 from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionStore
 from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.rows import RowRunner
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
+from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED
@@ -35,28 +33,8 @@ from ufmstar_torch.frame import FRAME_FAULTS, check_frame
 _TOLERANCE = UfMStarConfig().rotation_tolerance
 
 
-class SequenceError(Exception):
-    """A sequence cannot be used as a whole: no frame can be read, or there is no ground truth."""
-
-
 # Errors of a sequence that cannot be used. Any other error is a mistake in this program, and ends it.
 BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
-
-
-@dataclass(frozen=True)
-class RowFigures:
-    """The figures of one row on one sequence."""
-
-    row: Row  # which
-    # frames, figures, curves, state, ms: as ``Record`` has them.
-    frames: dict[str, Any]
-    figures: dict[str, float]
-    curves: dict[str, Any]
-    state: dict[str, float]
-    ms: dict[str, float]
-    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``), "nll_by_error:REFERENCE"
-    # and "nll_by_error_of_all:REFERENCE" (``NLLByError``), to be added up over sequences.
-    sums: dict[str, dict[str, Tensor]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,40 +91,21 @@ def evaluate_sequence(
     expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
     sources = {(base, how): judge.networks[base].prepared(how) for base, how in expected}
     anchors = anchor_sources(rows, sequence.folder, sequence.pose_scale)
-    runners = []
+    runners, judges = [], {}
     for row in rows:
         source = sources[row.method.base, row.setting.preprocess]
         estimator = make_estimator(row, judge.device, source.max_depth)
-        how: dict[str, Any] = {"every": row.method.every_member, "setting": row.setting}
-        runners.append(RowRunner(row.slug, source, estimator, **how, anchors=anchors.get(row), device=judge.device))
+        how: dict[str, Any] = {"every": row.method.every_member, "setting": row.setting, "device": judge.device}
+        runners.append(RowRunner(row.slug, source, estimator, anchors=anchors.get(row), **how))
+        named = {other.slug: other.method.name for other in references(row, rows)}
+        judges[row.slug] = RowJudge(row, named, judge.bins)
     tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)
     check = partial(_check_frame, sources=sources.values(), tracked=tracked)
-    named = {row.slug: {other.slug: other.method.name for other in references(row, rows)} for row in rows}
-    metrics, accounts = RowMetrics(named, judge.confident, judge.bins), _Accounts()
     stream = FrameStream(sequence, indices, runners, store=judge.store, device=judge.device, check=check)
-    stream.drive([metrics, accounts, *sinks, ProgressSink(progress)], stop=stop)
-    opened = Counter(skipped.reason for skipped in sequence.skipped)
-    left_out = {"left_out_on_opening": dict(sorted(opened.items()))}
-    return [_result(row, metrics, accounts, left_out) for row in rows]
-
-
-def _result(row: Row, metrics: RowMetrics, accounts: _Accounts, left_out: Mapping[str, Any]) -> RowFigures:
-    """Compute one row's figures after the last frame. Raises SequenceError: no frame was judged."""
-    key = row.slug
-    frames = accounts.frames(key, metrics.judged[key])
-    if not frames["judged"]:
-        reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
-        none = "none of those that were read has ground truth"
-        raise SequenceError(f"no frame could be judged: {reasons or none}")
-    return RowFigures(
-        row=row,
-        frames={**frames, **left_out},
-        figures=metrics.figures(key),
-        curves=metrics.curves(key),
-        state=accounts.state(key),
-        ms=accounts.median_ms(key),
-        sums=metrics.sums(key),
-    )
+    stream.drive([RowJudges(judges, judge.confident), *sinks, ProgressSink(progress)], stop=stop)
+    opened = dict(sorted(Counter(skipped.reason for skipped in sequence.skipped).items()))
+    figures = [judges[row.slug].figures() for row in rows]
+    return [replace(one, frames={**one.frames, "left_out_on_opening": opened}) for one in figures]
 
 
 def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) -> None:
@@ -162,53 +121,6 @@ def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) 
     checked = check_frame(one, pose, K, None, None, None, None, feature_count=0, rotation_tolerance=_TOLERANCE)
     if int(checked.fault[0]):
         raise FrameError(frame.name, FRAME_FAULTS[int(checked.fault[0])])
-
-
-class _Accounts(FrameSink):
-    """Counts, times and memory of every row over a sequence, by key."""
-
-    def begin(self, stream: FrameStream) -> None:
-        self._rows = {row.key: row for row in stream.rows}
-        self._reasons: dict[str, Counter[str]] = {key: Counter() for key in self._rows}
-        self._idle: dict[str, Counter[str]] = {}
-        self._ms: dict[str, list[Mapping[str, float]]] = {key: [] for key in self._rows}
-        self._memory: dict[str, list[Mapping[str, float]]] = {key: [] for key in self._rows}
-
-    def take(self, result: FrameResult) -> None:
-        for key, reason in result.skipped.items():
-            self._reasons[key][reason] += 1
-        for key, row in result.rows.items():
-            if row.statistics is not None:
-                segments, matched = (int(count[0]) for count in (row.statistics.segments, row.statistics.matched))
-                # The first frame has nothing to match.
-                now = {"without_segment": not segments, "without_match": not matched and bool(self._ms[key])}
-                self._idle.setdefault(key, Counter(dict.fromkeys(now, 0))).update(now)
-            self._ms[key].append(row.ms)
-            self._memory[key].append(self._rows[key].estimator.memory())
-
-    def frames(self, key: str, judged: int) -> dict[str, Any]:
-        """Counts, as ``Record`` has them."""
-        reasons, done = self._reasons[key], len(self._ms[key])
-        skipped = sum(reasons.values())
-        counts = {"selected": done + skipped, "done": done, "judged": judged, "skipped": skipped}
-        return {**counts, **self._idle.get(key, {}), "reasons": dict(sorted(reasons.items()))}
-
-    def state(self, key: str) -> dict[str, float]:
-        """The size of the method's state over the sequence, as ``Record`` has it."""
-        state: dict[str, float] = {}
-        for name, end in (self._memory[key][-1] if self._memory[key] else {}).items():
-            values = [memory[name] for memory in self._memory[key]]
-            if name in ("bytes", "count"):
-                state |= {f"{name}_mean": sum(values) / len(values), f"{name}_max": max(values), f"{name}_end": end}
-            else:
-                state |= {"anchors_mean": sum(values) / len(values)} if name == "anchors" else {name: end}
-        return state
-
-    def median_ms(self, key: str) -> dict[str, float]:
-        """Median time of a frame by stage [ms]."""
-        stages = ("network", "anchors", "uncertainty")
-        times = {stage: [ms[stage] for ms in self._ms[key] if stage in ms] for stage in stages}
-        return {stage: median(values) for stage, values in times.items() if values}
 
 
 def _check(sequence: FrameSequence, rows: Sequence[Row], indices: range, networks: Mapping[str, DepthSource]) -> None:

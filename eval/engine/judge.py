@@ -9,26 +9,34 @@ on the same frames are judged on the same pixels.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.rows import RowResult
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.methods import method
 from ufmstar_torch.eval.methods.row import Row
 
 if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence without ground truth need not wait for
     from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 
-# Of a run: UfM*, beside it the network alone, and the posterior where there is one.
+# Names of a run's figures: UfM*, beside it the network alone, and the posterior if there is one.
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
-# Of a row's sums.
+# Names of a row's sums.
 METRICS, BY_ERROR, BY_ERROR_OF_ALL = "metrics", "nll_by_error", "nll_by_error_of_all"
 # Of the sums with one threshold: variances within 60 % of each other share a level, errors within 11 % a bin.
 OF_ALL = {"levels": 60, "bins": 128}
+
+
+class SequenceError(Exception):
+    """A sequence cannot be used as a whole: no frame can be read, or there is no ground truth."""
 
 
 def metrics_of(metrics: dict[str, SequenceMetrics], key: str, **how: Any) -> SequenceMetrics:
@@ -42,9 +50,8 @@ def metrics_of(metrics: dict[str, SequenceMetrics], key: str, **how: Any) -> Seq
 
 class RunMetrics(FrameSink):
     """The figures of a run's row, ``UFM``, beside them those of its network alone, ``ALONE``, and of its ``POSTERIOR``.
-    All are of the pixels that the row uses; the others are masked. ``sums`` are those of an earlier part of the run."""
-
-    stage: str | None = "metrics"
+    All are of the pixels that the row uses; the others are masked. ``sums`` are those of an earlier part of the run.
+    Its time is added to ``FrameResult.ms`` as "metrics" [ms]."""
 
     def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]]) -> None:
         self._key = key
@@ -66,10 +73,12 @@ class RunMetrics(FrameSink):
 
     def take(self, result: FrameResult) -> None:
         """Add a frame."""
-        row = result.rows.get(self._key)
-        if row is None or row.truth is None:
-            return
-        target = torch.from_numpy(row.truth)
+        started, row = perf_counter(), result.rows.get(self._key)
+        if row is not None and row.truth is not None:
+            self._add(row, torch.from_numpy(row.truth))
+        result.ms["metrics"] = 1000 * (perf_counter() - started)
+
+    def _add(self, row: RowResult, target: Tensor) -> None:
         maps: dict[str, tuple[Tensor, Tensor | None]] = {UFM: (row.depth, row.variance)}
         maps |= {} if row.network_variance is None else {ALONE: (row.depth, row.network_variance)}
         if row.posterior_depth is not None:
@@ -78,72 +87,135 @@ class RunMetrics(FrameSink):
             metrics_of(self._metrics, name).update(depth, variance, target, row.valid)
 
 
-class RowMetrics(FrameSink):
-    """The figures of every row of an evaluation.
+@dataclass(frozen=True)
+class RowFigures:
+    """The figures of one row on one sequence."""
 
-    Pixels that a row leaves out are NaN, not masked, so that the metrics count them.
+    row: Row  # which
+    # frames, figures, curves, state, ms: as ``Record`` has them.
+    frames: dict[str, Any]
+    figures: dict[str, float]
+    curves: dict[str, Any]
+    state: dict[str, float]
+    ms: dict[str, float]
+    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``), "nll_by_error:REFERENCE"
+    # and "nll_by_error_of_all:REFERENCE" (``NLLByError``), to be added up over sequences.
+    sums: dict[str, dict[str, Tensor]]
 
-    Args:
-        references: by row, the rows on whose confident pixels its NLL is binned by error, and their names.
-        confident: of the pixels of a frame, the share of which a reference counts as confident.
-        bins: of the calibration errors, see ``SequenceMetrics``.
 
-    Attributes:
-        judged: frames with ground truth, by row.
-    """
+class RowJudge:
+    """Collects counts, metrics, times and memory of one row over a sequence; ``named`` are the references by whose
+    confident pixels its NLL is binned by error: their names by key."""
 
-    def __init__(self, references: Mapping[str, Mapping[str, str]], confident: float, bins: str = "ours") -> None:
-        self._references, self._confident = references, confident
+    def __init__(self, row: Row, named: Mapping[str, str], bins: str) -> None:
+        self.row, self.named, self._bins = row, named, bins
         self._metrics: dict[str, SequenceMetrics] = {}
-        self._bins = bins
-        self._by_error: dict[str, dict[str, NLLByError]] = {}
-        self.judged = dict.fromkeys(references, 0)
+        self._by_error: dict[str, NLLByError] = {}
+        self._judged, self.reasons, self._idle = 0, Counter[str](), Counter[str]()
+        self._ms: list[Mapping[str, float]] = []
+        self._memory: list[Mapping[str, float]] = []
 
-    def take(self, result: FrameResult) -> None:
-        """Add a frame."""
-        targets = {key: torch.from_numpy(row.truth) for key, row in result.rows.items() if row.truth is not None}
-        expected = {other for key in targets for other in self._references[key]}
-        masks = {other: confident_pixels(result.rows[other], targets[other], self._confident) for other in expected}
-        for key, target in targets.items():
-            self._judge(key, result, target, masks)
+    def add(
+        self,
+        result: RowResult,
+        memory: Mapping[str, float],
+        masks: Mapping[str, Tensor],
+        rows: Mapping[str, RowResult],
+    ) -> None:
+        """Add a frame. Pixels that the row leaves out are NaN, not masked, so that the metrics count them.
 
-    def _judge(self, key: str, result: FrameResult, target: Tensor, masks: Mapping[str, Tensor]) -> None:
+        Args:
+            result: of this row.
+            memory: of its estimator after the frame.
+            masks: confident pixels by reference.
+            rows: results of all rows by key.
+        """
+        if result.statistics is not None:
+            segments, matched = (int(count[0]) for count in (result.statistics.segments, result.statistics.matched))
+            # The first frame has nothing to match.
+            self._idle.update(without_segment=int(not segments), without_match=int(bool(self._ms) and not matched))
+        self._ms.append(result.ms)
+        self._memory.append(memory)
+        if result.truth is None:
+            return
         from ufmstar_torch.eval.metrics import NLLByError
 
-        row = result.rows[key]
-        self.judged[key] += 1
-        depth = torch.where(row.valid, row.depth, torch.nan)
-        metrics = metrics_of(self._metrics, key, with_variance=row.variance is not None, bins=self._bins)
-        metrics.update(depth, row.variance, target)
-        if row.variance is None:
+        self._judged += 1
+        depth, variance, target = (
+            torch.where(result.valid, result.depth, torch.nan), result.variance, torch.from_numpy(result.truth)
+        )  # fmt: skip
+        how = {"with_variance": variance is not None, "bins": self._bins}
+        metrics_of(self._metrics, METRICS, **how).update(depth, variance, target)
+        if variance is None:
             return
-        binned = self._by_error.setdefault(key, {})
-        for other, name in self._references[key].items():
-            by_error = binned.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
-            by_error.update(depth, row.variance, target, masks[other])
-            of_all = binned.setdefault(f"{BY_ERROR_OF_ALL}:{name}", NLLByError(**OF_ALL, sync_on_compute=False))
-            reference = result.rows[other]
+        for other, name in self.named.items():
+            by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
+            by_error.update(depth, variance, target, masks[other])
+            of_all = NLLByError(**OF_ALL, sync_on_compute=False)
+            of_all = self._by_error.setdefault(f"{BY_ERROR_OF_ALL}:{name}", of_all)
+            reference = rows[other]
             assert reference.variance is not None
-            of_all.add_levels(depth, row.variance, target, torch.where(reference.valid, reference.variance, torch.nan))
+            of_all.add_levels(depth, variance, target, torch.where(reference.valid, reference.variance, torch.nan))
 
-    def figures(self, key: str) -> dict[str, float]:
-        """``SequenceMetrics.compute`` of a judged row."""
-        return self._metrics[key].compute()
-
-    def curves(self, key: str) -> dict[str, Any]:
-        """``SequenceMetrics.curves`` of a judged row, and its NLL and error by reference."""
-        curves: dict[str, Any] = self._metrics[key].curves()
-        for name, by_error in self._by_error.get(key, {}).items():
+    def figures(self) -> RowFigures:
+        """The figures after the last frame. Raises SequenceError: no frame was judged."""
+        reasons, done, skipped = dict(sorted(self.reasons.items())), len(self._ms), self.reasons.total()
+        if not self._judged:
+            worst = "; ".join(f"{count} x {reason}" for reason, count in list(reasons.items())[:3])
+            raise SequenceError(f"no frame could be judged: {worst or 'none of those that were read has ground truth'}")
+        frames = {"selected": done + skipped, "done": done, "judged": self._judged, "skipped": skipped}
+        metrics = self._metrics[METRICS]
+        curves: dict[str, Any] = metrics.curves()
+        sums = {METRICS: metrics.state_dict()}
+        for name, by_error in self._by_error.items():
             kind, _, reference = name.partition(":")
             if kind == BY_ERROR:
                 curves |= {f"{curve}:{reference}": values.tolist() for curve, values in by_error.compute().items()}
-        return curves
+            sums[name] = by_error.state_dict()
+        stages = ("network", "anchors", "uncertainty")
+        times = {stage: [ms[stage] for ms in self._ms if stage in ms] for stage in stages}
+        return RowFigures(
+            row=self.row,
+            frames={**frames, **self._idle, "reasons": reasons},
+            figures=metrics.compute(),
+            curves=curves,
+            state=self._state(),
+            ms={stage: median(values) for stage, values in times.items() if values},
+            sums={name: {entry: value.cpu() for entry, value in own.items()} for name, own in sums.items()},
+        )
 
-    def sums(self, key: str) -> dict[str, dict[str, Tensor]]:
-        """States of a judged row's metrics on the CPU by name: "metrics", "nll_by_error:REFERENCE" and
-        "nll_by_error_of_all:REFERENCE"."""
-        named: dict[str, Any] = {METRICS: self._metrics[key], **self._by_error.get(key, {})}
-        return {name: {entry: value.cpu() for entry, value in m.state_dict().items()} for name, m in named.items()}
+    def _state(self) -> dict[str, float]:
+        """The size of the method's state over the sequence, as ``Record`` has it."""
+        state: dict[str, float] = {}
+        for name, end in self._memory[-1].items():
+            values = [memory[name] for memory in self._memory]
+            mean = sum(values) / len(values)
+            if name in ("bytes", "count"):
+                state |= {f"{name}_mean": mean, f"{name}_max": max(values), f"{name}_end": end}
+            else:
+                state |= {"anchors_mean": mean} if name == "anchors" else {name: end}
+        return state
+
+
+class RowJudges(FrameSink):
+    """Judges every row of an evaluation, by key; of the pixels of a frame, a reference counts the share ``confident``
+    as confident."""
+
+    def __init__(self, judges: Mapping[str, RowJudge], confident: float) -> None:
+        self._judges, self._confident = judges, confident
+
+    def begin(self, stream: FrameStream) -> None:
+        self._estimators = {row.key: row.estimator for row in stream.rows}
+
+    def take(self, result: FrameResult) -> None:
+        """Add a frame."""
+        for key, reason in result.skipped.items():
+            self._judges[key].reasons[reason] += 1
+        judged = [key for key, row in result.rows.items() if row.truth is not None]
+        expected = {other for key in judged for other in self._judges[key].named}
+        masks = {other: confident_pixels(result.rows[other], self._confident) for other in expected}
+        for key, row in result.rows.items():
+            self._judges[key].add(row, self._estimators[key].memory(), masks, result.rows)
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:
@@ -169,11 +241,12 @@ def references(row: Row, rows: Sequence[Row]) -> list[Row]:
     return chosen
 
 
-def confident_pixels(row: RowResult, truth: Tensor, share: float) -> Tensor:
-    """[h, w] bool, of the pixels with ground truth [h, w] [m] (0 = none) those whose variance is at or below the
-    frame's ``share`` quantile, in (0, 1]."""
+def confident_pixels(row: RowResult, share: float) -> Tensor:
+    """[h, w] bool, True where there is ground truth and the variance is at or below the frame's ``share`` quantile,
+    in (0, 1]."""
     assert row.variance is not None
-    judged = row.valid & (truth > 0)
+    assert row.truth is not None
+    judged = row.valid & torch.from_numpy(row.truth > 0)
     values = row.variance[judged]
     if not len(values):
         return judged

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.engine.maps import MapSource, own_depth
+from ufmstar_torch.eval.engine.maps import TRUTH, MapSource, own_depth
 from ufmstar_torch.eval.engine.network_checks import check_members, without_sampling
 from ufmstar_torch.eval.engine.networks import NetworkSource, stochastic
 from ufmstar_torch.eval.methods.method import BASES
@@ -23,10 +23,9 @@ from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained, read_info
 from ufmstar_torch.networks_in_turn import NetworksInTurn
 
-TRUTH = "ground-truth"
 _FORM = "BASE=MODEL:FILE[,FILE...]"
 _CPU, _AS_USERS = torch.device("cpu"), Inference()
-_VERSION = 3  # of the digests: raise it where predictions from the same files change
+_VERSION = 4  # of the digests: raise it where predictions from the same files change
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,8 @@ class NetworkChoice:
     # a name that ``load_network`` accepts, or "ground-truth" (of "depth_only": the sequence's own depth, which shows
     # what a method makes of perfect depth).
     model: str
-    # its weights, one or several files, in the order of the members. Of "trained", "FILE#2" is member 2 of the file
-    # alone. A file .json is the spec that goes with the weights. Of "ground-truth" nothing, or "HxW".
+    # weights, one or several files, in the order of the members: "FILE#2" is member 2 of a file of "trained" alone, a
+    # file .json the spec that belongs to the weights; for "ground-truth" nothing, or "HxW".
     files: tuple[str, ...] = ()
     label: str = ""  # as shown; "" = derived from the files
 
@@ -95,8 +94,7 @@ class NetworkChoice:
         """The depth source.
 
         An ensemble's or BatchEnsemble's members take turns: image i is member i mod N's. MC-Dropout draws one sample
-        an image, or ``samples`` of them. Its sample n of frame i is seeded by i and n, so that it is the same whatever
-        ran before, on one process or many; the first one is what ``ufmstar run`` draws.
+        an image, or ``samples`` of them.
 
         Args:
             device: where networks run.
@@ -107,47 +105,17 @@ class NetworkChoice:
             FileNotFoundError, ValueError: as :func:`load_members`, or as ``check_members``.
         """
         if self.model == TRUTH:
-            label = self.label or "ground truth"
-            identity: dict[str, Any] = {"model": TRUTH, "label": label, "size": self.size}
-            return own_depth(self.size, identity, label=label, digest=_digest(identity))
-        members, sampling = self._members(inference, device), self.base == "mc_dropout"
-        check_members(self.base, members, device)
-        named = [(Path(path), member) for path, member in map(_path, self.weights)]
-        files = [{"name": path.name, "sha256": sha256(path), "member": member} for path, member in named]
-        spec = None if self.spec is None else sha256(Path(self.spec))
-        run_by = _run_by(members, inference)
-        made_of = {"model": self.model, "files": [file | {"name": None} for file in files], "spec": spec}
-        drawn = {"samples": samples} if sampling else {}
-        label = self.label or _label(self.model, named[0][0], members[0])
-        identity = {
-            "model": self.model, "label": label, "files": files, "spec": spec, "members": len(members),
-            **run_by, **drawn,
-        }  # fmt: skip
-        turns = NetworksInTurn(members, samples=samples if sampling else None, preprocess=members[0].preprocess)
-        return NetworkSource(
-            turns,
-            device,
-            identity,
-            seeding="sample" if sampling else None,
-            label=label,
-            precision=inference.precision,
-            digest=_digest({**made_of, **run_by, **drawn, "device": device.type, "version": _VERSION}),
-        )
-
-    def _members(self, inference: Inference, device: torch.device) -> list[DepthNetwork]:
-        """The members that the files hold, in their order, as they run."""
+            return own_depth(self.size, *([self.label] if self.label else []))
         try:
-            members: list[DepthNetwork] = []
-            for file in self.weights:
-                path, member = _path(file)
-                loaded = load_members(self.model, [path], spec=self.spec, inference=inference, device=device)
-                if member is not None and member >= len(loaded):
-                    raise ValueError(f"{path} has {len(loaded)} members, there is no {member} (counted from 0)")
-                members += loaded if member is None else [loaded[member]]
-            _require_same_input(members)
+            members = load_members(self.model, self.weights, spec=self.spec, inference=inference, device=device)
         except ValueError as error:
             raise ValueError(f"{self.base}={self.model}: {error}") from error
-        return members if self.base == "mc_dropout" else [without_sampling(member) for member in members]
+        sampling = self.base == "mc_dropout"
+        members = members if sampling else [without_sampling(member) for member in members]
+        check_members(self.base, members, device)
+        passes = samples if sampling else None
+        how: dict[str, Any] = {"label": self.label, "stored": True}
+        return _source(self.model, self.weights, self.spec, members, passes, inference, device, **how)
 
 
 def network_source(
@@ -157,46 +125,71 @@ def network_source(
     mode: str = "alternate",
     samples: int | None = None,
     spec: str | Path | None = None,
+    offload: bool = False,
     inference: Inference = _AS_USERS,
     device: str = "cpu",
-    **how: Any,
 ) -> NetworkSource:
     """One network, or the members of an ensemble, from files, as ``ufmstar run`` runs them.
 
     Args:
-        model, weights, spec, inference, **how: as :func:`load_members` takes them.
+        model, weights, spec, offload, inference, device: see :func:`load_members`.
         mode: "alternate" (one member per image in turn) or "full" (all of them on every image, or ``samples``
             passes of a network that samples).
         samples: None: as many as the paper's baseline.
-        device: "cpu", "cuda", ...
 
     Raises:
         FileNotFoundError, ValueError: as :func:`load_members`; mode "full" of one network that does not sample, or
             ``samples`` for any other.
     """
-    files, where = [Path(file) for file in weights], torch.device(device)
-    members = load_members(model, files, spec=spec, inference=inference, device=where, **how)
+    files, where = tuple(str(file) for file in weights), torch.device(device)
+    members = load_members(model, files, spec=spec, offload=offload, inference=inference, device=where)
     alone = len(members) == 1 and mode == "full"
     if alone and not stochastic(members):
         raise ValueError("mode 'full' needs several members, or one with dropout that samples; there is one without")
     if samples is not None and not alone:
         raise ValueError(f"samples goes with mode 'full' and one network that samples, there are {len(members)}")
     passes = (samples or SAMPLES) if alone else None
+    return _source(model, files, spec, members, passes, inference, where, mode=mode)
+
+
+def _source(
+    model: str,
+    files: Iterable[str],
+    spec: str | Path | None,
+    members: Sequence[DepthNetwork],
+    samples: int | None,
+    inference: Inference,
+    device: torch.device,
+    *,
+    label: str = "",
+    stored: bool = False,
+    **more: Any,
+) -> NetworkSource:
+    """The source of loaded members; its predictions may be ``stored``. ``more`` are values of its identity."""
+    named = [(Path(path), member) for path, member in map(_path, files)]
     identity = {
         "model": model,
-        "weights": [{"name": file.name, "sha256": sha256(file)} for file in files],
-        "mode": mode,
-        "samples": passes,
+        "label": label or _label(model, named[0][0], members[0]),
+        "files": [{"name": path.name, "sha256": sha256(path), "member": member} for path, member in named],
         "spec": None if spec is None else sha256(Path(spec)),
-        **_run_by(members, inference),
+        "members": len(members),
+        "samples": samples,
+        # Settings that change the last bits of a prediction.
+        "runtime": runtime_of(members[0], inference.precision)["name"],
+        "precision": inference.precision,
+        **more,
     }
-    turns = NetworksInTurn(members, samples=passes, preprocess=members[0].preprocess)
-    return NetworkSource(turns, where, identity, precision=inference.precision)
+    nameless = {"label": None, "files": [file | {"name": None} for file in identity["files"]]}
+    content = json.dumps({**identity, **nameless, "device": device.type, "version": _VERSION}, sort_keys=True)
+    digest = hashlib.sha256(content.encode()).hexdigest() if stored else ""
+    turns = NetworksInTurn(members, samples=samples, preprocess=members[0].preprocess)
+    how: dict[str, Any] = {"precision": inference.precision, "label": identity["label"], "digest": digest}
+    return NetworkSource(turns, device, identity, **how)
 
 
 def load_members(
     model: str,
-    files: Iterable[str | Path],
+    files: Iterable[str],
     *,
     spec: str | Path | None = None,
     offload: bool = False,
@@ -207,7 +200,8 @@ def load_members(
 
     Args:
         model: a name that ``load_network`` accepts.
-        files: one for each member (a directory for networks of ``transformers``); those of "trained" may hold several.
+        files: one for each member (a directory for networks of ``transformers``). Those of "trained" may hold several,
+            of which FILE#2 is number 2, counted from 0.
         spec: declares what an ONNX file or saved program does not say.
         offload: of "trained": weights stay in host memory and come to the device for their turn only.
         inference: runtime, precision and threads.
@@ -217,18 +211,18 @@ def load_members(
         FileNotFoundError: a file is missing.
         ValueError: unknown model, files that do not fit it, members that want different inputs.
     """
-    paths = [Path(file) for file in files]
-    for folder in paths if model in DIRECTORIES else []:
-        if not folder.is_dir():
+    named = [(Path(path), member) for path, member in map(_path, files)]
+    of_files = [*([] if model in DIRECTORIES else [path for path, _ in named]), *([Path(spec)] if spec else [])]
+    for path, _ in named if model in DIRECTORIES else ():
+        if not path.is_dir():
             fetch = "`hf download NAME --local-dir DIR` fetches a checkpoint from the hub"
-            raise FileNotFoundError(f"no such directory: {folder}; {fetch}")
-    for file in [*(paths if model not in DIRECTORIES else []), *([Path(spec)] if spec is not None else [])]:
-        if not file.is_file():
-            raise FileNotFoundError(f"no such file: {file}")
-    options: dict[str, Any] = {} if spec is None else {"spec": spec}
+            raise FileNotFoundError(f"no such directory: {path}; {fetch}")
+    for path in of_files:
+        if not path.is_file():
+            raise FileNotFoundError(f"no such file: {path}")
     members: list[DepthNetwork] = []
-    for path in paths:
-        how = options | inference.options(model, device)
+    how = ({} if spec is None else {"spec": spec}) | inference.options(model, device)
+    for path, member in named:
         if model == "trained" and not how:
             loaded = load_trained([path], offload=offload)
         else:
@@ -236,22 +230,14 @@ def load_members(
                 loaded = [load_network(model, path, **how)]
             except TypeError as error:
                 raise ValueError(f"model {model!r} does not take {sorted(how)}: {error}") from error
-        members += [inference.ready(network, path, device) for network in loaded]
-    _require_same_input(members)
+        if member is not None and member >= len(loaded):
+            raise ValueError(f"{path} has {len(loaded)} members, there is no {member} (counted from 0)")
+        selected = loaded if member is None else [loaded[member]]
+        members += [inference.ready(network, path, device) for network in selected]
+    inputs = [network.preprocess for network in members]
+    if any(other != inputs[0] for other in inputs[1:]):
+        raise ValueError(f"weights: the members of an ensemble must want the same input, got {inputs}")
     return members
-
-
-def _run_by(members: Iterable[DepthNetwork], inference: Inference) -> dict[str, str]:
-    """Settings that change the last bits of a prediction, for the identity: runtime and precision."""
-    first = runtime_of(next(iter(members)), inference.precision)
-    return {"runtime": first["name"], "precision": inference.precision}
-
-
-def _require_same_input(members: Iterable[DepthNetwork]) -> None:
-    """Raises ValueError unless the members of an ensemble want the same input."""
-    expected = [member.preprocess for member in members]
-    if any(other != expected[0] for other in expected[1:]):
-        raise ValueError(f"weights: the members of an ensemble must want the same input, got {expected}")
 
 
 def sha256(file: Path) -> str:
@@ -283,7 +269,3 @@ def _path(file: str) -> tuple[str, int | None]:
     if mark and path and number.isdecimal() and not Path(file).exists():
         return path, int(number)
     return file, None
-
-
-def _digest(values: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

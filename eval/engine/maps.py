@@ -4,6 +4,7 @@ depth."""
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrins
 from ufmstar_torch.eval.sequences.own_output import own_output
 from ufmstar_torch.prediction import DepthPrediction
 
+TRUTH = "ground-truth"
 # Depth [H, W] float32 [m] (0 = no prediction), variance [H, W] float32 [m^2] or None, intrinsics [3, 3] float64 [px].
 Maps = tuple[np.ndarray, np.ndarray | None, np.ndarray]
 
@@ -91,8 +93,8 @@ def folder_source(
     selected = [name for index in chosen if (name := sequence.names[index]) not in (run.skipped if run else ())]
     if not selected:
         raise ValueError(f"{folder}: none of the {len(chosen)} frames has a map")
-    place = DepthFolder(run.frames if run else folder, scale, variance)
-    maps = place.for_frames(sequence.names, sequence.names_on_disk, selected)
+    found = DepthFolder(run.frames if run else folder, scale, variance)
+    maps = found.for_frames(sequence.names, sequence.names_on_disk, selected)
     number = {name: i for i, name in enumerate(selected)}
     K_given = None if intrinsics is None else read_intrinsics(intrinsics)
 
@@ -101,18 +103,12 @@ def folder_source(
             raise FrameError(frame.name, f"skipped in {folder}: {run.skipped[frame.name]}" if run else "no map")
         file = maps.depth_files[number[frame.name]]
         depth, spread = maps[number[frame.name]]
-        if K_given is not None:
-            return depth, spread, K_given
-        if run is not None and file.stem in run.intrinsics:
-            return depth, spread, run.intrinsics[file.stem]
-        try:
-            size = sequence.image_size if frame.image is None else frame.image.shape[:2]
-            K = scale_intrinsics(frame.intrinsics, size, depth.shape[:2])
-        except ValueError as error:
-            raise FrameError(file, _cropped(sequence, depth)) from error
-        return depth, spread, K
+        K = K_given if run is None or K_given is not None else run.intrinsics.get(file.stem)
+        size = sequence.image_size if frame.image is None else frame.image.shape[:2]
+        return depth, spread, _of_whole_image(file, depth, size, frame.intrinsics) if K is None else K
 
-    _check_first(sequence, maps, K_given is not None or run is not None)
+    if K_given is None and run is None:
+        _check_first(sequence, maps)
     files = (*maps.depth_files, *maps.variance_files)
     listing = "\n".join(f"{file.name} {file.stat().st_size}" for file in files)
     identity = {
@@ -125,40 +121,38 @@ def folder_source(
     return MapSource(read, identity, size=size)
 
 
-def _check_first(sequence: FrameSequence, maps: DepthMaps, any_shape: bool) -> None:
-    """Raises ValueError at once where the first map has another shape than the images, as then all have."""
+def _check_first(sequence: FrameSequence, maps: DepthMaps) -> None:
+    """Raises ValueError where the first map has another aspect ratio than the images, as then all have."""
     try:
         depth, _ = maps[0]
-        if not any_shape:
-            scale_intrinsics(sequence.intrinsics, sequence.image_size, depth.shape[:2])
     except FrameError:  # counted when its turn comes
         return
+    try:
+        _of_whole_image(maps.depth_files[0], depth, sequence.image_size, sequence.intrinsics)
+    except FrameError as error:
+        raise ValueError(str(error)) from error
+
+
+def _of_whole_image(file: Path, depth: np.ndarray, size: Size | None, K: np.ndarray) -> np.ndarray:
+    """[3, 3] the camera of a map that shows a whole image of ``size`` (H, W) with intrinsics K. Raises FrameError: it
+    does not."""
+    try:
+        return scale_intrinsics(K, size, depth.shape[:2])
     except ValueError as error:
-        raise ValueError(f"{maps.depth_files[0]}: {_cropped(sequence, depth)}") from error
+        height, width = size or (0, 0)
+        reason = f"the map is {depth.shape[1]}x{depth.shape[0]}, the images are {width}x{height}: it does not show the "
+        raise FrameError(file, f"{reason}whole image: give the intrinsics of the maps, --map-intrinsics") from error
 
 
-def _cropped(sequence: FrameSequence, depth: np.ndarray) -> str:
-    height, width = sequence.image_size or (0, 0)
-    return (
-        f"the map is {depth.shape[1]}x{depth.shape[0]}, the images are {width}x{height}: it does not show the whole "
-        "image: give the intrinsics of the maps, --map-intrinsics"
-    )
-
-
-def own_depth(
-    size: Size | None = None, identity: Mapping[str, Any] | None = None, *, label: str = "", digest: str = ""
-) -> MapSource:
-    """The sequence's own depth as the prediction: what UfM* makes of perfect depth, the method's floor.
-
-    Args:
-        size, label, digest: see :class:`MapSource`.
-        identity: None = as ``ufmstar run`` writes it down.
-    """
+def own_depth(size: Size | None = None, label: str = "ground truth") -> MapSource:
+    """The sequence's own depth as the prediction: UfM* on perfect depth, the method's floor. ``size``, ``label``: see
+    :class:`MapSource`."""
 
     def read(frame: Frame) -> Maps:
         if frame.depth is None:
             raise FrameError(frame.name, "no depth map")
         return frame.depth, None, depth_camera(frame)
 
-    plain = {"maps": "the sequence's own depth", "size": size}
-    return MapSource(read, identity or plain, size=size, is_truth=True, label=label, digest=digest)
+    identity = {"model": TRUTH, "label": label, "size": size}
+    digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+    return MapSource(read, identity, size=size, is_truth=True, label=label, digest=digest)

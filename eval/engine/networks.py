@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, cast
+from typing import Any, cast
 from weakref import WeakKeyDictionary
 
 import torch
@@ -31,13 +31,13 @@ _SAMPLE_STRIDE = 1_000_003
 class NetworkSource(DepthSource):
     """Depth from networks.
 
+    Where a network samples (decoder dropout), sample n of frame i is seeded by i and n, so that it is the same whatever
+    ran before, on one process or many, in a run that continues or in one that does not.
+
     Args:
         networks: moved to ``device``.
         device: where they run.
         identity: plain values for the record of what was run.
-        seeding: of decoder dropout. "frame": by the frame's index, once for all its passes, so that a continued run
-            draws the same. "sample": by the frame's index and the number of the sample, so that a sample is the same
-            whatever ran before. None: the networks draw nothing.
         precision: of the inference, as ``Inference.precision``; predictions are of single precision in any case.
         label: as tables show it.
         digest: distinguishes these networks from others in a store; "" = their predictions are not stored.
@@ -51,7 +51,6 @@ class NetworkSource(DepthSource):
         device: torch.device,
         identity: Mapping[str, Any],
         *,
-        seeding: Literal["frame", "sample"] | None = "frame",
         precision: str = "float32",
         label: str = "",
         digest: str = "",
@@ -60,12 +59,11 @@ class NetworkSource(DepthSource):
         self._turns = networks.to(device)
         self.networks = cast("tuple[DepthNetwork, ...]", tuple(self._turns.networks))
         self.max_depth, self.passes = self._turns.max_depth, self._turns.passes
-        self._device, self._seeding, self._precision = device, seeding, precision
+        self._device, self._precision = device, precision
         self._timer = StageTimer(device)
         self._generator = torch.Generator(device)
         self._inputs: WeakKeyDictionary[Frame, tuple[Tensor, Tensor]] = WeakKeyDictionary()
-        self._seeded: Frame | None = None
-        for network in stochastic(networks.networks) if seeding is not None else []:
+        for network in stochastic(networks.networks):
             set_sampling(network, True, self._generator)
 
     @property
@@ -86,7 +84,7 @@ class NetworkSource(DepthSource):
             return self
         other = copy.copy(self)
         other._turns = NetworksInTurn(self.networks, samples=self._turns.samples, preprocess=changed)
-        other._inputs, other._seeded, other._timer = WeakKeyDictionary(), None, StageTimer(self._device)
+        other._inputs, other._timer = WeakKeyDictionary(), StageTimer(self._device)
         other.identity = {**self.identity, "preprocess": how}
         other.digest = self.digest and hashlib.sha256(f"{self.digest} {how}".encode()).hexdigest()
         return other
@@ -97,13 +95,9 @@ class NetworkSource(DepthSource):
 
     def one(self, frame: Frame, n: int) -> Predicted:
         """One inference, of member (or sample) n. Raises FrameError: the frame has no image."""
-        if self._seeding == "frame" and self._seeded is not frame:  # a frame seeds once for all members
-            self._generator.manual_seed(frame.index)
-            self._seeded = frame
         with torch.no_grad():
             x, K = self._input(frame)
-            if self._seeding == "sample":
-                self._generator.manual_seed(frame.index + _SAMPLE_STRIDE * n)
+            self._generator.manual_seed(frame.index + _SAMPLE_STRIDE * n)
             reduced = self._precision == BF16
             with self._timer.stage("network"), torch.autocast(self._device.type, torch.bfloat16, enabled=reduced):
                 maps = self._turns.member(x, K, n)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -18,7 +17,6 @@ from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction
 
-_ALL = "all"  # the member's name of all predictions combined, in a store
 _SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
 
 
@@ -90,30 +88,15 @@ class DepthSource(ABC):
         """One timed inference, of member (or sample) n. Raises FrameError: the frame has nothing to predict from."""
 
 
-@dataclass(frozen=True)
-class PredictionKey:
-    """All inputs that determine a prediction."""
-
-    network: str  # digest of the network(s)
-    sequence: str  # ``sequence_digest``
-    frame: str  # its name
-    member: str  # "0", "1", ..., or "all"
-    content: str  # ``frame_digest``
-
-    @property
-    def path(self) -> Path:
-        """Within the store's folder."""
-        return Path(self.network[:_SHOWN], self.sequence[:_SHOWN], f"{self.frame}@{self.member}.maps")
-
-
 class PredictionStore(Protocol):
-    """Keeps predictions, so that a network sees an image once, however often the rows on it change."""
+    """Keeps predictions, so that a network sees an image once, however often the rows on it change. A prediction is
+    named by a ``path`` of networks, sequence, frame and member, and by a digest of the frame's ``content``."""
 
-    def load(self, key: PredictionKey, device: torch.device) -> Predicted | None:
+    def load(self, path: Path, content: str, device: torch.device) -> Predicted | None:
         """The prediction bit for bit as it was stored, or None where it has to be computed."""
         ...
 
-    def store(self, key: PredictionKey, predicted: Predicted) -> None:
+    def store(self, path: Path, content: str, predicted: Predicted) -> None:
         """Keep a prediction."""
         ...
 
@@ -125,23 +108,28 @@ class FramePredictions:
     def __init__(self, frame: Frame, device: torch.device, store: PredictionStore | None, sequence: str) -> None:
         self.frame, self._device, self._store, self._sequence = frame, device, store, sequence
         self._content = "" if store is None else frame_digest(frame)
-        # By source: what rows asked for, by member ("0", "1", ... or "all"), and single inferences.
+        # By source: predictions by member ("0", "1", ... or "all"), and single inferences.
         self._cached: dict[tuple[object, str], Predicted] = {}
         self._inferences: dict[tuple[object, int], Predicted] = {}
 
     def of(self, source: DepthSource, position: int, every: bool) -> Predicted:
         """The prediction for a row that has used ``position`` images before: of all members, or of the one in turn.
         Raises FrameError: the frame has nothing to predict from."""
-        if every and source.passes > 1:
-            member, passes = _ALL, range(source.passes)
-        else:
-            member, passes = str(n := source.turn(position)), range(n, n + 1)
-        found = self._looked_up(source, member)
+        combined = every and source.passes > 1
+        member = "all" if combined else str(source.turn(position))
+        key = source.digest or source, member
+        if key in self._cached:
+            return self._cached[key]
+        store = self._store if source.cacheable else None
+        path = Path(source.digest[:_SHOWN], self._sequence[:_SHOWN], f"{self.frame.name}@{member}.maps")
+        found = None if store is None else store.load(path, self._content, self._device)
         if found is None:
-            made = [self._inference(source, n) for n in passes]
-            found = self._cached[source.digest or source, member] = _combined(made) if member == _ALL else made[0]
-            if self._store is not None and source.cacheable:
-                self._store.store(self._stored_as(source, member), found)
+            members = range(source.passes) if combined else [int(member)]
+            made = [self._inference(source, n) for n in members]
+            found = _combined(made) if combined else made[0]
+            if store is not None:
+                store.store(path, self._content, found)
+        self._cached[key] = found
         return found
 
     def _inference(self, source: DepthSource, n: int) -> Predicted:
@@ -151,18 +139,6 @@ class FramePredictions:
             made = source.one(self.frame, n).to(self._device)
             self._inferences[key] = made.to(torch.float32) if source.cacheable else made
         return self._inferences[key]
-
-    def _looked_up(self, source: DepthSource, member: str) -> Predicted | None:
-        """In memory, then in the store."""
-        key = (source.digest or source, member)
-        if key not in self._cached and self._store is not None and source.cacheable:
-            stored = self._store.load(self._stored_as(source, member), self._device)
-            if stored is not None:
-                self._cached[key] = stored
-        return self._cached.get(key)
-
-    def _stored_as(self, source: DepthSource, member: str) -> PredictionKey:
-        return PredictionKey(source.digest, self._sequence, self.frame.name, member, self._content)
 
 
 def _combined(made: Sequence[Predicted]) -> Predicted:

@@ -1,4 +1,4 @@
-"""One row in the middle of a sequence: which frames it uses, at which poses, and what it makes of them."""
+"""One row in the middle of a sequence: its poses, its anchors, its estimator, and the result for each frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.anchors import AnchorSource, FrameAnchors
+from ufmstar_torch.anchors.tracker import Landmarks
+from ufmstar_torch.eval.engine.anchors import AnchorSource
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.estimators import Estimator
 from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
@@ -20,7 +21,7 @@ from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.frame import FRAME_FAULTS
 from ufmstar_torch.output import FrameStatistics
 
-# Prefixes of the tensors of a row's state, as files of ``ufmstar run`` have them since its first version.
+# Prefixes of the tensors of a row's state.
 _IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drift."
 
 
@@ -49,7 +50,7 @@ class RowResult:
     truth: NDArray[np.float32] | None
     T_world_cam: NDArray[np.float64]  # [4, 4] the pose as the row sees it [m]
     member: int | None  # which network predicted; None where all did, and of maps
-    anchors: FrameAnchors | None  # of the frame; None of a row without anchors
+    landmarks: Landmarks | None  # of the frame, behind its anchors; None of a row without anchors
     ms: dict[str, float]  # "network" where one ran, "anchors" where some were tracked, and "uncertainty" [ms]
 
     @property
@@ -103,13 +104,14 @@ class RowRunner:
             RuntimeError, ValueError: as the estimator.
         """
         T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
-        anchors = None if self.anchors is None else self.anchors.of(frame, T, predicted, truth)
+        landmarks, anchors, tracking_ms = (
+            (None, None, None) if self.anchors is None else self.anchors.of(frame, T, predicted, truth)
+        )
         member = self.source.turn(self.images) if self.source.networks and not self.every else None
         with self._timer.stage("uncertainty"):
-            sparse = None if anchors is None else anchors.anchors
-            answer = self.estimator.update(predicted, torch.from_numpy(T), sparse)
+            answer = self.estimator.update(predicted, torch.from_numpy(T), anchors)
             answer = {name: value[0].cpu() if isinstance(value, Tensor) else value for name, value in answer.items()}
-        times = {"network": predicted.ms, "anchors": None if anchors is None else anchors.ms, **self._timer.take()}
+        times = {"network": predicted.ms, "anchors": tracking_ms, **self._timer.take()}
         self.images += 1
         statistics, network_variance = answer.get("statistics"), predicted.maps.variance
         if self._skips_faults and statistics is not None and int(statistics.fault[0]):
@@ -123,7 +125,7 @@ class RowRunner:
             truth=truth,
             T_world_cam=T,
             member=member,
-            anchors=anchors,
+            landmarks=landmarks,
             ms={stage: time for stage, time in times.items() if time is not None},
         )
 

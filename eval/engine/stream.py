@@ -7,7 +7,9 @@ suite with metrics.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import closing
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,7 +19,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.predictions import FramePredictions, Predicted, PredictionStore, sequence_digest
-from ufmstar_torch.eval.engine.prefetch import Prefetch
+from ufmstar_torch.eval.engine.prefetch import prefetch
 from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
 from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
@@ -38,7 +40,7 @@ class FrameResult:
     frame: Frame | None = None  # as it was read; None where no row selects it, or it cannot be used
     rows: Mapping[str, RowResult] = field(default_factory=dict)  # by key, of the rows that used it
     skipped: Mapping[str, str] = field(default_factory=dict)  # by key, why a row that selects the frame cannot use it
-    # "read" (time spent waiting: frames are read ahead), "predict" and "truth", and the stages of earlier sinks [ms].
+    # "read" (time spent waiting: frames are read ahead), "predict" and "truth" [ms]; sinks may add their own.
     ms: dict[str, float] = field(default_factory=dict)
     # ``FrameStream.state`` after the frame, for sinks in a ``WriterThread``; else empty.
     state: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
@@ -46,9 +48,6 @@ class FrameResult:
 
 class FrameSink(ABC):
     """Receives the result of every frame: metrics, writers, progress."""
-
-    # Its time stands in ``FrameResult.ms`` under this name for the sinks after it; None = it is not timed.
-    stage: str | None = None
 
     def begin(self, stream: FrameStream) -> None:
         """Before the first frame, or the first one after a resume."""
@@ -78,7 +77,6 @@ class FrameStream:
 
     Attributes:
         position: number of finished frames, skipped ones included.
-        timer: of the stages of a frame.
     """
 
     def __init__(
@@ -98,7 +96,7 @@ class FrameStream:
         self._store, self._device, self._check = store, device or torch.device("cpu"), check
         self._names = sequence.names
         self._digest = "" if store is None else sequence_digest(sequence)
-        self.timer = StageTimer(self._device)
+        self._timer = StageTimer(self._device)
         self.position = start
 
     def drive(self, sinks: Sequence[FrameSink], *, stop: Callable[[], bool] = lambda: False) -> None:
@@ -112,13 +110,15 @@ class FrameStream:
             Stopped: ``stop`` returned True.
             FrameError: without rows, a frame cannot be read.
         """
-        with Prefetch(self.sequence, self._selected(), self._prepare) as frames:
+        with closing(prefetch(self.sequence, self._selected(), self._prepare)) as frames:
             for sink in sinks:
                 sink.begin(self)
             while self.position < len(self.indices):
                 if stop():
                     raise Stopped
-                hand_over(self._next(frames), sinks, self.timer)
+                result = self._next(frames)
+                for sink in sinks:
+                    sink.take(result)
         for sink in sinks:
             sink.end()
 
@@ -126,30 +126,30 @@ class FrameStream:
         """All tensors on which the next frame depends, by row."""
         return {row.key: row.state() for row in self.rows}
 
-    def _next(self, frames: Prefetch) -> FrameResult:
+    def _next(self, frames: Iterator[Future[Frame]]) -> FrameResult:
         """Process the next frame. Raises FrameError: without rows, it cannot be read."""
         number, index = self.position, self.indices[self.position]
         name = self._names[index]
         active = [row for row in self.rows if selects(row.setting, number)]
-        self.timer.take()
+        self._timer.take()
         self.position += 1
         if self.rows and not active:
             return FrameResult(number, index, name)
         try:
-            with self.timer.stage("read"):
-                frame = frames.next()
+            with self._timer.stage("read"):
+                frame = next(frames).result()
                 if self._check is not None:
                     self._check(frame)
             cached = FramePredictions(frame, self._device, self._store, self._digest)
-            with self.timer.stage("predict"):
+            with self._timer.stage("predict"):
                 predictions = {row.key: cached.of(row.source, row.images, row.every) for row in active}
-            with self.timer.stage("truth"):
+            with self._timer.stage("truth"):
                 truths = _truths(frame, predictions)
         except FrameError as error:
             if not self.rows:
                 raise
             return FrameResult(number, index, name, skipped={row.key: error.reason for row in active})
-        ms = self.timer.take()
+        ms = self._timer.take()
         results: dict[str, RowResult] = {}
         skipped: dict[str, str] = {}
         for row in active:
@@ -173,17 +173,6 @@ class FrameStream:
         if self._store is None and torch.get_num_threads() == 1:
             for row in self.rows:
                 row.source.prepare(frame)
-
-
-def hand_over(result: FrameResult, sinks: Sequence[FrameSink], timer: StageTimer) -> None:
-    """Give a result to sinks, in their order; the times of their stages are added to it."""
-    for sink in sinks:
-        if sink.stage is None:
-            sink.take(result)
-            continue
-        with timer.stage(sink.stage):
-            sink.take(result)
-        result.ms.update(timer.take())
 
 
 def _truths(frame: Frame, predictions: Mapping[str, Predicted]) -> dict[str, NDArray[np.float32] | None]:

@@ -1,6 +1,6 @@
-"""Sinks behind the loop over frames: metrics and files in a thread of their own, while network and step compute on.
+"""Metrics and files in a thread of their own, while network and step compute the next frames.
 
-Compressing and writing release Python's lock, so that they fill the cores. The thread works frame by frame, in order.
+Compressing and writing release Python's lock. The thread works frame by frame, in order.
 """
 
 from __future__ import annotations
@@ -11,10 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from time import perf_counter
 
-import torch
-
-from ufmstar_torch.eval.engine.clock import StageTimer
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, hand_over
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 
 # Frames that wait for their sinks; each holds its maps and the state after it, about 3 MB at 224 x 224.
 _WAITING = 4
@@ -27,13 +24,12 @@ class WriterThread(FrameSink):
     error of a sink is raised in the loop, at the next frame or at the end; no later frame comes to a sink then.
 
     Args:
-        sinks: called in their order, one frame after the other. ``FrameResult.ms`` has their stages, and "cycle", the
-            time since the frame before [ms]: of the whole loop, waiting for these sinks included.
+        sinks: called in their order, one frame after the other. ``FrameResult.ms`` has "cycle", the time since the
+            frame before [ms]: of the whole loop, waiting for these sinks included.
     """
 
     def __init__(self, sinks: Sequence[FrameSink]) -> None:
         self._sinks = tuple(sinks)
-        self._timer = StageTimer(torch.device("cpu"))
         self._thread = ThreadPoolExecutor(1)
         self._waiting: deque[Future[None]] = deque()
         self._intact = True
@@ -79,5 +75,6 @@ class WriterThread(FrameSink):
         if not self._intact:
             return
         self._intact = False
-        hand_over(result, self._sinks, self._timer)
+        for sink in self._sinks:
+            sink.take(result)
         self._intact = True

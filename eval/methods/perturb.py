@@ -14,9 +14,9 @@ from ufmstar_torch.eval.methods.setting import Setting
 if TYPE_CHECKING:
     from torch import Tensor
 
-# What is drawn of a frame beside its noise, as a third number of the seed; 1 and 2 are of its anchors.
+# Third number of the seed of drift; 1 and 2 belong to the frame's anchors, noise has none.
 _DRIFT = 3
-# Of a walk's state.
+# Names in a walk's state.
 _KEPT = ("index", "T_world_cam", "drifted")
 
 

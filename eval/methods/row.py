@@ -15,9 +15,9 @@ from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, Setting, config
 class Row:
     """A method under a setting."""
 
-    method: Method  # which network, how often it is run, and what judges its views
-    setting: Setting = DEFAULT  # what an ablation changes about it
-    # what tables and figures call it; "" = by method and setting. It makes no other row of it.
+    method: Method
+    setting: Setting = DEFAULT  # the changes of an ablation
+    # in tables and figures; "" = by method and setting. Ignored when rows are compared.
     title: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
@@ -59,11 +59,6 @@ class Row:
         """For people: "UfM*-Ensemble", "UfM*-Ensemble (ema_alpha 1.0)"."""
         changed = ", ".join(f"{name} {value}" for name, value in self.changed.items())
         return f"{self.name} ({changed})" if changed else self.name
-
-    @property
-    def base_line(self) -> Row:
-        """The same method with the same preset and preprocessing, and nothing varied."""
-        return Row(self.method, self.setting.chosen)
 
     def to_dict(self) -> dict[str, Any]:
         """The row as plain values, as eval.json has it."""

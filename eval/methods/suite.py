@@ -4,7 +4,7 @@
 title = "Smoothing"                        # name: the file's, unless given
 base = "ensemble"                          # the network it is about, unless --base names another one; or
 bases = ["ensemble", "aleatoric"]          # several: the rows of each in turn
-datasets = ["scannet"]                     # a hint for readers, as sequences, network and size
+efficiency = true                          # time, energy and memory are measured as well
 sweep = ["ema_alpha"]                      # settings that vary, for a figure
 include = ["ablation-eta"]                 # rows and sweeps of other suites as well
 
@@ -40,10 +40,9 @@ from ufmstar_torch.eval.methods.setting import DEFAULTS, default_of, setting_fro
 
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
-_HINTS = ("datasets", "sequences", "network", "size", "efficiency")
 _KEYS = {
     "name": str, "title": str, "base": str, "bases": list, "include": list, "sweep": list, "rows": list,
-    "datasets": list, "sequences": int, "network": str, "size": list, "efficiency": bool,
+    "efficiency": bool,
 }  # fmt: skip
 _ROW_KEYS = {"methods": list, "bases": list, "setting": dict, "each": dict, "multiples": dict, "label": str}
 
@@ -60,10 +59,6 @@ class Suite:
     title: str  # one line for people
     rows: tuple[Row, ...]  # each of them once
     sweep: tuple[str, ...] = ()  # settings that vary, by the names of ``Setting.to_dict``; () = a table of methods
-    datasets: tuple[str, ...] = ()  # that the paper takes
-    sequences: int | None = None  # how many it samples of each; None = all
-    network: str = ""  # that it judges
-    size: tuple[int, int] | None = None  # (h, w) of the network's input in the paper [px]
     efficiency: bool = False  # whether time, energy and memory are what it is about
 
     def __post_init__(self) -> None:
@@ -85,14 +80,14 @@ class Suite:
 
     def with_bases(self, bases: Iterable[str]) -> Suite:
         """The suite with the rows of some bases only. Raises ValueError: none is left."""
-        given = set(bases)
-        kept = tuple(row for row in self.rows if row.method.base in given)
-        if not kept:
+        available = set(bases)
+        rows = tuple(row for row in self.rows if row.method.base in available)
+        if not rows:
             raise ValueError(
                 f"suite {self.name} has rows of {', '.join(self.bases)}, but there are networks of "
-                f"{', '.join(sorted(given)) or 'none'} only: give --network BASE=MODEL:FILES for one of them"
+                f"{', '.join(sorted(available)) or 'none'} only: give --network BASE=MODEL:FILES for one of them"
             )
-        return replace(self, rows=kept)
+        return replace(self, rows=rows)
 
 
 def names() -> tuple[str, ...]:
@@ -131,13 +126,11 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
         if base is not None and "base" not in values:
             raise ValueError("--base goes with figures and ablations of one network, the suite names its own")
         rows = tuple(dict.fromkeys(_rows_of(values, base or values.get("base"), preset)))
-        own = Path(name).stem
+        stem = Path(name).stem
         if base is not None and not rows:
             raise ValueError(f"the suite has no rows of {base}")
-        given = {key: value for key, value in values.items() if key in _HINTS}
-        hints: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in given.items()}
         sweep = tuple(dict.fromkeys(_sweep(values)))
-        return Suite(values.get("name", own), values.get("title", own), rows, sweep, **hints)
+        return Suite(values.get("name", stem), values.get("title", stem), rows, sweep, values.get("efficiency", False))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{name}: {error}") from error
 
@@ -155,7 +148,7 @@ def _read(name: str) -> dict[str, Any]:
     """The content of a suite's file, its keys and bases checked."""
     values = tomllib.loads(_file(name).read_text(encoding="utf-8"))
     _check(values, _KEYS, "the suite")
-    for key in ("bases", "include", "sweep", "datasets"):
+    for key in ("bases", "include", "sweep"):
         _words(values, key)
     for base in (*values.get("bases", []), values.get("base", "ensemble")):
         _require_base(base)
@@ -164,11 +157,11 @@ def _read(name: str) -> dict[str, Any]:
 
 def _rows_of(values: Mapping[str, Any], base: str | None, preset: str | None) -> Iterator[Row]:
     """The rows of a suite and of those that it includes, for a base or for the suite's own bases."""
-    for own in values.get("bases", [base]):
+    for network in values.get("bases", [base]):
         for n, part in enumerate(values.get("rows", [])):
             _check(part, _ROW_KEYS, f"rows {n + 1}")
             try:
-                yield from _expanded(part, own, preset)
+                yield from _expanded(part, network, preset)
             except ValueError as error:
                 raise ValueError(f"rows {n + 1}: {error}") from error
     for name in values.get("include", []):

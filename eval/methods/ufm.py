@@ -32,23 +32,18 @@ class UfMConfig(Checked):
     "MC-dropout": the members in turn, or one stochastic pass. "Depth only": no variance, s^2 = 0. "Full": mean
     depth, A and E of several inferences.
 
-    Attributes:
-        max_points: points kept per stream; the paper's 100,000 at 224 x 224, 300,000 at 518 x 518. None = all.
-            With fewer than an image has pixels, points are dropped before they are seen again.
-        add_aleatoric: let A, where it is given, be part of s^2, the variance of a single observation.
-        add_epistemic: likewise E.
-        rotation_tolerance: max |R^T R - I| of a pose; less is removed by projection onto SO(3), more is a fault.
-        on_bad_frame: "raise" or "skip" (counted, NaN returned) for unusable poses and intrinsics.
-
     Raises:
         ValueError: an impossible value, or, from ``from_dict``, an unknown name.
     """
 
+    # Points kept per stream; the paper's 100,000 at 224 x 224, 300,000 at 518 x 518. None = all. With fewer than an
+    # image has pixels, points are dropped before they are seen again.
     max_points: int | None = 100_000
-    add_aleatoric: bool = True
-    add_epistemic: bool = True
+    add_aleatoric: bool = True  # A is part of s^2, the variance of a single observation
+    add_epistemic: bool = True  # likewise E
+    # max |R^T R - I| of a pose; less is removed by projection onto SO(3), more is a fault.
     rotation_tolerance: float = number(0.01, "", "1", 0.0, 0.1)
-    on_bad_frame: str = choice("raise", "skip")
+    on_bad_frame: str = choice("raise", "skip")  # of unusable poses and intrinsics; skipped frames are counted, NaN
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -59,46 +54,27 @@ class UfMConfig(Checked):
 
 @dataclass(frozen=True)
 class UfMStatistics:
-    """Counts of one frame, per stream [B].
+    """Counts of one frame, per stream [B]."""
 
-    Attributes:
-        points: kept after the frame.
-        memory: of these points [bytes].
-        fused: points that met a valid pixel.
-        new: pixels that no point had landed on, appended.
-        dropped: points pruned.
-        valid_pixels: pixels used.
-        fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
-        rotation_deviation: max |R^T R - I| of the pose as given.
-    """
-
-    points: Tensor
-    memory: Tensor
-    fused: Tensor
-    new: Tensor
-    dropped: Tensor
-    valid_pixels: Tensor
-    fault: Tensor
-    rotation_deviation: Tensor
+    points: Tensor  # kept after the frame
+    memory: Tensor  # of these points [bytes]
+    fused: Tensor  # points that met a valid pixel
+    new: Tensor  # pixels that no point had landed on, appended
+    dropped: Tensor  # points pruned
+    valid_pixels: Tensor  # pixels used
+    fault: Tensor  # index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped
+    rotation_deviation: Tensor  # max |R^T R - I| of the pose
 
 
 @dataclass(frozen=True)
 class UfMOutput:
-    """The prediction of one frame with its variance. Maps have the layout in which ``depth`` was given.
+    """The prediction of one frame with its variance. Maps have the layout of the input ``depth``."""
 
-    Attributes:
-        depth: the depth as given [m].
-        variance: S_zz of the newest point at each pixel, s^2 where there was none [m^2]; NaN where not valid.
-        aleatoric, epistemic: A and E as given [m^2], or None.
-        valid: True where the pixel was used.
-        statistics: per-stream counts of this frame.
-    """
-
-    depth: Tensor
-    variance: Tensor
-    aleatoric: Tensor | None
-    epistemic: Tensor | None
-    valid: Tensor
+    depth: Tensor  # the input [m]
+    variance: Tensor  # S_zz of the newest point at each pixel, s^2 where there was none [m^2]; NaN where not valid
+    aleatoric: Tensor | None  # A of the input [m^2]
+    epistemic: Tensor | None  # E of the input [m^2]
+    valid: Tensor  # True where the pixel was used
     statistics: UfMStatistics
 
     @property
@@ -126,13 +102,6 @@ class UfM(StatefulModule):
     STATE = _STATE
     CONFIG = UfMConfig
     config: UfMConfig
-    moments: Tensor
-    count: Tensor
-    points: Tensor
-    T_world_first: Tensor
-    started: Tensor
-    frames: Tensor
-    skipped: Tensor
 
     def __init__(
         self,
@@ -217,11 +186,11 @@ class UfM(StatefulModule):
             keep = ~self._chosen(streams, b)
             of_point = keep.repeat_interleave(self.points)
             fresh = _empty(b, dtype, device)
-            kept = {"moments": self.moments[of_point], "count": self.count[of_point]}
+            remaining = {"moments": self.moments[of_point], "count": self.count[of_point]}
             for name in _STATE[2:]:
                 old = getattr(self, name)
-                kept[name] = torch.where(keep.view(-1, *[1] * (old.dim() - 1)), old, fresh[name])
-            self._store(kept)
+                remaining[name] = torch.where(keep.view(-1, *[1] * (old.dim() - 1)), old, fresh[name])
+            self._store(remaining)
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         """Also that no stream has more points than ``max_points``, and every covariance is one that points can have."""
@@ -243,18 +212,18 @@ class UfM(StatefulModule):
         first = torch.where((fine & ~state["started"])[:, None, None], frame.T_world_cam, state["T_world_first"])
         R, t = relative_pose(frame.T_world_cam, first)
         s2 = self._observation_variance(frame)
-        # Of a stream at fault no pixel is valid: nothing is taken in.
-        given = zip(clouds, frame.depth, s2, frame.valid, frame.intrinsics, R, t, strict=True)
-        taken = [take_in(cloud, View(*view), self.config.max_points) for cloud, *view in given]
+        # No pixel of a stream at fault is valid: it stays as it is.
+        observed = zip(clouds, frame.depth, s2, frame.valid, frame.intrinsics, R, t, strict=True)
+        fused = [take_in(cloud, View(*view), self.config.max_points) for cloud, *view in observed]
 
         def each(values: Iterable[int]) -> Tensor:
             return torch.tensor(list(values), device=s2.device)
 
-        points = each(len(one.cloud.count) for one in taken)
+        points = each(len(one.cloud.count) for one in fused)
         self._store(
             {
-                "moments": _joined([one.cloud.moments for one in taken]),
-                "count": _joined([one.cloud.count for one in taken]),
+                "moments": _joined([one.cloud.moments for one in fused]),
+                "count": _joined([one.cloud.count for one in fused]),
                 "points": points,
                 "T_world_first": first,
                 "started": state["started"] | fine,
@@ -264,18 +233,18 @@ class UfM(StatefulModule):
         )
         statistics = UfMStatistics(
             points=points,
-            memory=points * taken[0].cloud.bytes_per_point,
-            fused=each(one.fused for one in taken),
-            new=each(one.new for one in taken),
-            dropped=each(one.dropped for one in taken),
+            memory=points * fused[0].cloud.bytes_per_point,
+            fused=each(one.fused for one in fused),
+            new=each(one.new for one in fused),
+            dropped=each(one.dropped for one in fused),
             valid_pixels=frame.valid.sum((1, 2)),
             fault=frame.fault,
             rotation_deviation=frame.rotation_deviation,
         )
-        return torch.stack([one.variance for one in taken]), statistics
+        return torch.stack([one.variance for one in fused]), statistics
 
     def _observation_variance(self, frame: FrameInput) -> Tensor:
-        """[B, H, W] s^2 of one observation [m^2]: what the network states, 0 if it states nothing."""
+        """[B, H, W] s^2 of one observation [m^2]: the network's variance, 0 if it states none."""
         both = [(frame.aleatoric, self.config.add_aleatoric), (frame.epistemic, self.config.add_epistemic)]
         counted = [value.detach() for value, counts in both if value is not None and counts]
         return sum(counted, start=torch.zeros_like(frame.depth))

@@ -9,6 +9,8 @@ from torch import Tensor
 from ufmstar_torch.eval.metrics.base import SumMetric, share
 from ufmstar_torch.eval.metrics.pixel_sums import add_delta1, add_errors
 
+TOLERANCE = 0.25  # [1] of delta1, in both definitions
+
 
 class Delta1(SumMetric):
     """delta1, the share of pixels with depth right within 25 % (section "Experimental Setup").
@@ -17,17 +19,12 @@ class Delta1(SumMetric):
     ``delta1_ratio``, as elsewhere in the literature, max(d/g, g/d) < 1.25, with d <= 0 a miss; ``pixels``, how many
     were judged; ``left_out_share``, of the pixels with ground truth, those whose depth is NaN or infinite.
     Without any pixel the figures are NaN.
-
-    Args:
-        tolerance: .25 in both definitions.
     """
 
     ADD = add_delta1
 
-    def __init__(self, tolerance: float = 0.25, **kwargs: Any) -> None:
-        if not tolerance > 0:
-            raise ValueError(f"tolerance must be positive, got {tolerance}")
-        super().__init__({"tolerance": tolerance}, (tolerance,), **kwargs)
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(constants=(TOLERANCE,), **kwargs)
         self.add_counts("hits", "hits_ratio", "pixels", "with_truth")
 
     def compute(self) -> dict[str, Tensor]:

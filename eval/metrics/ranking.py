@@ -2,7 +2,7 @@
 
 Ranks need all pixels at once; a stream has none of the earlier ones. So the pixels go into bins of equal
 width in the logarithm of the variance and of the error, finer than anyone reads a variance, and pixels
-of one bin count as ties. What that can change is bounded: see each class.
+of one bin count as ties. Each class states a bound on the error that this makes.
 """
 
 from __future__ import annotations
@@ -15,6 +15,9 @@ from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import SumMetric, flat_pixels
 from ufmstar_torch.eval.metrics.pixel_sums import HIGH, LOW, add_joint, add_nll_by_error, add_sparsification
+
+# In the logarithm of the variance or of the error; of both together: 5.5 % in variance, 2 MB of counts.
+BINS, JOINT_BINS = 4096, 512
 
 
 def mean_of_share(count: Tensor, total: Tensor, shares: Tensor) -> Tensor:
@@ -43,20 +46,15 @@ class Sparsification(SumMetric):
 
     Ties: pixels whose variance agrees within a bin (4096 bins: .7 %, .35 % of sigma) count as equal, so
     the curve is exactly that of variances rounded so far.
-
-    Args:
-        bins: of the logarithm of the variance.
     """
 
     OF_VARIANCE = "AUSE"
     ADD = add_sparsification
 
-    def __init__(self, bins: int = 4096, **kwargs: Any) -> None:
-        if bins < 1:
-            raise ValueError(f"bins must be >= 1, got {bins}")
-        super().__init__({"bins": bins}, **kwargs)
-        self.add_counts("count", "count_squared", "count_relative", shape=(bins + 2,))
-        self.add_sums("squared", "relative", "sum_squared", "sum_relative", shape=(bins + 2,))
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_counts("count", "count_squared", "count_relative", shape=(BINS + 2,))
+        self.add_sums("squared", "relative", "sum_squared", "sum_relative", shape=(BINS + 2,))
 
     def compute(self) -> dict[str, Tensor]:
         kept = 1 - torch.arange(50, dtype=torch.float64, device=self.count.device) / 50
@@ -88,19 +86,14 @@ class SpearmanCorrelation(SumMetric):
     The bound: a bin's mean rank X' is the conditional mean of the ranks X in it, so that var X = var X' +
     w var X with w <= sum_b n_b (n_b^2 - 1) / (N (N^2 - 1)); by Cauchy-Schwarz the covariance changes by
     at most sd X sd Y (sqrt(w_x) + sqrt(w_y) + sqrt(w_x w_y)).
-
-    Args:
-        bins: per axis; 512 make bins of 5.5 % in variance (2.7 % of sigma) and 2 MB of counts.
     """
 
     OF_VARIANCE = "Spearman's correlation"
     ADD = add_joint
 
-    def __init__(self, bins: int = 512, **kwargs: Any) -> None:
-        if bins < 1:
-            raise ValueError(f"bins must be >= 1, got {bins}")
-        super().__init__({"bins": bins}, **kwargs)
-        self.add_counts("joint", shape=(bins + 2, bins + 2))
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_counts("joint", shape=(JOINT_BINS + 2, JOINT_BINS + 2))
 
     def compute(self) -> dict[str, Tensor]:
         joint = self.joint.double()

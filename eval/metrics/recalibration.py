@@ -17,7 +17,7 @@ from ufmstar_torch.eval.metrics.pixel_sums import HIGH, LOW
 from ufmstar_torch.recalibrate import ISOTONIC, SCALAR, Recalibration
 
 Array = NDArray[np.float64]
-# Of |z| of a standard normal variable: the levels at which errors are compared with it. The outer tenth is left out:
+# Levels of |z| of a standard normal variable at which errors are compared with it. The outer tenth is left out:
 # gross errors of the depth would set the variance of all other pixels.
 LEVELS = np.arange(0.1, 0.91, 0.1)
 GROUPS = 32
@@ -59,8 +59,8 @@ def fit(joints: Sequence[Array], kind: str = ISOTONIC, groups: int = GROUPS) -> 
         knots.append(float(np.exp((share @ np.log(np.maximum(value, LOW))) / share.sum())))
         scales.append(_scale(errors, value))
     fitted = isotonic_regression(np.log(scales), weights=np.array(mass)).x
-    kept = [0, *(i for i in range(1, len(knots)) if knots[i] > knots[i - 1] * 1.0001)]
-    return Recalibration(tuple(knots[i] for i in kept), tuple(float(np.exp(fitted[i])) for i in kept))
+    rising = [0, *(i for i in range(1, len(knots)) if knots[i] > knots[i - 1] * 1.0001)]
+    return Recalibration(tuple(knots[i] for i in rising), tuple(float(np.exp(fitted[i])) for i in rising))
 
 
 def figures(joint: Array, recalibration: Recalibration | None) -> dict[str, float]:

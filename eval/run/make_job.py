@@ -82,7 +82,7 @@ def _recalibration(options: Mapping[str, Any], config: UfMStarConfig, source: De
     file = beside(weights[0]) if name is None else Path(name)
     try:
         recalibration = Recalibration.from_json(file)
-        recalibration.require(config, ", ".join(one["name"] for one in source.identity.get("weights", ())))
+        recalibration.require(config, ", ".join(one["name"] for one in source.identity.get("files", ())))
     except ValueError as error:
         raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
     return recalibration

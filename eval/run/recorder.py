@@ -16,7 +16,7 @@ from ufmstar_torch.eval.run.run_folder import Checkpoint, RunFolder
 from ufmstar_torch.eval.run.summary import GOING_ON, NEAR_ZERO, write_summary
 
 _MAPS = ("depth", "variance", "disagreement", "measured", "anchored", "bias", "posterior_depth", "posterior_variance")
-_COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured")
+_COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured", "single_view")
 _SUMMARY_EVERY = 30.0  # [s] between two summaries of an unfinished run
 
 
@@ -117,15 +117,16 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
     with a depth, and ``used`` agree with others. ``without`` is the reason where none is used. Of a map of landmarks,
     ``tracked`` counts all, and ``found`` those in view.
     """
-    anchors, statistics = row.anchors, row.statistics
-    if anchors is None or statistics is None or row.anchored is None or row.bias is None:
+    landmarks, statistics = row.landmarks, row.statistics
+    if landmarks is None or statistics is None or row.anchored is None or row.bias is None:
         return {}
     assert statistics.anchors is not None
     assert statistics.anchors_used is not None
     used, usable = int(statistics.anchors_used[0]), int(statistics.anchors[0])
-    counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
+    found = len(landmarks.depth)
+    counts = {"tracked": landmarks.tracked, "found": found, "usable": usable, "used": used}
     return {
-        "anchors": {**counts, "without": None if used else why_none(anchors.triangulated, usable, anchors.none)},
+        "anchors": {**counts, "without": None if used else why_none(found, usable, landmarks.none)},
         "mean_anchored": _mean(row.anchored, row.valid),
         "mean_bias": _mean(row.bias, row.valid),
         **_posterior_figures(row),

@@ -1,6 +1,6 @@
 """COLMAP: ``sparse/0/{cameras,images,points3D}.{bin,txt}`` beside ``images/``, of any number of cameras.
 
-Poses are world-to-camera in a unit of their own: metres only where ``ufmstar poses`` wrote so (``scale.json``), or with
+Poses are world-to-camera in a unit of their own: metres only where ``ufmstar poses`` wrote so (``poses.json``), or with
 ``pose_scale``. The first pixel's centre is (0.5, 0.5) there. Depth maps may lie in ``depth/``. The files are read here,
 not by pycolmap, which accepts truncated cameras and does not return from truncated images.
 https://colmap.github.io/format.html
@@ -27,7 +27,7 @@ from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_quaternions
 
 LOOKED_FOR = "cameras and images (.bin or .txt) in sparse/0/, sparse/ or the folder itself"
-SCALE_FILE, MODEL = "scale.json", "sparse/0"
+SCALE_FILE, MODEL = "poses.json", "sparse/0"
 # By COLMAP's number: name, and of its parameters how many are focal lengths and how many distortion coefficients; the
 # others are the principal point. Models without a number of coefficients are not OpenCV's.
 _MODELS: tuple[tuple[str, int, int | None], ...] = (
@@ -86,7 +86,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         time = None if times is None else float(times[number])
         frames.append(Entry(name, _pose(view, model), partial(read_color, folder / view.name), load_depth, time))
     name = path.resolve().name
-    metric = _metric(root)
+    metric = _metric(root) and model == root / MODEL
     return sequence_of_lenses(name, "colmap", frames, lenses, path, options, times=times, metric=metric)
 
 

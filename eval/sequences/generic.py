@@ -68,7 +68,7 @@ def read(path: Path, options: Options) -> FrameSequence:
             images; no image has a pose (both time ranges are given); depth maps that fit no image.
     """
     root = path if path.is_dir() else path.parent
-    images, size, times = _images(path, options)
+    images, size, times = open_images(path, options)
     trajectory = read_trajectory(_given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
     frames = attach(_with_depth(images, root, times, options, options.depth_scale), times, trajectory, options)
     K, size_of_depth = _intrinsics(root, options), depth_size(frames)
@@ -104,7 +104,7 @@ def open_unposed(path: Path, options: Options) -> FrameSequence:
     if not has_images_and_depth(path):
         raise ValueError(f"{path} must hold one of {', '.join(IMAGES)} and one of {', '.join(DEPTHS)}")
     first = next(name for name in IMAGES if (path / name).is_dir())
-    images, size, times = _images(path, replace(options, images=options.images or path / first))
+    images, size, times = open_images(path, replace(options, images=options.images or path / first))
     scale = options.depth_scale
     if scale is None and (path / "depth.txt").is_file():
         scale = TUM_SCALE
@@ -128,7 +128,7 @@ def _intrinsics(root: Path, options: Options) -> np.ndarray:
     return read_intrinsics(_given_or_found(root, None, INTRINSICS, "intrinsics") if given is None else given)
 
 
-def _images(path: Path, options: Options) -> tuple[list[Entry], Size | None, np.ndarray | None]:
+def open_images(path: Path, options: Options) -> tuple[list[Entry], Size | None, np.ndarray | None]:
     """The images without poses and depth, their (H, W), and timestamps [N] [s] (None where they are not known)."""
     source = path
     if options.images is not None:

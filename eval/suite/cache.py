@@ -1,7 +1,7 @@
 """Predictions on disk, so that a network sees an image once, however often the rows on it are changed.
 
 One file for each network, frame and member: ``NETWORK/SEQUENCE/FRAME@MEMBER.maps``, which begins with the SHA-256
-of the rest, an npz with the maps in float32. What is read is bit for bit what was written, or is not used.
+of the rest, an npz with the maps in float32. A file that was changed or cut off is not used.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ufmstar_torch.eval.engine.predictions import Predicted, PredictionKey
+from ufmstar_torch.array_files import read_npz_whole
+from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -39,43 +40,42 @@ class PredictionCache:
         self.folder = folder
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            # Asked by writing: permissions do not tell of file systems that are mounted read-only.
+            # Tried by writing: permissions say nothing about file systems that are mounted read-only.
             probe = folder / ".writable"
-            write_atomic(probe, lambda file: file.write(b""))
+            write_atomic(probe, lambda opened: opened.write(b""))
         except OSError as error:
             raise CacheError(_cannot(folder, error)) from error
 
-    def load(self, key: PredictionKey, device: torch.device) -> Predicted | None:
+    def load(self, path: Path, content: str, device: torch.device) -> Predicted | None:
         """The prediction, or None where it has to be made: there is no file, it belongs to another image of that name,
         was cut off or changed, or cannot be read."""
         try:
-            content = (self.folder / key.path).read_bytes()
+            packed = (self.folder / path).read_bytes()
         except OSError:
             return None
-        if len(content) < _DIGEST or hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
+        if len(packed) < _DIGEST or hashlib.sha256(packed[_DIGEST:]).digest() != packed[:_DIGEST]:
             return None
-        with np.load(io.BytesIO(content[_DIGEST:]), allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        if bytes(arrays.pop("content")).decode() != key.content:
+        arrays = read_npz_whole(path, packed[_DIGEST:])
+        if bytes(arrays.pop("content")).decode() != content:
             return None
         K = torch.from_numpy(arrays.pop("intrinsics"))
         maps = {name: torch.from_numpy(value)[None].to(device) for name, value in arrays.items()}
         return Predicted(DepthPrediction(maps["depth"], maps.get("aleatoric"), maps.get("epistemic")), K[None])
 
-    def store(self, key: PredictionKey, predicted: Predicted) -> None:
+    def store(self, path: Path, content: str, predicted: Predicted) -> None:
         """Keep a prediction. Raises CacheError: it cannot be written."""
         maps = predicted.maps
         named = {"depth": maps.depth, "aleatoric": maps.aleatoric_variance, "epistemic": maps.epistemic_variance}
         arrays = {name: value[0].cpu().numpy() for name, value in named.items() if value is not None}
         arrays["intrinsics"] = predicted.intrinsics[0].numpy()
-        arrays["content"] = np.frombuffer(key.content.encode(), np.uint8)
+        arrays["content"] = np.frombuffer(content.encode(), np.uint8)
         packed = io.BytesIO()
         np.savez(packed, allow_pickle=False, **arrays)
         body = packed.getvalue()
-        path = self.folder / key.path
+        file = self.folder / path
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomic(path, lambda file: file.write(hashlib.sha256(body).digest() + body))
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(file, lambda opened: opened.write(hashlib.sha256(body).digest() + body))
         except OSError as error:
             raise CacheError(_cannot(self.folder, error)) from error
 

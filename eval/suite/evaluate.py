@@ -9,12 +9,11 @@ from typing import Any
 import torch
 
 from ufmstar_torch.eval.engine.anchors import landmark_digests
-from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, RowFigures, evaluate_sequence
-from ufmstar_torch.eval.engine.judge import references
+from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, evaluate_sequence
+from ufmstar_torch.eval.engine.judge import RowFigures, references
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.run.files import remove_temporaries
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.eval.suite.examples import ExampleWriter
 from ufmstar_torch.eval.suite.folder import EvalFolder
@@ -40,12 +39,11 @@ def evaluate_item(
     """Compute and store the missing rows of a sequence, or why they cannot be computed.
 
     Args:
-        job: what is evaluated; its folder is open.
+        job: its folder is open.
         item: the sequence.
         judge: of the job.
-        stop: called before every frame; nothing of the sequence is stored then.
-        progress: called at the start and after every frame.
-        evaluate: computes rows on a sequence; see ``evaluate_sequence``.
+        stop, progress: see ``evaluate_sequence``; nothing is stored of a sequence that is stopped.
+        evaluate: computes rows on a sequence.
 
     Returns:
         A line about the sequence, "" where nothing was missing.
@@ -56,42 +54,39 @@ def evaluate_item(
         CacheError, OSError: nothing can be written.
     """
     folder, started = EvalFolder(job.out), time.monotonic()
-    place, rows = folder.place(item), job.suite.rows
-    place.mkdir(parents=True, exist_ok=True)
-    remove_temporaries(path for pattern in (".*.tmp", "*/.*.tmp") for path in place.glob(pattern))
-    missing = folder.missing(item, rows)
+    missing = folder.begin(item, job.suite.rows)
     try:
         sequence = item.open()
-        digest = content_digest(sequence)
-        landmarks = landmark_digests(rows, sequence.folder, sequence.pose_scale)
+        made_of = {"sequence": content_digest(sequence), "device": str(judge.device)}
+        landmarks = landmark_digests(job.suite.rows, sequence.folder, sequence.pose_scale)
     except (*BROKEN, OSError) as error:
         return folder.fail(item, error, missing)
-    folder.require_same_sequence(item, digest, landmarks)
-    posed = [row for row in rows if sequence.posed or row.method.fusion == ALONE]
+    folder.require_same_sequence(item, made_of["sequence"], landmarks)
+    posed = [row for row in job.suite.rows if sequence.posed or row.method.fusion == ALONE]
     possible = [row for row in posed if not _fitted_to(row, item)]
     todo = [row for row in missing if row in possible]
-    line = ""
+    left_out = [row for row in missing if row not in possible]
+    lines = []
     if todo:
-        sinks = [ExampleWriter(place)] if job.stores_examples(item) else []
+        sinks = [ExampleWriter(folder.sequence_folder(item))] if job.stores_examples(item) else []
         needed = with_references(todo, possible)
         try:
             results = evaluate(sequence, needed, judge, sinks=sinks, stop=stop, progress=progress)
         except BROKEN as error:
             return folder.fail(item, error, missing)
-        made_of = {"sequence": digest, "device": str(judge.device)}
         for result in results:
             if result.row in todo:
                 slug = result.row.slug
                 anchors = {"landmarks": landmarks[slug]} if slug in landmarks else {}
-                folder.write(item, _record(job, item, judge, result, {**made_of, **anchors}), result)
+                folder.write(item, _record(job, item, judge, result, made_of | anchors), result)
         frames, seconds = results[0].frames.get("done", 0), time.monotonic() - started
-        line = f"{item.label}: {len(todo)} rows, {frames} frames, {seconds:.1f} s"
-    if len(todo) < len(missing):
-        left_out = [row for row in missing if row not in possible]
-        reason = folder.fail(item, (_FITTED if sequence.posed else _NO_POSES).format(len(left_out)), left_out)
-        return f"{line}; {reason}" if line else reason
-    folder.succeeded(item)
-    return line
+        lines.append(f"{item.label}: {len(todo)} rows, {frames} frames, {seconds:.1f} s")
+    if left_out:
+        reason = (_FITTED if sequence.posed else _NO_POSES).format(len(left_out))
+        lines.append(folder.fail(item, reason, left_out))
+    else:
+        folder.succeeded(item)
+    return "; ".join(lines)
 
 
 def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:
@@ -111,12 +106,8 @@ def _record(job: EvalJob, item: WorkItem, judge: Judge, result: RowFigures, made
         network=network.label,
         method=row.method.name,
         setting=row.setting.to_dict(),
-        frames=result.frames,
-        figures=result.figures,
-        curves=result.curves,
-        state=result.state,
-        ms=result.ms,
         provenance={**computed_with, "network": network.digest, "runtime": network.runtime, **made_of},
+        **{name: getattr(result, name) for name in ("frames", "figures", "curves", "state", "ms")},
     )
 
 

@@ -40,6 +40,7 @@ _SUBMITIT = ("name", "timeout_min", "mem_gb", "cpus_per_task", "gpus_per_node")
 
 Stop = Callable[[], bool]
 Report = Callable[[str], None]
+Frames = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def evaluate_suite(
     overwrite: bool = False,
     stop: Stop = lambda: False,
     report: Report = lambda _: None,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    progress: Frames = lambda *_: None,
     evaluate: Evaluate = evaluate_sequence,
 ) -> EvalOutcome:
     """Evaluate the sequences of a shard.
@@ -178,25 +179,18 @@ def _evaluate_alone(job: EvalJob, item: WorkItem) -> str:
 
 
 def _evaluate_here(
-    job: EvalJob,
-    items: Iterable[WorkItem],
-    judge: Judge,
-    stop: Stop,
-    report: Report,
-    progress: Callable[[str, int, int], None],
-    evaluate: Evaluate,
+    job: EvalJob, items: Iterable[WorkItem], judge: Judge, stop: Stop, report: Report, progress: Frames, how: Evaluate
 ) -> bool:
     """One item after another in this process; whether all were done."""
-
-    def shown(label: str, now: Progress) -> None:
-        progress(label, now.done, now.total)
-
     try:
         for item in items:
             if stop():
                 return False
-            how: dict[str, Any] = {"stop": stop, "progress": partial(shown, item.label), "evaluate": evaluate}
-            if line := evaluate_item(job, item, judge, **how):
+
+            def shown(now: Progress, label: str = item.label) -> None:
+                progress(label, now.done, now.total)
+
+            if line := evaluate_item(job, item, judge, stop=stop, progress=shown, evaluate=how):
                 report(line)
     except Stopped:
         return False
@@ -251,7 +245,8 @@ def evaluate_on_slurm(job: EvalJob, slurm: Slurm, *, stop: Stop, report: Report,
     output = f"{job.out}/slurm"
     how = {name: options.pop(name, False) for name in ("resume", "overwrite")}
     # Opened once before any job starts, which reports mistakes once.
-    EvalFolder.open(job.out, job.about(job.load(torch.device("cpu"))), **how).close()
+    with EvalFolder.open(job.out, job.about(job.load(torch.device("cpu"))), **how):
+        pass
     try:
         executor = submitit.AutoExecutor(folder=output, cluster=slurm.cluster)
         executor.update_parameters(**{"name": "ufmstar-eval", **slurm.parameters})

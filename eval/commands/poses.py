@@ -1,0 +1,222 @@
+"""``ufmstar poses``: its options, the files, and what is printed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from ufmstar_torch.eval.commands.options import UsageError, parse, positional
+from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosesOptions:
+    """Poses and landmarks of a video or a folder of images, by structure from motion.
+
+    Images do not show a scale: give a known length or a metric trajectory. Without either, `ufmstar run` takes the
+    result with --pose-scale or --scale-from network only.
+
+    Attributes:
+        source: video file, or folder of images in the order of their names
+        out: folder for the result, which `ufmstar run` reads; anchors are in OUT/landmarks.npz
+        intrinsics: of the images, kept as they are: a file, or fx fy cx cy [px]; default: K.txt in the folder, or else
+            estimated
+        distortion: of the images' lens, undone in OUT/images: k1 k2 p1 p2 [k3 [k4 k5 k6]], or fisheye k1 k2 k3 k4
+        length: A B METRES, two places and their distance; a place is NAME, where the camera was at that image, or
+            NAME:U,V, what a pixel of OUT/images/NAME.jpg shows
+        trajectory: file with metric positions of the camera (SLAM's, VIO's, GPS's) in TUM or KITTI format
+        images: folder of images or video within the source
+        fps: frames per second of images without timestamps
+        time_offset: added to the images' times [s]
+        max_pose_gap: positions are interpolated between samples at most this far apart [s]
+        frames: START:STOP:STEP, which images, counted from 0 as Python does
+        overwrite: replace the reconstruction in --out
+        threads: number of CPU threads; default: all cores
+        debug: show tracebacks
+    """
+
+    USAGE: ClassVar[str] = (
+        "ufmstar poses VIDEO|FOLDER --out DIR [--intrinsics FILE] [--length A B METRES | --trajectory FILE] [options]"
+    )
+
+    source: str = positional()
+    out: Path
+    intrinsics: tuple[str, ...] = ()
+    distortion: tuple[str, ...] = ()
+    length: tuple[str, ...] = ()
+    trajectory: str | None = None
+    images: str | None = None
+    fps: float | None = None
+    time_offset: float = 0.0
+    max_pose_gap: float = 0.1
+    frames: str | None = None
+    overwrite: bool = False
+    threads: int | None = None
+    debug: bool = False
+
+    def __post_init__(self) -> None:
+        parse_intrinsics(self.intrinsics, "--intrinsics")
+        _ = self.known_length
+        if self.length and self.trajectory:
+            raise ValueError("--length and --trajectory contradict each other: give one of them")
+        if self.distortion and not self.intrinsics:
+            raise ValueError("--distortion goes with --intrinsics only")
+
+    @property
+    def known_length(self) -> tuple[str, str, float] | None:
+        """Two places and their distance [m]. Raises ValueError: another form."""
+        if not self.length:
+            return None
+        try:
+            first, second, text = self.length
+            metres = float(text)
+            if not 0 < metres < float("inf"):
+                raise ValueError
+        except ValueError:
+            raise ValueError(f"--length must be A B METRES, got {' '.join(self.length)!r}") from None
+        return first, second, metres
+
+
+def read(words: Sequence[str]) -> PosesOptions:
+    """The options of a command line; errors as :func:`parse`."""
+    return parse(PosesOptions, words, "ufmstar poses")
+
+
+def main(options: PosesOptions) -> int:
+    """Reconstruct, write the folder, and print what was found; the exit code."""
+    from ufmstar_torch.eval.reconstruct.reconstruct import POSES, require_pycolmap
+    from ufmstar_torch.eval.run.folder import FolderError, OutputFolder
+
+    require_pycolmap()
+    try:
+        images, size = _images(options)
+        with OutputFolder.open(options.out, POSES, {}, overwrite=options.overwrite):
+            found = _reconstruct(options, images, size)
+    except (FolderError, FileNotFoundError, ValueError) as error:
+        raise UsageError(error) from error
+    _report(found, options.out)
+    return 0
+
+
+def _images(options: PosesOptions) -> tuple[list[Any], tuple[int, int]]:
+    """The entries of the images with their times, and their (H, W). Raises ValueError: there is none."""
+    from dataclasses import replace
+
+    from ufmstar_torch.eval.sequences.frame import parse_slice
+    from ufmstar_torch.eval.sequences.generic import open_images
+    from ufmstar_torch.eval.sequences.options import Options
+
+    path = Path(options.source)
+    if not path.exists():
+        raise FileNotFoundError(f"no such file or folder: {path}")
+    entries, size, times = open_images(
+        path, Options(images=options.images, fps=options.fps, time_offset=options.time_offset)
+    )
+    if times is not None:
+        entries = [replace(e, timestamp=float(time)) for e, time in zip(entries, times, strict=True)]
+    entries = entries[parse_slice(options.frames)]
+    if not entries or size is None:
+        raise ValueError(f"{path}: no image that can be read")
+    return entries, size
+
+
+def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]) -> dict[str, Any]:
+    import numpy as np
+
+    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.engine.progress import Progress
+    from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
+    from ufmstar_torch.eval.reconstruct.reconstruct import POSES, gaps, landmarks, reconstruct, scale_model
+    from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+    from ufmstar_torch.eval.run.machine import available_cores
+    from ufmstar_torch.eval.sequences.options import Options, resolve
+    from ufmstar_torch.eval.sequences.poses import read_trajectory
+
+    root = Path(options.source) if Path(options.source).is_dir() else Path(options.source).parent
+    lens = _lens(options, root, size)
+    if lens is not None:  # COLMAP's mapper fails on some lenses, and `run` has less to do
+        images = [lens.see(entry) for entry in images]
+    trajectory = None if options.trajectory is None else read_trajectory(resolve(root, options.trajectory))
+    length = options.known_length
+    out = options.out
+    (out / "images").mkdir()
+    with Bars() as bars, stop_signals(bars.say) as stop:
+        named = {word.partition(":")[0] for word in options.length[:2]}
+        always = {e.name for e in images if e.name in named or (e.name.isdecimal() and str(int(e.name)) in named)}
+        chosen, broken = write_keyframes(
+            images,
+            out / "images",
+            always=always,
+            progress=lambda done: bars.show(Progress("frames", done, len(images))),
+            stop=stop,
+        )
+        keyframes = [images[index] for index in chosen]
+        names = [entry.name for entry in keyframes]
+        if keyframes and keyframes[0].timestamp is not None:
+            lines = "".join(f"{entry.timestamp:.9f} images/{entry.name}.jpg\n" for entry in keyframes)
+            write_atomic(out / "rgb.txt", lambda file: file.write(lines.encode()))
+        models = reconstruct(
+            out, names, None if lens is None else lens.K, threads=options.threads or available_cores(), say=bars.say
+        )
+    opening = Options(fps=options.fps, time_offset=options.time_offset, max_pose_gap=options.max_pose_gap)
+    scale = scale_model(models[0], images, length=length, trajectory=trajectory, options=opening)
+    for number, model in enumerate(models):
+        (out / "sparse" / str(number)).mkdir()
+        model.write(out / "sparse" / str(number))
+    points, sigma = landmarks(models[0])
+    write_atomic(out / "landmarks.npz", lambda file: np.savez(file, points=points, sigma=sigma))
+    found = {
+        "program": POSES.program,
+        "state": "finished",
+        **scale,
+        "images": len(images),
+        "images_that_cannot_be_read": broken,
+        "keyframes": len(names),
+        "models": [model.num_reg_images() for model in models],
+        "gaps": gaps(names, models[0]),
+        "landmarks": len(points),
+        "reprojection_error": models[0].compute_mean_reprojection_error(),
+    }
+    write_json_atomic(out / POSES.manifest, found)
+    return found
+
+
+def _lens(options: PosesOptions, root: Path, size: tuple[int, int]) -> Any:
+    """The camera, or None where it is to be estimated. Raises ValueError: intrinsics that do not fit the images."""
+    from ufmstar_torch.eval.sequences.frame import check_intrinsics
+    from ufmstar_torch.eval.sequences.generic import INTRINSICS
+    from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
+    from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
+
+    source = parse_intrinsics(options.intrinsics, "--intrinsics")
+    if source is None:
+        source = next((str(root / name) for name in INTRINSICS if (root / name).is_file()), None)
+    if source is None:
+        return None
+    K = read_intrinsics(source)
+    check_intrinsics("intrinsics", K, size)
+    coefficients, fisheye = parse_distortion(options.distortion)
+    return Lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), size, coefficients, fisheye)
+
+
+def _report(found: dict[str, Any], out: Path) -> None:
+    largest, *others = found["models"]
+    print(f"{largest} of {found['keyframes']} keyframes (of {found['images']} images) have a pose, error "
+          f"{found['reprojection_error']:.2f} px; {found['landmarks']} landmarks")  # fmt: skip
+    for first, last in found["gaps"]:
+        print(f"  no pose: {first} to {last}")
+    if others:
+        print(f"  further models, which do not connect to the first: {', '.join(map(str, others))} keyframes")
+    match found["scale_from"]:
+        case None:
+            print("scale unknown: pass --length A B METRES or --trajectory FILE, or to `ufmstar run` --pose-scale M or "
+                  "--scale-from network")  # fmt: skip
+        case "length":
+            print(f"scale from the length: {found['metres_per_unit']:.4g} m per unit")
+        case _:
+            print(
+                f"scale from the trajectory: {found['metres_per_unit']:.4g} m per unit, {found['residual']:.3f} m off"
+            )
+    print(f"{out}: ufmstar run {out} --anchors landmarks.npz ...")

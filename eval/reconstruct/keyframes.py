@@ -1,0 +1,91 @@
+"""Keyframes: the images of a video that lie far enough apart to triangulate, by how far its corners move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError
+
+# A new keyframe where the median corner has moved by this share of the image's width since the last one, or where fewer
+# than half of its corners are left.
+_MOTION, _LEFT = 0.03, 0.5
+_WIDTH = 320  # [px] to which images are reduced for tracking
+_CORNERS, _FEWEST = 300, 20  # in an image; one with fewer corners is no keyframe
+_JPEG_QUALITY = 95
+
+
+def write_keyframes(
+    images: Sequence[Entry],
+    folder: Path,
+    *,
+    always: Collection[str] = (),
+    progress: Callable[[int], object] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> tuple[list[int], int]:
+    """Decodes a video's images once, in order, and writes its keyframes as ``folder/NAME.jpg``.
+
+    Args:
+        images: all of the video.
+        folder: an existing one.
+        always: names of images that are keyframes wherever they lie.
+        progress: called with the number of decoded images.
+        stop: called before every image; True ends the video there.
+
+    Returns:
+        The keyframes' positions in ``images``, and how many images cannot be decoded.
+    """
+    import cv2
+
+    chosen, broken, motion = [], 0, _Motion()
+    for index, entry in enumerate(images):
+        if stop():
+            break
+        assert entry.load_image is not None
+        try:
+            image = entry.load_image()
+        except FrameError:
+            broken += 1
+            continue
+        if motion.is_keyframe(image, required=entry.name in always):
+            how = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+            if not cv2.imwrite(str(folder / f"{entry.name}.jpg"), image[..., ::-1], how):
+                raise OSError(f"{folder / entry.name}.jpg cannot be written")
+            chosen.append(index)
+        progress(index + 1)
+    return chosen, broken
+
+
+class _Motion:
+    """Corners followed from image to image since the last keyframe."""
+
+    def __init__(self) -> None:
+        self._last: np.ndarray | None = None
+        self._start = self._now = np.zeros((0, 1, 2), np.float32)
+        self._count = 0
+
+    def is_keyframe(self, image: np.ndarray, required: bool) -> bool:
+        """Whether the next image [H, W, 3] is a keyframe: ``required``, or far enough from the last one."""
+        import cv2
+
+        scale = min(1.0, _WIDTH / image.shape[1])
+        grey = cv2.resize(
+            cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
+        )
+        if self._last is not None and self._last.shape == grey.shape and len(self._now):
+            moved, found, _ = cv2.calcOpticalFlowPyrLK(self._last, grey, self._now, None)
+            kept = found.ravel() == 1
+            self._start, self._now = self._start[kept], moved[kept]
+        self._last = grey
+        left = len(self._now) >= max(_LEFT * self._count, 1)
+        distance = np.linalg.norm(self._now - self._start, axis=-1)
+        if left and not required and np.median(distance) < _MOTION * grey.shape[1]:
+            return False
+        corners = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.01, 5)
+        if (corners is None or len(corners) < _FEWEST) and not required:
+            return False
+        self._start = self._now = np.zeros((0, 1, 2), np.float32) if corners is None else corners
+        self._count = len(self._start)
+        return True

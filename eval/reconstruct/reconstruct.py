@@ -1,0 +1,197 @@
+"""Structure from motion of keyframes: SIFT on the CPU, matching, COLMAP's global mapper; models, landmarks and gaps.
+
+```
+DIR/images/NAME.jpg     keyframes; DIR/rgb.txt has their times [s], where they are known
+DIR/sparse/0, 1, ...    COLMAP models, the largest first; metric only 0, and only with a scale
+DIR/landmarks.npz       points [P, 3] and sigma [P] [m] of model 0, for --anchors
+DIR/poses.json          what was found, and where the scale comes from
+```
+The incremental mapper is not used: it put a walk with a HoloLens 148 cm off.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ufmstar_torch.eval.reconstruct.scale import endpoint, similarity
+from ufmstar_torch.eval.run.folder import FolderKind
+from ufmstar_torch.eval.sequences.attach import attach
+from ufmstar_torch.eval.sequences.colmap import SCALE_FILE
+from ufmstar_torch.eval.sequences.frame import Entry
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.poses import Trajectory
+from ufmstar_torch.optional import optional
+
+# Up to so many keyframes, all pairs are matched; of more, each with the next ten and those 16, 32, ... 512 later.
+_ALL_PAIRS = 60
+_FEATURES, _LARGEST_IMAGE = 4096, 1600  # of an image [1], [px]
+# A landmark: seen by three images, from directions at least so far apart [rad], with at most this error [px]. Its error
+# counts as at least half a pixel, as SIFT places a feature.
+_VIEWS, _ANGLE, _MOST_ERROR, _LEAST_ERROR = 3, np.radians(1.5), 2.0, 0.5
+
+
+def _clear(out: Path) -> None:
+    for name in ("images", "sparse"):
+        shutil.rmtree(out / name, ignore_errors=True)
+    for name in ("rgb.txt", "landmarks.npz", "database.db"):
+        (out / name).unlink(missing_ok=True)
+
+
+POSES = FolderKind(program="ufmstar poses", noun="reconstruction", manifest=SCALE_FILE, clear=_clear)
+
+
+def require_pycolmap() -> Any:
+    """The package. Raises ModuleNotFoundError: it is missing; the message names the extra that brings it."""
+    return optional("pycolmap", "`ufmstar poses` needs pycolmap", "'ufmstar-torch[recordings]'")
+
+
+def reconstruct(
+    out: Path,
+    names: Sequence[str],
+    K: np.ndarray | None,
+    *,
+    threads: int,
+    say: Callable[[str], object] = lambda _: None,
+) -> list[Any]:
+    """The models (``pycolmap.Reconstruction``) of ``out/images/NAME.jpg``, the largest first.
+
+    Args:
+        out: the folder.
+        names: of the keyframes, in the order of the video.
+        K: [3, 3] of all of them [px], kept as it is; None = one focal length and one distortion coefficient are
+            estimated.
+        threads: of the CPU.
+        say: gets a line at the start of each stage.
+
+    Raises:
+        ValueError: the images fit no model.
+    """
+    if len(names) < _VIEWS:
+        raise ValueError(f"{len(names)} keyframes, of which {_VIEWS} are needed: too few images, or blank or alike")
+    pycolmap = require_pycolmap()
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.set_random_seed(0)
+    camera = {"camera_model": "SIMPLE_RADIAL"}
+    if K is not None:  # COLMAP's first pixel has its centre at (0.5, 0.5)
+        values = (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
+        camera = {"camera_model": "PINHOLE", "camera_params": ",".join(f"{value:.17g}" for value in values)}
+    database, cpu = out / "database.db", pycolmap.Device.cpu
+    features, matching = pycolmap.FeatureExtractionOptions(), pycolmap.FeatureMatchingOptions()
+    features.num_threads = matching.num_threads = threads
+    features.sift.max_num_features, features.max_image_size = _FEATURES, _LARGEST_IMAGE
+    say(f"features of {len(names)} keyframes")
+    pycolmap.extract_features(
+        database,
+        out / "images",
+        image_names=[f"{name}.jpg" for name in names],
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=pycolmap.ImageReaderOptions(**camera),
+        extraction_options=features,
+        device=cpu,
+    )
+    say("matches between keyframes")
+    match = pycolmap.match_exhaustive if len(names) <= _ALL_PAIRS else pycolmap.match_sequential
+    match(database, matching_options=matching, device=cpu)
+    say("poses")
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads, options.random_seed = threads, 0
+    adjustment = options.mapper.bundle_adjustment
+    adjustment.refine_focal_length = adjustment.refine_extra_params = K is None
+    (out / "sparse").mkdir(exist_ok=True)
+    scratch = out / "sparse" / "unsorted"
+    scratch.mkdir()
+    found = pycolmap.global_mapping(database, out / "images", scratch, options).values()
+    shutil.rmtree(scratch)
+    database.unlink()
+    models = sorted((model for model in found if model.num_reg_images()), key=lambda m: -m.num_reg_images())
+    if not models:
+        raise ValueError("no model: the images are blank, or the camera only turns; give another part of the video")
+    return models
+
+
+def scale_model(
+    model: Any,
+    images: Sequence[Entry],
+    *,
+    length: tuple[str, str, float] | None = None,
+    trajectory: Trajectory | None = None,
+    options: Options | None = None,
+) -> dict[str, Any]:
+    """Bring a model into metres, in place, and for a trajectory into its axes.
+
+    Args:
+        model: ``pycolmap.Reconstruction``.
+        images: all of the video, in order, with their times.
+        length: two places as ``endpoint`` reads them, and their distance [m].
+        trajectory: positions of the camera in metres.
+        options: how its times meet the images'.
+
+    Returns:
+        ``scale_from``, None without either; ``metres_per_unit``, and for a trajectory ``residual`` [m].
+
+    Raises:
+        ValueError: the two places are one, or see ``endpoint``, ``attach`` and ``similarity``.
+    """
+    pycolmap = require_pycolmap()
+    if length is not None:
+        first, second = (endpoint(model, word) for word in length[:2])
+        apart = float(np.linalg.norm(second - first))
+        if not apart > 0:
+            raise ValueError(f"--length: {length[0]} and {length[1]} are the same place")
+        metres = length[2] / apart
+        model.transform(pycolmap.Sim3d(metres, pycolmap.Rotation3d(), np.zeros(3)))
+        return {"scale_from": "length", "metres_per_unit": metres}
+    if trajectory is None:
+        return {"scale_from": None}
+    stamps = [entry.timestamp for entry in images]
+    times = None if None in stamps else np.array(stamps, dtype=np.float64)
+    known = attach(images, times, trajectory, options or Options())
+    position = {
+        f.name: f.T_world_cam[:3, 3] for f in known if isinstance(f, Entry) and np.isfinite(f.T_world_cam).all()
+    }
+    centres = {Path(i.name).stem: i.projection_center() for i in model.images.values()}
+    both = sorted(position.keys() & centres.keys())
+    pairs = (np.array([values[name] for name in both]).reshape(-1, 3) for values in (centres, position))
+    metres, R, t, residual = similarity(*pairs)
+    model.transform(pycolmap.Sim3d(metres, pycolmap.Rotation3d(R), t))
+    return {"scale_from": "trajectory", "metres_per_unit": metres, "residual": residual}
+
+
+def landmarks(model: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Points [P, 3] of a model that several images see from different directions, and the standard deviations [P] of
+    their depths: sqrt(2) e z / (f sin(angle)), e the error of their pixels [px], z their depth, ``angle`` the largest
+    between two of their rays."""
+    centres = {key: image.projection_center() for key, image in model.images.items()}
+    focal = {key: model.cameras[image.camera_id].mean_focal_length() for key, image in model.images.items()}
+    points, sigma = [], []
+    for point in model.points3D.values():
+        seen = sorted({element.image_id for element in point.track.elements})
+        if len(seen) < _VIEWS or not point.error <= _MOST_ERROR:
+            continue
+        rays = point.xyz - np.array([centres[key] for key in seen])
+        distance = np.linalg.norm(rays, axis=1)
+        rays = rays / distance[:, None]
+        angle = float(np.arccos(np.clip(rays @ rays.T, -1, 1).min()))
+        if angle < _ANGLE:
+            continue
+        pixel = max(point.error, _LEAST_ERROR) / np.mean([focal[key] for key in seen])
+        points.append(point.xyz)
+        sigma.append(np.sqrt(2) * pixel * distance.mean() / np.sin(min(angle, np.pi / 2)))
+    return np.array(points).reshape(-1, 3), np.array(sigma)
+
+
+def gaps(keyframes: Sequence[str], model: Any) -> list[tuple[str, str]]:
+    """The first and last name of each run of keyframes without a pose in a model."""
+    posed = {Path(image.name).stem for image in model.images.values()}
+    result: list[tuple[str, str]] = []
+    before = True
+    for name in keyframes:
+        if name not in posed:
+            result = [*result, (name, name)] if before else [*result[:-1], (result[-1][0], name)]
+        before = name in posed
+    return result
