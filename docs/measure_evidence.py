@@ -172,8 +172,9 @@ def judged(frames: Frames, predictions: list[tuple[Tensor, Tensor, NDArray[np.fl
         pose.append(float(out.statistics.pose_error[0]))
     squares = np.concatenate(z)
     ratio = (np.concatenate(errors).mean() / np.concatenate(network).mean()) ** 0.5
-    rest = 100 * (squares > 9).mean(), np.nanmean([*calibration[-10:], np.nan]), np.nanmedian([*pose, np.nan])
-    return f"{ratio:.2f} / {squares.mean() ** 0.5:.1f} / {rest[0]:.0f} / {rest[1]:.1f} / {rest[2]:.1f}"
+    shown = [x[np.isfinite(x)] for x in (np.array(calibration[-10:]), np.array(pose))]
+    rest = [f"{np.median(x):.1f}" if len(x) else "–" for x in shown]
+    return " / ".join([f"{ratio:.2f}", f"{squares.mean() ** 0.5:.1f}", f"{100 * (squares > 9).mean():.0f}", *rest])
 
 
 def main() -> None:

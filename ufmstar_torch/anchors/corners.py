@@ -26,8 +26,6 @@ _HALVED_FROM = 480
 # ratio of the eigenvalues of some 1 to 20. The response is of fourth order in contrast: the weakest corner has a
 # hundredth of the strongest one's eigenvalue.
 _HARRIS, _WEAKEST = 0.04, 1e-4
-# Corners are spread over so many cells of the image in a row, out of so many times the number that is asked for.
-_CELLS, _MORE = 6, 4
 
 
 def follow(
@@ -91,7 +89,7 @@ def find(gray: NDArray[np.uint8], count: int, spacing: float, followed: NDArray[
         followed: [N, 2] (u, v) inside the image [px].
 
     Returns:
-        [n, 2] positions (u, v) [px]: the best of every cell of the image, then the second best, and so on.
+        [n, 2] positions (u, v), the best first [px].
     """
     cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
 
@@ -103,13 +101,6 @@ def find(gray: NDArray[np.uint8], count: int, spacing: float, followed: NDArray[
     for u, v in np.rint((followed + 0.5) / factor - 0.5).astype(int).tolist():
         cv2.circle(free, (u, v), round(spacing / factor), 0, -1)
     corners = cv2.goodFeaturesToTrack(
-        searched, _MORE * count, _WEAKEST, spacing / factor, mask=free, useHarrisDetector=True, k=_HARRIS
+        searched, count, _WEAKEST, spacing / factor, mask=free, useHarrisDetector=True, k=_HARRIS
     )
-    if corners is None:
-        return np.zeros((0, 2))
-    cell = (corners[:, 0] * _CELLS / searched.shape[::-1]).astype(np.int64) @ [1, _CELLS]
-    by_cell = cell.argsort(kind="stable")
-    rank = np.empty_like(cell)
-    rank[by_cell] = np.arange(len(cell)) - np.searchsorted(cell[by_cell], cell[by_cell])
-    best = rank.argsort(kind="stable")[:count]
-    return (corners[best, 0].astype(np.float64) + 0.5) * factor - 0.5
+    return np.zeros((0, 2)) if corners is None else (corners[:, 0].astype(np.float64) + 0.5) * factor - 0.5

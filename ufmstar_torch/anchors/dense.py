@@ -53,7 +53,8 @@ class DenseConfig(Checked):
         landmarks: how many are remembered.
         corners: corners that are followed.
         corner_distance: of a corner that is an anchor from all dense ones, as a share of the width.
-        corner_sigma: its largest standard deviation, as a share of its depth.
+        corner_sigma: its largest standard deviation, and the largest one that the distance of corners from their
+            epipolar lines makes over their baseline, as shares of its depth.
         start_depth: median depth of the scene before one is known [m]; right to a factor of 5.
         least_score: of a match, zero-mean normalised cross-correlation (ZNCC).
         rival: a match is unique where the best other one has this many times its 1 - ZNCC at least.
@@ -192,7 +193,7 @@ class DenseEvidence(SavedState):
         if len(chosen) >= _AGREE and trusted:
             expected = np.concatenate([np.flatnonzero(sighted.due), np.arange(known, len(pixel))])
             shares = np.array([share for share, _ in chosen])
-            noise = self._errors.positions(K, small.shape[1], self._depth, self._tracker.pose_variance)[shares]
+            noise = self._errors.positions(K, small.shape[1], self._depth)[shares]
             views = self._views([keyframe for _, keyframe in chosen], noise, T, K)
             self._baseline = float(np.linalg.norm(np.linalg.inv(K) @ views.b[-1]))
             actual = measure(small, pixel[expected], views, self._search())
@@ -226,7 +227,9 @@ class DenseEvidence(SavedState):
 
     def _apart(self, corners: Landmarks, taken: NDArray[np.float64], width: int) -> NDArray[np.int64]:
         """Which corners are anchors: certain ones, away from positions [N, 2] that are taken."""
-        fine = np.flatnonzero(np.sqrt(corners.variance) <= self.config.corner_sigma * corners.depth)
+        over = self._tracker.pose_error / max(self._tracker.baseline, 1e-9) / self._tracker.focal
+        sigma = np.maximum(np.sqrt(corners.variance) / corners.depth, over * np.maximum(corners.depth, self._depth))
+        fine = np.flatnonzero(sigma <= self.config.corner_sigma)
         square = np.square(corners.pixel[fine, None] - taken).sum(-1).min(1, initial=np.inf)
         return fine[square > (self.config.corner_distance * width) ** 2]
 

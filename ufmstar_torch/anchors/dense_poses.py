@@ -91,15 +91,14 @@ class PoseErrors(SavedState):
         self._disagreement = 1.0
         self._camera, self._covariance = np.zeros(CAMERA), np.eye(CAMERA)
 
-    def positions(self, K: NDArray[np.float64], width: int, depth: float, measured: float = 0.0) -> NDArray[np.float64]:
+    def positions(self, K: NDArray[np.float64], width: int, depth: float) -> NDArray[np.float64]:
         """[baselines] variance of a position in a keyframe by all errors [px^2], at a depth [m], in an image ``width``
-        wide. By the poses' it is at least ``measured`` [px^2], what tracked corners show of them."""
+        wide."""
         f = K[0, 0]
         if not self._known:
             self._variance[:] = _FIRST**2 / 2 / f**2 * np.array([1, depth**2])
             self._covariance = self._prior(width)
             self._known = True
-        self._variance = np.maximum(self._variance, measured / 2 / f**2 * np.array([1, depth**2]))
         return self._left + f**2 * (self._variance @ [1, 1 / depth**2])
 
     def camera(self, K: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -16,6 +16,8 @@ LARGEST = 1e12
 
 def saved_image(state: Mapping[str, Tensor], name: str) -> NDArray[np.uint8]:
     """A grey image [H, W] of a saved state; raises ValueError: it is none."""
+    if name not in state:
+        raise ValueError(f"state[{name!r}] must have shape [H, W], but is missing")
     image = state[name]
     if image.dtype != torch.uint8 or image.dim() != 2:
         raise ValueError(f"state[{name!r}] must be an image uint8 [H, W], got {image.dtype} {tuple(image.shape)}")

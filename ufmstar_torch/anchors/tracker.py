@@ -84,7 +84,7 @@ class TrackerConfig(Checked):
     max_error: float = number(3.0, "", "px", 0, open_low=True)
     max_relative_sigma: float = number(0.4, "", "1", 0, open_low=True)
     min_share: float = number(0.2, "", "1", 0, 1)
-    max_pose_error: float = number(0.01, "", "width", 0, open_low=True)
+    max_pose_error: float = number(0.008, "", "width", 0, open_low=True)
     start_depth: float = number(2.0, "", "m", 0, open_low=True)
 
     def __post_init__(self) -> None:
@@ -198,7 +198,7 @@ class LandmarkTracker(SavedState):
         self._poses = np.tile(np.eye(4), (w, 1, 1))
         self._view = -1
         self._noise = self.config.pixel_noise**2
-        self._off = -1.0  # variance of corners from their epipolar lines [px^2]; negative = not measured
+        self._off = -1.0  # standard deviation of corners from their epipolar lines [px]; negative = not measured
         self.baseline, self._depth = 0.0, self.config.start_depth  # of the views, and of the scene [m]
         self._point = np.full((n, 3), np.nan)  # of the corners in the newest image [m]; the window decides it
 
@@ -252,19 +252,24 @@ class LandmarkTracker(SavedState):
         return self._landmarks(tracked)
 
     @property
+    def focal(self) -> float:
+        """Of the last image [px]."""
+        return float(self._K[0, 0])
+
+    @property
     def pose_error(self) -> float:
         """Standard deviation of corners from their epipolar lines [px]; NaN = not measured."""
-        return float(np.sqrt(self._off)) if self._off >= 0 else float("nan")
+        return self._off if self._off >= 0 else float("nan")
 
     @property
     def pose_variance(self) -> float:
         """What errors of the poses add to the variance of a tracked position [px^2]."""
-        return max(self._off - self.config.pixel_noise**2, 0.0)
+        return max(max(self._off, 0.0) ** 2 - self.config.pixel_noise**2, 0.0)
 
     @property
     def contradicted(self) -> bool:
         """Whether the poses contradict the images."""
-        return self._off > (self.config.max_pose_error * self._gray.shape[1]) ** 2
+        return self._off > self.config.max_pose_error * self._gray.shape[1]
 
     def _compare_with_poses(self) -> None:
         """Follow how far corners lie from where the poses allow them to be, each in the first view that has it."""
@@ -278,7 +283,7 @@ class LandmarkTracker(SavedState):
         distance, rho, baseline = off_lines(*views, self._K, self._depth)
         cell = (views[0] * _CELLS / self._gray.shape[::-1]).astype(np.int64).clip(0, _CELLS - 1) @ [1, _CELLS]
         weight = 1 / np.bincount(cell)[cell]  # by area: a thing that moves by itself may have most of the corners
-        now = (_median(distance, weight) / _MEDIAN) ** 2
+        now = _median(distance, weight) / _MEDIAN
         self._off = now if self._off < 0 else _FOLLOWS * self._off + (1 - _FOLLOWS) * now
         self.baseline = float(np.median(baseline))
         shows = (rho > 0) & (np.linalg.norm(views[0] - views[1], axis=1) > _MOVES)
