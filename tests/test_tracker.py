@@ -166,7 +166,7 @@ def test_matches_lie_on_the_part_of_the_line_where_points_of_the_scene_are(turne
     now, then = seen_from(points, np.stack([T, before])).transpose(1, 0, 2)
 
     def off(match):
-        distance, rho, baseline = off_lines(now, match, T, np.tile(before, (50, 1, 1)), K, 3.0)
+        distance, rho, baseline = off_lines(now, match, T, np.tile(before, (50, 1, 1)), K, 0.1, 30.0)
         np.testing.assert_allclose(baseline, 0.2)
         return np.median(distance), rho
 

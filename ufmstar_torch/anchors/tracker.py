@@ -37,11 +37,12 @@ _NO_TRACK, _NO_DEPTH = "no corner followed from the frame before", "no parallax,
 # Of the median depth: nearer, a point's position in an image is not computed but bounded.
 _NEAREST = 1e-3
 # Depths of a scene, over the median: where the poses allow a corner's point to be. Half of the corners lie nearer than
-# the median, and matches without motion, as of a frozen image, beyond ten times of it.
-_RANGE, _AHEAD = (1 / 50, 10.0), 0.98
-# Share of the running comparison with the poses that remains after a frame, and the motion of a corner that shows a
-# depth [px].
-_FOLLOWS, _MOVES = 0.6, 1.0
+# the median, which says little while it is not known well; of an image without motion, as of one that is frozen, all
+# would be farther.
+_NEAR, _FAR, _MEDIAN_DEPTH, _AHEAD = 1 / 50, 10.0, 1.0, 0.98
+# Share of the running comparison with the poses that remains after a frame; the motion of a corner that shows a depth,
+# and of an image that stands still [px].
+_FOLLOWS, _MOVES, _STILL = 0.6, 1.0, 0.2
 # Cells of the image, in a row, that count alike in what corners show of the poses.
 _CELLS = 6
 # The median of the absolute value of a standard normal variable.
@@ -105,7 +106,7 @@ class Landmarks:
         none: why there is no landmark, where N = 0.
         pose_error: standard deviation of tracked corners from their epipolar lines [px]; NaN = not measured.
         shared: variance of inverse depths by errors of the poses, the same error for all landmarks of the image
-            [1/m^2]; it is in ``variance`` too.
+            [1/m^2]; it is in ``variance`` too. Infinite where the poses contradict the images.
         contradicted: the poses contradict the images, and no depth is used.
     """
 
@@ -280,13 +281,15 @@ class LandmarkTracker(SavedState):
             return
         first = order[seen[chosen].argmax(1)]
         views = self._pixel[chosen, self._view], self._pixel[chosen, first], self._poses[self._view], self._poses[first]
-        distance, rho, baseline = off_lines(*views, self._K, self._depth)
+        motion = np.linalg.norm(views[0] - views[1], axis=1)
+        far = self._depth * (_MEDIAN_DEPTH if np.median(motion) < _STILL else _FAR)
+        distance, rho, baseline = off_lines(*views, self._K, _NEAR * self._depth, far)
         cell = (views[0] * _CELLS / self._gray.shape[::-1]).astype(np.int64).clip(0, _CELLS - 1) @ [1, _CELLS]
         weight = 1 / np.bincount(cell)[cell]  # by area: a thing that moves by itself may have most of the corners
         now = _median(distance, weight) / _MEDIAN
         self._off = now if self._off < 0 else _FOLLOWS * self._off + (1 - _FOLLOWS) * now
         self.baseline = float(np.median(baseline))
-        shows = (rho > 0) & (np.linalg.norm(views[0] - views[1], axis=1) > _MOVES)
+        shows = (rho > 0) & (motion > _MOVES)
         if shows.sum() >= _ENOUGH:
             self._depth *= (1 / _median(rho[shows], weight[shows]) / self._depth) ** (1 - _MEMORY)
 
@@ -354,7 +357,7 @@ class LandmarkTracker(SavedState):
             none = contradiction(self.pose_error, config.max_pose_error * self._gray.shape[1])
         if result is None or self.contradicted:
             nothing = np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked, none
-            return Landmarks(*nothing, **judged, contradicted=self.contradicted)
+            return Landmarks(*nothing, **judged, shared=self.shared(self.baseline), contradicted=self.contradicted)
         T = self._poses[self._view]
         axis = T[:3, 2]
         depth = (result.point - T[:3, 3]) @ axis
@@ -378,7 +381,10 @@ class LandmarkTracker(SavedState):
         return Landmarks(pixel, depth[fine], variance, tracked, none, **judged, shared=shared)
 
     def shared(self, baseline: float) -> float:
-        """Variance of inverse depths by errors of the poses over a baseline [m], alike for all points [1/m^2]."""
+        """Variance of inverse depths by errors of the poses over a baseline [m], alike for all points [1/m^2]; infinite
+        where the poses contradict the images: what earlier ones taught may be as wrong."""
+        if self.contradicted:
+            return float("inf")
         return self.pose_variance / max(self._K[0, 0] * baseline, 1e-9) ** 2 if self.pose_variance else 0.0
 
 
@@ -388,7 +394,7 @@ def contradiction(error: float, limit: float) -> str:
 
 
 def off_lines(
-    position: NDArray, before: NDArray, T: NDArray, T_before: NDArray, K: NDArray, depth: float
+    position: NDArray, before: NDArray, T: NDArray, T_before: NDArray, K: NDArray, near: float, far: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """How far matches lie from where two poses allow them: from the part of the epipolar line on which points of a
     scene lie. Without parallax, that is a point; a match that moved the wrong way, or not at all, lies beyond its end.
@@ -399,7 +405,7 @@ def off_lines(
         T: [4, 4] camera-to-world of the present view [m].
         T_before: [N, 4, 4] of the earlier ones.
         K: [3, 3] [px].
-        depth: median of the scene [m].
+        near, far: range of the depths [m].
 
     Returns:
         [N] distances [px], [N] inverse depths of the nearest points of the whole lines [1/m], [N] baselines [m].
@@ -412,14 +418,14 @@ def off_lines(
     # In front of the earlier camera too: 1/z < x_z/-b_z.
     most = np.where(b[:, 2] < 0, _AHEAD * x[:, 2] / np.maximum(-b[:, 2], 1e-12), np.inf)
 
-    def seen(ratio: float) -> NDArray[np.float64]:
-        point = x + b * np.minimum(1 / (ratio * depth), most)[:, None]
+    def seen(depth: float) -> NDArray[np.float64]:
+        point = x + b * np.minimum(1 / depth, most)[:, None]
         return np.asarray(point[:, :2] / np.maximum(point[:, 2:], _NEAREST))
 
-    near, end = (seen(ratio) for ratio in _RANGE)
-    way = end - near
-    share = ((before - near) * way).sum(1) / np.maximum(np.square(way).sum(1), 1e-12)
-    off = before - near - share.clip(0, 1)[:, None] * way
+    start = seen(near)
+    way, from_start = seen(far) - start, before - start
+    share = (from_start * way).sum(1) / np.maximum(np.square(way).sum(1), 1e-12)
+    off = from_start - share.clip(0, 1)[:, None] * way
     speed = b[:, :2] - before * b[:, 2:]
     rho = ((before * x[:, 2:] - x[:, :2]) * speed).sum(1) / np.maximum(np.square(speed).sum(1), 1e-12)
     return np.linalg.norm(off, axis=1), rho, np.linalg.norm(moved, axis=1)

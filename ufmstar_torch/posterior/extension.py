@@ -43,7 +43,8 @@ class PosteriorFrame(FrameExtension):
             variance = variance + posterior.depth.square() * anchors.contradiction[:, None, None].to(variance.dtype)
         if anchors is not None and anchors.shared is not None:  # an error of the poses, which no anchor beside can show
             shared = anchors.shared[:, None, None].to(variance.dtype)
-            variance = variance + torch.minimum(posterior.depth**4 * shared, posterior.depth.square())
+            most = self._config.posterior.prior_sigma**2 * posterior.depth.square()
+            variance = variance + torch.minimum(posterior.depth**4 * shared, most)
         self._posterior = replace(posterior, variance=variance)
         statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
         return state.with_tensors({"posterior": learnt}), replace(out, statistics=statistics)
