@@ -340,6 +340,24 @@ def test_the_standard_error_is_of_pixels_drawn_without_replacement():
     assert every.standard_error.item() < 1e-12 < every.mean.item()
 
 
+def test_mean_uncertainty_is_seeded_and_checked():
+    def mean(**options):
+        ufm = UfMStar(CONFIG)
+        ufm(*frame(0))
+        return ufm.mean_uncertainty(*frame(1), **options).mean
+
+    assert torch.equal(mean(pixels=50, seed=3), mean(pixels=50, seed=3))
+    assert not torch.equal(mean(pixels=50, seed=3), mean(pixels=50, seed=4))
+
+
+def test_mean_uncertainty_with_the_moving_average_on_request():
+    dense, sampled = UfMStar(CONFIG), UfMStar(CONFIG)
+    for i in range(4):
+        out = dense(*frame(i, torch.float64))
+        mean = sampled.mean_uncertainty(*frame(i, torch.float64), fraction=1.0, average=True)
+        assert mean.mean.item() == pytest.approx(out.variance[out.valid].mean().item(), rel=1e-5)
+
+
 def test_query_is_the_dense_map_at_its_own_points():
     from ufmstar_torch.camera import unproject
 

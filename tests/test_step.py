@@ -201,6 +201,10 @@ def test_agrees_with_the_reference(compiled_backend, name, dtype, tolerance):
     for key, value in reference.state.tensors().items():
         found = getattr(fast.ufm, key).cpu()
         assert found.dtype == value.dtype
+        if key in reference.mixture.tensors() or key in reference.state.by_component:
+            slots = min(found.shape[1], value.shape[1])  # a GPU's mixture grows ahead
+            assert not found[:, slots:].any()
+            found, value = found[:, :slots], value[:, :slots]
         torch.testing.assert_close(found, value, rtol=10 * tolerance, atol=10 * tolerance, equal_nan=True)
 
 

@@ -24,7 +24,7 @@ _DEMO_COLUMNS = {"delta1": "delta1", **_CALIBRATION, "ause_rmse": "AUSE [m]"}
 _RUN_COLUMNS = {"delta1": "delta1", "abs_rel": "AbsRel", "rmse": "RMSE [m]", **_CALIBRATION, "spearman": "Spearman"}
 _CALIBRATED = 4.0  # mean z^2 of held-out anchors, and its inverse: sigma is right to a factor of two
 _UNSUPPORTED = "mean sigma not shown: neither truth nor held-out anchors (--posterior) support it"
-# What the counts of a frame's anchors mean, by their source: how many have a depth there, and of how many.
+# The counts of a frame's anchors by their source: how many have a depth, and of how many.
 _FOUND = {
     "tracked": ("triangulated", "tracked"),
     "landmarks": ("in view", "in the map"),
@@ -96,7 +96,7 @@ def demo_explanation(summary: Mapping[str, Any]) -> str:
         "Better: a high delta1, a low NLL, ECE and AUSE, and a sigma that equals the RMSE beside it.",
     ]
     hints = {
-        SHEET: f"the last four columns share a scale, so sigma can be compared with the error; {unseen} rooms below",
+        SHEET: f"sigma and the error beside it share a scale, so that they can be compared; {unseen} rooms below",
         CURVES: "nearer to the diagonal is better; on the left, a curve below it is over-confident",
         PLY: f"the mixture, brighter = views disagree more; for splat viewers ({ELLIPSOIDS}: MeshLab, Blender)",
     }

@@ -30,7 +30,7 @@ _VERSION = 4
 _COLOR = {0: "raw", 1: "png", 2: "jpeg"}
 _DEPTH = {0: "raw_ushort", 1: "zlib_ushort", 2: "occi_ushort"}
 _MATRIX = ("<f4", (4, 4))
-# What follows the sensor's name; sizes are width, height.
+# The header behind the sensor's name; sizes are width, height.
 _HEADER = np.dtype(
     [
         *[(f"{name}_{camera}", *_MATRIX) for camera in ("color", "depth") for name in ("K", "T")],
