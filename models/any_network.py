@@ -54,6 +54,9 @@ class WrappedNetwork(DepthNetwork):
         """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it, with ``intrinsics`` [B, 3, 3]
         [px] for a network that takes them. Raises ValueError: the network's output is not what was declared, or the
         intrinsics are missing."""
+        if not isinstance(image, Tensor):
+            expected = "image must be a tensor [B, 3, H, W] as network.preprocess(image, intrinsics) returns it"
+            raise TypeError(f"{expected}, got {type(image).__name__}; UncertainDepth takes pictures as they are")
         result = infer(self.network, image, intrinsics, takes=self._passes_intrinsics)
         if isinstance(result, DepthPrediction):
             return result

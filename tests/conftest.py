@@ -1,4 +1,4 @@
-"""What all tests share: one thread a process, kernels that are compiled once, Hypothesis's profiles."""
+"""One thread a process, kernels that are compiled once, Hypothesis's profiles, and fixtures of several files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ COMPILERS: pytest.StashKey[list[subprocess.Popen[bytes]]] = pytest.StashKey()
 
 settings.register_profile("fast", deadline=None, max_examples=25)
 settings.register_profile("thorough", deadline=None, max_examples=150, print_blob=True)
-settings.load_profile("fast")  # --hypothesis-profile=thorough loads the other one
+settings.register_profile("interpreted", deadline=None, max_examples=3)
+# --hypothesis-profile=thorough loads another one.
+settings.load_profile("interpreted" if os.environ.get("TRITON_INTERPRET") == "1" else "fast")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -43,10 +45,11 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what is marked slow or needs a device, unless files or tests are named or ``-m`` selects by marker."""
-    if config.option.markexpr or _names_files(config):
+    """Leave out what needs a device, and what is slow unless files or tests are named, where ``-m`` does not choose."""
+    if config.option.markexpr:
         return
-    left_out = [item for item in items if any(map(item.get_closest_marker, ("slow", "interpreter", "gpu")))]
+    markers = ("interpreter", "gpu") if _names_files(config) else ("slow", "interpreter", "gpu")
+    left_out = [item for item in items if any(map(item.get_closest_marker, markers))]
     config.hook.pytest_deselected(items=left_out)
     items[:] = [item for item in items if item not in set(left_out)]
 
@@ -67,6 +70,28 @@ def _compiled(dtype: str) -> bool:
     done = CORE / "kernels" / "__pycache__" / f"{dtype}.compiled"
     sources = [path for folder in ("", "kernels", "posterior") for path in (CORE / folder).glob("*.py")]
     return done.is_file() and done.stat().st_mtime > max(path.stat().st_mtime for path in sources)
+
+
+TRITON = (
+    pytest.mark.interpreter, pytest.mark.gpu,
+    pytest.mark.filterwarnings("ignore::RuntimeWarning:triton"),  # numpy on inf and NaN, as a GPU computes silently
+)  # fmt: skip
+
+
+@pytest.fixture(scope="session", params=["torch", "numba", pytest.param("triton", marks=TRITON)])
+def backend(request: pytest.FixtureRequest):
+    """Each implementation of the steps in turn (``backends``)."""
+    from backends import make_backend
+
+    return make_backend(request.param)
+
+
+@pytest.fixture(scope="session", params=["numba", pytest.param("triton", marks=TRITON)])
+def compiled_backend(request: pytest.FixtureRequest):
+    """Those that are compared with the reference."""
+    from backends import make_backend
+
+    return make_backend(request.param)
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from walks import SPGF
+from walks import SPGF as SPGF
 
 import scenes
 from ufmstar_torch import UfMStarConfig

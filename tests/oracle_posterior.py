@@ -136,7 +136,7 @@ def update(state, depth, claimed, pixel, g, variance):
     at = np.rint(pixel).astype(int)
     d = np.array([depth[r, c] for c, r in at])
     y = np.log(g / d)
-    stated, roughness = ratio(state, "noise") * variance / g**2, ratio(state, "roughness")
+    stated, roughness = ratio(state, "noise") * variance / g**2 + 1 / N, ratio(state, "roughness")
     blur = np.zeros(N)
     for k, (c, r) in enumerate(at):
         around = depth[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]
@@ -153,7 +153,7 @@ def update(state, depth, claimed, pixel, g, variance):
         residual, var = (y - fit) / left, var / left
         total = var + noise
         if round_ < 1:
-            weight = 5 / (4 + residual**2 / total) / noise
+            weight = 1 / (noise + np.maximum(residual**2 / total - 1, 0) * total / 20)
     away = distances(logs, set(node[weight * WEAK >= 1]))
     count = np.bincount(node, minlength=n)[node]
     square = np.minimum(residual**2, CLIP * total)
@@ -176,7 +176,7 @@ def update(state, depth, claimed, pixel, g, variance):
     spread = spread + away * ratio(state, "unseen")
     offset, share = HX[:, 4:] @ mean[4:], away / REACH
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
-    spread += [tail(*each) for each in zip(share, offset, around, strict=True)]
+    spread = [second_moment(*each) for each in zip(spread, share, offset, around, strict=True)]
     return after, *read(depth, counted, logs, mean[:4], offset, spread, share)
 
 
@@ -197,10 +197,13 @@ def y_variance(shape, node, y, noise, used, centre):
     return out.ravel()
 
 
-def tail(share, offset, around):
-    """.03 (1 + 2 share) E[(e^(n - offset) - 1)^2], n normal; e^-offset at most 100."""
-    a, q = 2 * around, min(math.exp(-offset), 100)
-    return 0.03 * (1 + 2 * share) * (q * q * math.exp(2 * a) - 2 * q * math.exp(a / 2) + 1)
+def second_moment(variance, share, offset, around):
+    """E[(e^n - 1)^2], n normal, or with the probability .03 + .06 share of n - offset; e^-offset at most 100."""
+    p, moments = 0.03 + 0.06 * share, []
+    for v, q in ((variance, 1), (2 * around, min(math.exp(-offset), 100))):
+        v = min(v, 2)
+        moments.append(q * q * math.exp(2 * v) - 2 * q * math.exp(v / 2) + 1)
+    return (1 - p) * moments[0] + p * moments[1]
 
 
 def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
@@ -221,8 +224,8 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
     area = believed / np.maximum(np.bincount(node, believed, minlength=logs.size)[node], 1e-12)
     share, around = away / REACH, y_variance(logs.shape, node, y, noise, rest, mean[0])[node]
     offset = H[:, FEATURES:] @ mean[FEATURES:]
-    final = total + away * ratio(state, "unseen") + share * claimed
-    final += [tail(*each) for each in zip(share, offset, around, strict=True)]
+    final = total + away * ratio(state, "unseen")
+    final = [second_moment(*each) for each in zip(final, share, offset, around, strict=True)] + share * claimed
     return {
         "amplitude": ((area * (square - noise) / total).sum(), (area * var / total).sum() / ratio(state, "amplitude")),
         "unseen": ((area * (error - total)).sum(), (area * away).sum()),

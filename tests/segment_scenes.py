@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import oracle_spgf
@@ -11,21 +11,11 @@ import torch
 from numpy.typing import NDArray
 from shared_data import require_shared
 from torch import Tensor
+from walks import oracle_settings
 
 from ufmstar_torch.camera import resize_intrinsics, unproject
 from ufmstar_torch.config import SPGFConfig
-from ufmstar_torch.kernels import segment_cpu
-from ufmstar_torch.segment import spgf as torch_spgf
-from ufmstar_torch.segment_input import SegmentInput
 
-
-def numba_spgf(depth, intrinsics, config=None, *, variance=None, valid=None, features=None, before_pruning=False):
-    """The compiled kernel with the reference's arguments."""
-    given = SegmentInput.checked(depth, intrinsics, config, variance, valid, features)
-    return segment_cpu.segment(given, before_pruning=before_pruning)
-
-
-TIERS = {"torch": torch_spgf, "numba": numba_spgf}
 REFERENCES = ("spgf_224_tum", "spgf_224_tartanair_indoor", "spgf_vga_tum")
 
 
@@ -83,20 +73,7 @@ def run_oracle(
     c = config.scaled_to(*depth.shape)
     fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     f = min(fx, fy)
-    limits = oracle_spgf.Settings(
-        a=c.slope(f) * f,
-        noise_floor=c.noise_floor,
-        noise_thresh=c.noise_thresh,
-        line_t=c.line_thresh,
-        occ_x=c.occlusion_gap,
-        n_check=c.n_check,
-        max_open=c.max_open,
-        angle=c.angle_cosine,
-        sparse=c.sparse,
-        min_gaussian_length=c.min_gaussian_length,
-        frame_max_scale=c.frame_max_scale,
-        max_depth=c.depth_limit,
-    )
+    limits = replace(oracle_settings(c).settings, a=c.slope(f) * f)
     return oracle_spgf.segment(depth.numpy(), oracle_spgf.Camera(fx, fy, cx, cy), limits, **options)
 
 

@@ -63,9 +63,6 @@ class Result:
     name: str = "not a tensor"
 
 
-# --- wrapping ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("returned", "output"),
     [
@@ -175,9 +172,6 @@ def test_a_wrapped_module_stays_a_module(image: Tensor) -> None:
     torch.testing.assert_close(factor.grad, image.sum())
     assert network.preprocess.size == (6, 8)
     assert all(not module.training for module in network.eval().modules())
-
-
-# --- saved programs ----------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:`torch.jit:FutureWarning", "ignore:`torch.jit:DeprecationWarning")
@@ -321,9 +315,6 @@ def test_compressed_archives_and_other_inputs_are_refused(tmp_path: Path, image:
             target.writestr(entry, source.read(entry))
     with pytest.raises(ValueError, match=r"small.pt2 is not a readable torch.export file: it has compressed files"):
         load_exported(tmp_path / "small.pt2", METRIC)
-
-
-# --- by name -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("suffix", ["onnx", "pth", "safetensors"])

@@ -6,6 +6,7 @@ import copy
 import pickle
 import threading
 from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -85,9 +86,6 @@ def alone(layer, n):
     return call
 
 
-# ---- one layer ----
-
-
 @settings(max_examples=25)
 @given(
     groups=st.sampled_from([(1, 3, 2), (2, 4, 6), (4, 4, 4), (4, 4, 8)]),
@@ -150,12 +148,6 @@ def test_autocast_does_not_widen_what_follows():
     layer.selection.members = torch.zeros(1, dtype=torch.int64)
     with torch.autocast("cpu", torch.bfloat16):
         assert layer(torch.zeros(1, 3, 6, 6)).dtype == torch.bfloat16
-
-
-# ---- how factors begin ----
-
-
-# ---- conversion ----
 
 
 class KeepsTwice(nn.Module):
@@ -236,37 +228,24 @@ def test_fastdepth_and_monodepth2_are_converted_whole():
             assert together.var(0).mean() > 0
 
 
-# ---- the ensemble ----
-
-
-def test_a_member_alone_is_its_part_of_the_batched_pass():
+def test_a_member_is_its_part_of_the_batched_pass_and_its_folded_network():
     _, ensemble = tiny()
     x = images()
     together = ensemble.distribution(x)
-    for n in range(N):
-        own = ensemble.member(n).distribution(x)
-        part = slice(2 * n, 2 * n + 2)
-        torch.testing.assert_close(own.depth, together.depth[part], rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(own.log_variance, together.log_variance[part], rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(ensemble.distribution(x, n).depth, own.depth, rtol=0, atol=0)
-        assert torch.equal(ensemble.member(n)(x).depth, own.depth)
     assert together.depth.shape == (2 * N, 6, 8)
-
-
-def test_a_member_is_its_folded_network():
-    _, ensemble = tiny()
-    x = images()
     for n, member in enumerate(ensemble.all_members()):
-        plain = ensemble.folded(n)
+        own, plain = member.distribution(x), ensemble.folded(n)
         assert not converted_layers(plain)
         assert {type(m) for m in plain.modules()} >= {nn.Conv2d, nn.Linear, nn.BatchNorm2d}
-        expected = member.distribution(x)
-        torch.testing.assert_close(plain.distribution(x).depth, expected.depth, rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(plain.distribution(x).log_variance, expected.log_variance, rtol=1e-12, atol=1e-12)
+        for name in ("depth", "log_variance"):
+            part = getattr(together, name)[2 * n : 2 * n + 2]
+            torch.testing.assert_close(part, getattr(own, name), rtol=1e-12, atol=1e-12)
+            torch.testing.assert_close(getattr(plain.distribution(x), name), part, rtol=1e-12, atol=1e-12)
         with torch.no_grad():
             for value in plain.parameters():
                 value.zero_()  # independent of the ensemble
-        torch.testing.assert_close(member.distribution(x).depth, expected.depth, rtol=0, atol=0)
+        assert torch.equal(member.distribution(x).depth, own.depth)
+        assert torch.equal(ensemble.distribution(x, n).depth, own.depth)
 
 
 @pytest.mark.parametrize("head", [AleatoricNetwork, EvidentialNetwork])
@@ -302,9 +281,6 @@ def test_gradients_are_those_of_the_formula():
         return torch.func.functional_call(layer, parameters, (x,))
 
     assert torch.autograd.gradcheck(call, (x, layer.r, layer.s, layer.bias, layer.shared.weight))
-
-
-# ---- members as networks ----
 
 
 def test_members_alternate_and_share_everything():
@@ -352,19 +328,14 @@ def test_a_copy_or_pickle_has_its_own_selection():
 def test_threads_do_not_mix_members():
     _, ensemble = tiny()
     x = images()
-    expected = [ensemble.member(n)(x).depth for n in range(N)]
-    wrong, barrier = [], threading.Barrier(N)
+    expected, barrier = [ensemble.member(n)(x).depth for n in range(N)], threading.Barrier(N)
 
-    def work(n):
+    def right(n):
         barrier.wait()
-        wrong.extend(n for _ in range(30) if not torch.equal(ensemble.member(n)(x).depth, expected[n]))
+        return all(torch.equal(ensemble.member(n)(x).depth, expected[n]) for _ in range(30))
 
-    threads = [threading.Thread(target=work, args=(n,)) for n in range(N)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert wrong == []
+    with ThreadPoolExecutor(N) as pool:
+        assert all(pool.map(right, range(N)))
 
 
 def test_an_error_ends_the_selection():

@@ -9,14 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from modules import CONFIG, DEPTHS, K_, POSES, H, K, W, frame
-from walks import SPGF, oracle_settings
+from modules import CONFIG, DEPTHS, POSES, H, K, W, frame
+from walks import SPGF
 
-import oracle
-from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.config import PAPER
 from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.networks import NetworkSource
@@ -32,37 +28,6 @@ pytestmark = pytest.mark.numerics
 
 DEPTHS_OF = [torch.tensor(depth, dtype=torch.float32)[None] for depth in DEPTHS]
 HOSTILE = [0.0, -1.0, 1e-45, 1e-40, 1e-20, 1e-7, 1e6, 1e10, 1e20, 3e38, float("inf"), float("nan")]
-
-
-@pytest.mark.parametrize("max_depth", [20.0, 1e6])
-@given(st.data())
-@settings(max_examples=25, deadline=None)
-def test_no_single_value_spoils_the_state_or_a_map(max_depth, data):
-    """One hostile pixel of depth, A, E or an anchor per frame: everything that is valid stays finite, also later."""
-    segment = SPGFConfig(
-        **{**SPGF.to_dict(), "max_depth": max_depth, "min_gaussian_length": max(0.5, max_depth / 9000)}
-    )
-    ufm = UfMStar(
-        CONFIG.replace(segment=segment, anchors=AnchorConfig(), aleatoric_in_moments=data.draw(st.booleans()))
-    )
-    for i in range(3):
-        depth, pose, intrinsics = frame(i)
-        a, e = torch.full_like(depth, 1e-3), torch.full_like(depth, 1e-3)
-        v, u = data.draw(st.integers(0, H - 1)), data.draw(st.integers(0, W - 1))
-        for values in (depth, a, e):
-            if data.draw(st.booleans()):
-                values[0, v, u] = data.draw(st.sampled_from(HOSTILE))
-        n = torch.tensor([[[u, v], [5, 5], [20, 10], [30, 20], [10, 25]]], dtype=torch.float64)
-        g = torch.full((1, 5), 2.5, dtype=torch.float64)
-        g[0, 0] = data.draw(st.sampled_from(HOSTILE))
-        out = ufm(depth, pose, intrinsics, a, e, anchors=Anchors(n, g, torch.full_like(g, 1e-3)))
-        assert bool(out.variance[out.valid].isfinite().all())
-        assert bool(out.variance[~out.valid].isnan().all())
-        given = int(((depth > 0) & depth.isfinite()).sum())
-        counts = out.statistics
-        assert int(counts.valid_pixels + counts.beyond + counts.out_of_range) == given
-    for name, value in ufm.state.tensors().items():
-        assert name == "smoothed" or bool(value.isfinite().all()), name
 
 
 def test_beyond_the_networks_range_nothing_is_certain():
@@ -129,51 +94,11 @@ def test_declared_ranges_reach_the_pipeline_and_the_evaluation():
     assert made.ufm.config.segment.max_depth == 7.0
 
 
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({(0, 0): 1e100}, "focal length"),
-        ({(1, 1): 1e-9}, "focal length"),
-        ({(0, 2): 320.0}, "principal point outside the depth map; expected the intrinsics of the depth map"),
-        ({(1, 2): -3.0}, "principal point outside the depth map"),
-    ],
-)
-def test_intrinsics_that_cannot_be_the_depth_maps_are_refused(changes, text):
-    depth, pose, intrinsics = frame(0)
-    intrinsics = intrinsics.clone()
-    for at, value in changes.items():
-        intrinsics[0][at] = value
-    ufm = UfMStar(CONFIG)
-    with pytest.raises(ValueError, match=text):
-        ufm(depth, pose, intrinsics)
-    skipping = UfMStar(CONFIG.replace(on_bad_frame="skip"))
-    assert int(skipping(depth, pose, intrinsics).statistics.fault[0]) > 0
-    pose = pose.clone()
-    pose[0, 0, 3] = 1e12
-    with pytest.raises(ValueError, match="farther from the origin than 1e9 m"):
-        ufm(depth, pose, K)
-
-
 CHOICES = {
     "paper": {},
     "relative": {"unmeasured_relative": 0.2},
     "nan": {},
 }
-
-
-@pytest.mark.parametrize("choice", CHOICES)
-def test_what_was_not_measured_agrees_with_the_oracle(choice):
-    config = CONFIG.replace(unmeasured=choice, **CHOICES[choice])
-    tiers = [UfMStar(config.replace(backend=backend), dtype=torch.float64) for backend in ("torch", "numba")]
-    judge = oracle.Oracle(oracle_settings(SPGF), unmeasured=choice, **CHOICES[choice])
-    for i in range(3):
-        V, _ = judge.step(DEPTHS[i], POSES[i], K_)
-        share = judge.share()
-        for ufm in tiers:
-            out = ufm(*frame(i, torch.float64))
-            np.testing.assert_allclose(out.variance[0].numpy(), V, rtol=1e-7, atol=1e-10)
-            np.testing.assert_allclose(out.measured[0].numpy(), share, rtol=1e-7, atol=1e-9)
-            assert int(out.statistics.unmeasured[0]) == int((share < 0.5).sum())
 
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])
@@ -288,23 +213,6 @@ def test_the_papers_configuration():
     assert told is not None
     assert [name for name in PAPER if name.removeprefix("segment") not in told] == []
     assert UfMStarConfig.from_dict(paper.to_dict()) == paper
-
-
-@pytest.mark.parametrize("backend", ["torch", "numba"])
-def test_the_papers_configuration_agrees_with_the_oracle(backend):
-    """Pruning if either is small, thresholds of this image's size with the camera's own f, neighbourhoods."""
-    paper = UfMStarConfig.paper().replace(backend=backend)
-    thresholds = paper.segment.scaled_to(H, W)
-    assert (thresholds.min_pixels, thresholds.min_rows) == (48, 4)
-    assert thresholds.adaptive_thresh_scale == pytest.approx(2.4 * W / 224)  # the larger of the two factors
-    judge = oracle.Oracle(oracle_settings(thresholds), neighbourhood=(2.0, 0.1, 0.5))
-    ufm = UfMStar(paper, dtype=torch.float64)
-    for i in range(2):
-        out = ufm(*frame(i, torch.float64))
-        V, _ = judge.step(DEPTHS[i], POSES[i], K_)
-        np.testing.assert_allclose(out.variance[0].numpy(), V, rtol=1e-7, atol=1e-10)
-    assert len(judge.mixture) > 1
-    assert float(out.variance[out.valid].max()) > 0
 
 
 def test_outputs_print_as_a_line():

@@ -112,9 +112,6 @@ def test_metadata_nested_too_deeply_names_the_file(tmp_path: Path) -> None:
         load_weights(Small(), tmp_path / "deep.safetensors")
 
 
-# --- damage ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", FORMATS)
 @given(data=st.data())
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -201,9 +198,6 @@ def test_missing_files_and_unknown_suffixes(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"w\.npz must end in"):
         save_checkpoint(tmp_path / "w.npz", Small())
     assert not (tmp_path / "w.npz").exists()
-
-
-# --- writing -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", FORMATS)

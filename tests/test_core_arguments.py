@@ -37,10 +37,10 @@ def model(image, *camera, network=None, **options):
     return UncertainDepth(network or Brightness(), CONFIG, **options)(image, *(camera or (POSE, K)))
 
 
-def seen_two():
+def seen():
     module = UfMStar(CONFIG)
     module(DEPTH, POSE, K)
-    return module(DEPTH.expand(2, H, W), POSE, K)
+    return module
 
 
 REFUSED = {
@@ -50,7 +50,9 @@ REFUSED = {
     "depth in millimetres": (lambda: ufm(DEPTH.short(), POSE, K), TypeError, "depth must have a floating-point dtype"),
     "depth as a list": (lambda: ufm([[1.0]], POSE, K), TypeError, "depth must be a torch.Tensor or a NumPy array"),
     "depth of objects": (lambda: ufm(np.array([None]), POSE, K), TypeError, "depth .*got an array of object"),
-    "depth of other streams": (seen_two, ValueError, r"depth has 2 streams .*call reset\(\)"),
+    "depth of other streams": (
+        lambda: seen()(DEPTH.expand(2, H, W), POSE, K), ValueError, r"depth has 2 streams .*call reset\(\)"
+    ),
     "pose of 3 x 3": (lambda: ufm(DEPTH, torch.eye(3), K), ValueError, r"pose must be camera-to-world \[B, 4, 4\]"),
     "pose of other streams": (lambda: ufm(DEPTH, POSE.expand(3, 4, 4), K), ValueError, "pose must have depth's 1"),
     "pose as text": (lambda: ufm(DEPTH, ["a"], K), TypeError, "pose must hold numbers"),
@@ -75,6 +77,18 @@ REFUSED = {
     "an argument of no extension": (lambda: ufm(DEPTH, POSE, K, ancors=1), TypeError, "takes no argument 'ancors'"),
     "a config that is a dict": (lambda: UfMStar({}), TypeError, "config must be a UfMStarConfig"),
     "a state in half precision": (lambda: UfMStar(dtype=torch.float16), ValueError, "dtype must be torch.float32"),
+    **{
+        f"a sample of {sample}": (lambda s=sample: seen().mean_uncertainty(DEPTH, POSE, K, **s), ValueError, name)
+        for sample, name in (
+            ({"pixels": 0}, "pixels"), ({"pixels": H * W + 1}, "pixels"), ({"fraction": 0.0}, "fraction"),
+            ({"fraction": 1.5}, "fraction"), ({"pixels": 5, "fraction": 0.5}, "pixels or fraction"),
+        )
+    },
+    "points of other streams": (lambda: seen().query(torch.zeros(2, 5, 3)), ValueError, r"points must be \[1, N, 3\]"),
+    "points without streams": (lambda: seen().query(torch.zeros(5, 3)), ValueError, r"points must be \[1, N, 3\]"),
+    "points in the plane": (lambda: seen().query(torch.zeros(1, 5, 2)), ValueError, r"points must be \[1, N, 3\]"),
+    "points of another frame": (lambda: seen().query(torch.zeros(1, 5, 3), "camera"), ValueError, "frame must be"),
+    "points of no mixture": (lambda: UfMStar().query(torch.zeros(1, 5, 3)), ValueError, "query needs a mixture"),
     "an image of one channel": (lambda: model(IMAGE[:, :1]), ValueError, r"image must be \[B, 3, H, W\]"),
     "a tensor with channels last": (lambda: model(torch.tensor(PICTURE)[None]), ValueError, "image .*permute"),
     "an array with channels first": (lambda: model(IMAGE.numpy()), ValueError, r"image as a NumPy array .*\[H, W, 3\]"),
@@ -84,6 +98,9 @@ REFUSED = {
     "an image that is a file's name": (lambda: model("a.png"), TypeError, "image must be .*Pillow image, got str"),
     "bytes for a network of floats": (
         lambda: model(IMAGE, network=nn.Conv2d(3, 1, 1)), TypeError, r"image of torch.uint8: give floats.*wrap_network"
+    ),
+    "an array for a wrapped network": (
+        lambda: wrap_network(Brightness())(PICTURE), TypeError, r"image must be a tensor .*network.preprocess"
     ),
     "a network that returns a tensor": (
         lambda: model(IMAGE / 255, network=nn.Identity()), TypeError, r"DepthPrediction, got Tensor: wrap.*wrap_network"

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors.dense_poses import PoseErrors
-from ufmstar_torch.kernels.beside_cpu import beside
+from ufmstar_torch.kernels.anchor_check_cpu import check_anchors
 from ufmstar_torch.kernels.dense_cpu import Measured, Views
 from ufmstar_torch.kernels.poses_cpu import Shown, linearised, solved
 
@@ -169,7 +169,7 @@ def around(rho_right, rho_here):
 @pytest.mark.parametrize(("rho_here", "to"), [(2.0, 62.0), (1.0, 58.0)])
 def test_an_anchor_on_an_edge_moves_to_its_own_surface(rho_here, to):
     image, pixel, rho, middle = around(2.0, rho_here)
-    surface, alone = beside(image, pixel, rho, np.full(len(rho), 1e-4), 10)
+    surface, alone = check_anchors(image, pixel, rho, np.full(len(rho), 1e-4), 10)
     np.testing.assert_allclose(surface[middle], [to, 65], atol=1e-6)
     assert alone[middle] < 0.1 * (2.0 - 1.0) ** 2
     flat = np.abs(pixel[:, 0] - 60) > 20
@@ -181,7 +181,7 @@ def test_an_anchor_that_differs_from_those_around_it_is_as_uncertain_as_the_orac
     image, pixel, rho, middle = around(1.0, 3.0)
     rho = rho * rng.uniform(0.9, 1.1, len(rho))
     variance = rng.uniform(1e-4, 1e-3, len(rho))
-    _, alone = beside(image, pixel, rho, variance, 10)
+    _, alone = check_anchors(image, pixel, rho, variance, 10)
     np.testing.assert_allclose(alone, oracle_dense.alone(pixel, rho, variance, 10), rtol=1e-12)
     assert alone[middle] > 0.5
     assert np.delete(alone, middle).max() < 0.1 * alone[middle]

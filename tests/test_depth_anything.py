@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 import torch
-from depth_anything_files import MEAN, STD, lively, write_depth_anything, write_other
+from depth_anything_files import MEAN, STD, write_depth_anything, write_other
 from layouts import write_generic
 from runs import read_summary
 from safetensors.torch import load_file, save_file
@@ -44,16 +44,10 @@ def relative(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def other(tmp_path_factory):
-    """A GLPN, whose configuration does not say what its depth is, and which reduces resolution."""
-    folder = tmp_path_factory.mktemp("hub") / "glpn"
-    config = transformers.GLPNConfig(
-        hidden_sizes=[8, 8, 16, 16], depths=[1, 1, 1, 1], num_attention_heads=[1, 1, 2, 2], decoder_hidden_size=8
-    )
-    lively(transformers.GLPNForDepthEstimation(config), 3).save_pretrained(folder)
-    (folder / "preprocessor_config.json").write_text(
-        json.dumps({"image_processor_type": "GLPNImageProcessor", "size_divisor": 32, "resample": 2, "do_rescale": True,
-                    "do_normalize": False})
-    )  # fmt: skip
+    """A GLPN, whose configuration does not say what its depth is."""
+    folder = write_other(tmp_path_factory.mktemp("hub") / "glpn", "glpn", 3)
+    saying = {"image_processor_type": "GLPNImageProcessor", "size_divisor": 32, "resample": 2, "do_normalize": False}
+    (folder / "preprocessor_config.json").write_text(json.dumps(saying))
     return folder
 
 
@@ -75,9 +69,6 @@ def own_processor(folder, images, **changes):
     """What the checkpoint's own image processor makes of uint8 images [B, 3, H, W]."""
     processor = transformers.DPTImageProcessor.from_pretrained(folder, **changes)
     return processor(list(images), return_tensors="pt")["pixel_values"]
-
-
-# ---- the network ----
 
 
 def test_metric_depth_equals_transformers_own_forward(metric):
@@ -118,9 +109,6 @@ def test_inputs_that_do_not_fit_are_refused(metric):
             network(image)
 
 
-# ---- relative checkpoints ----
-
-
 def test_a_relative_checkpoint_is_no_depth_network_until_it_is_aligned(relative):
     K_photo = resize_intrinsics(K, (480, 640), (48, 64))
     network = DepthAnything.from_pretrained(relative, size=(70, 84))
@@ -142,9 +130,6 @@ def test_a_relative_checkpoint_is_no_depth_network_until_it_is_aligned(relative)
     torch.testing.assert_close(out.depth, truth, rtol=1e-4, atol=0)
     torch.testing.assert_close(out.intrinsics[0], K_net)
     assert out.variance.isfinite().any()
-
-
-# ---- preprocessing ----
 
 
 @pytest.mark.parametrize("keep_aspect", [False, True])
@@ -184,9 +169,6 @@ def test_an_image_processor_may_be_missing_or_say_something_else(broken):
     file.write_text("{")
     with pytest.raises(CheckpointError, match=r"broken: preprocessor_config\.json cannot be read"):
         DepthAnything.from_pretrained(broken)
-
-
-# ---- checkpoints that cannot be used ----
 
 
 def edit_weights(folder, edit):
@@ -256,9 +238,6 @@ def test_a_hub_name_without_a_connection_says_what_to_do(tmp_path, monkeypatch):
     assert isinstance(caught.value.__cause__, OSError)
 
 
-# ---- any other model ----
-
-
 def test_another_model_in_one_line_with_its_meaning_declared(other):
     images = photos(1, (64, 96))
     with pytest.raises(ValueError, match=r"\(glpn\) does not say whether its depth is metric: declare kind='metric'"):
@@ -318,9 +297,6 @@ def test_weights_that_a_model_does_not_use_may_be_missing(broken):
     assert from_hugging_face(broken, allow_missing=["head.conv3"]).kind == "metric"
 
 
-# ---- what each architecture's output is ----
-
-
 @pytest.mark.parametrize("architecture", ["depth_anything", "depth_pro", "dpt", "glpn", "zoedepth"])
 def test_depth_is_what_transformers_own_post_processing_makes_of_it(architecture, tmp_path):
     """Depth Pro's inverse depth with its field of view, ZoeDepth's padding; the others as they are."""
@@ -370,9 +346,6 @@ def test_other_architectures_are_refused_by_name(broken, architecture):
     (broken / "config.json").write_text(json.dumps({"model_type": architecture}))
     with pytest.raises(CheckpointError, match=rf"broken \({architecture}\) cannot be loaded as a depth model: covered"):
         from_hugging_face(broken, kind="metric")
-
-
-# ---- by name, and on the command line ----
 
 
 def test_networks_by_name(metric, relative, other, tmp_path):

@@ -40,9 +40,6 @@ def with_dropout(p: float = P) -> FastDepth:
     return network.eval()
 
 
-# --- the layer ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("generator", [None, seeded()], ids=["torch's", "own"])
 def test_share_and_scale(generator: torch.Generator | None) -> None:
     """A value is 0 with probability p, otherwise it is divided by 1 - p: the mean stays."""
@@ -64,9 +61,6 @@ def test_when_it_acts() -> None:
     assert layer(x) is x
     assert DecoderDropout(0.0).train()(x) is x
     assert layer.state_dict() == {}
-
-
-# --- moments -----------------------------------------------------------------------------------------
 
 
 def closed_form(backbone: Linear, image: Tensor) -> tuple[Tensor, Tensor]:
@@ -129,9 +123,6 @@ def test_aleatoric_variance_is_averaged_and_evidence_added() -> None:
         torch.testing.assert_close(together.epistemic_variance, between + own.mean(0))
 
 
-# --- only the decoder ---------------------------------------------------------------------------------
-
-
 def backbones() -> list[Backbone]:
     from ufmstar_torch.models.monodepth2 import MonodepthResNet
 
@@ -159,8 +150,6 @@ def test_the_encoder_does_not_sample() -> None:
         with torch.no_grad():
             assert torch.equal(network(image).depth, network(image).depth)
 
-
-# --- both forms in UncertainDepth ---------------------------------------------------------------------
 
 CONFIG = UfMStarConfig(segment=SPGF)
 K = torch.tensor(scenes.intrinsics(64, 64))

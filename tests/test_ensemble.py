@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -55,9 +56,6 @@ def image(batch=2):
     return torch.rand(batch, 3, 8, 10, generator=torch.Generator().manual_seed(0))
 
 
-# ---- all members at once ----
-
-
 def test_an_ensemble_is_the_mixture_of_its_members():
     networks = [Gain(1.0), Gain(1.5), Gain(3.0)]
     mixture = Ensemble(networks)(image())
@@ -67,9 +65,6 @@ def test_an_ensemble_is_the_mixture_of_its_members():
     torch.testing.assert_close(mixture.aleatoric_variance, 0.01 * mean)
     torch.testing.assert_close(mixture.epistemic_variance, (depths**2).sum(0) / 3 - mean**2)
     assert Ensemble(networks).preprocess == INPUT
-
-
-# ---- lazy members ----
 
 
 def test_only_the_members_in_turn_are_loaded_each_once():
@@ -125,14 +120,6 @@ def test_a_copy_loads_anew(copied):
     assert "loaded=True" in repr(other)
 
 
-def in_threads(count, work):
-    threads = [threading.Thread(target=work) for _ in range(count)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-
-
 def test_threads_load_a_member_once():
     barrier, started = threading.Barrier(4), []
 
@@ -141,13 +128,9 @@ def test_threads_load_a_member_once():
         threading.Event().wait(0.05)
         return Gain(1.0)
 
-    member, depths = LazyMember(slow, INPUT), []
-
-    def work():
-        barrier.wait()
-        depths.append(member(image()).depth)
-
-    in_threads(4, work)
+    member = LazyMember(slow, INPUT)
+    with ThreadPoolExecutor(4) as pool:
+        depths = list(pool.map(lambda _: (barrier.wait(), member(image()).depth)[1], range(4)))
     assert len(started) == 1
     assert len(depths) == 4
 

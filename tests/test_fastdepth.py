@@ -39,9 +39,6 @@ def tum_frames(step: int) -> list[tuple[Tensor, Tensor]]:
     return frames
 
 
-# --- sizes -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("widths", "weights", "macs"),
     [(FastDepthWidths.full(), 3.93e6, 0.74e9), (FastDepthWidths.pruned(), 1.34e6, 0.37e9)],
@@ -64,12 +61,6 @@ def test_weights_and_operations_are_the_papers(widths: FastDepthWidths, weights:
         assert network(torch.rand(1, 3, 224, 224)).depth.shape == (1, 224, 224)
     assert counted["weights"] == pytest.approx(weights, rel=0.003)
     assert counted["macs"] == pytest.approx(macs, rel=0.01)
-
-
-SIZE, IMAGE = "multiples of 32 px", r"image must be floating-point \[B, 3, H, W\]"
-
-
-# --- agreement with ONNX Runtime ---------------------------------------------------------------------
 
 
 def test_published_weights_agree_with_onnx_runtime(network: FastDepth) -> None:
@@ -105,14 +96,6 @@ def test_import_of_other_widths_and_folded_norms(tmp_path: Path, folded: bool) -
     torch.testing.assert_close(depth, run_onnx(path, image)[:, 0], rtol=0, atol=2e-3)
 
 
-def test_folding_keeps_the_function(network: FastDepth) -> None:
-    image = network.preprocess.apply_image(tum_frames(20)[0][0])
-    before = {key: value.clone() for key, value in network.state_dict().items()}
-    with torch.inference_mode():
-        torch.testing.assert_close(network.folded()(image).depth, network(image).depth, rtol=0, atol=2e-5)
-    assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())
-
-
 def test_a_bias_before_batch_norm_is_taken_into_account(tmp_path: Path) -> None:
     def with_bias(model: onnx.ModelProto) -> None:
         bias = np.linspace(-0.2, 0.3, 6, dtype=np.float32)
@@ -127,9 +110,6 @@ def test_a_bias_before_batch_norm_is_taken_into_account(tmp_path: Path) -> None:
     expected = run_onnx(path, image)[:, 0]
     assert (expected - run_onnx(plain, image)[:, 0]).abs().max() > 0.1
     torch.testing.assert_close(depth, expected, rtol=0, atol=2e-3)
-
-
-# --- what is not a FastDepth -------------------------------------------------------------------------
 
 
 def node(model: onnx.ModelProto, kind: str, index: int) -> onnx.NodeProto:
@@ -195,12 +175,6 @@ def test_other_graphs_are_refused(tmp_path: Path, edit: Edit, message: str) -> N
     good = write_fastdepth(tmp_path / "good.onnx", small_network())
     with pytest.raises(ValueError, match=message):
         FastDepth.from_onnx(edited(good, tmp_path / "edited.onnx", edit))
-
-
-# --- real frames and training ------------------------------------------------------------------------
-
-
-# --- for training from scratch -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """What only a CUDA device can show: no synchronisation, many streams, flat memory, the graph. ``pytest -m gpu``.
 
-The kernels themselves are in ``test_triton.py``, which runs on the device as well.
+The kernels themselves are in the tests of ``conftest.backend``, which run on the device as well.
 """
 
 from __future__ import annotations
@@ -79,15 +79,6 @@ def test_the_graph_equals_the_step():
         assert same(out.variance, expected.variance)
     for name, value in plain.state_dict().items():
         assert same(ufm.state_dict()[name], value)
-
-
-def test_gpu_equals_cpu_over_a_walk():
-    config = UfMStarConfig(segment=SPGF)
-    gpu, cpu = UfMStar(config), UfMStar(config)
-    for depth, pose, K, _ in walks(4, 8):
-        a, b = gpu(depth.cuda(), pose.cuda(), K.cuda()), cpu(depth, pose, K)
-        assert torch.equal(a.labels.cpu(), b.labels)
-        torch.testing.assert_close(a.variance.cpu(), b.variance, rtol=1e-6, atol=1e-9, equal_nan=True)
 
 
 @pytest.mark.parametrize("size", [(224, 224), (518, 518)])

@@ -30,9 +30,6 @@ def pixel(value: float) -> Tensor:
     return torch.full((1, 1, 1), value, dtype=torch.float64)
 
 
-# --- distributions -----------------------------------------------------------------------------------
-
-
 @given(
     gamma=st.floats(0.1, 100),
     nu=st.floats(0.01, 100),
@@ -46,9 +43,6 @@ def test_evidential_variance_is_the_students_t(gamma: float, nu: float, alpha: f
     assert prediction.variance is not None
     assert float(prediction.depth) == pytest.approx(marginal.mean())
     assert float(prediction.variance) == pytest.approx(marginal.var(), rel=1e-9)
-
-
-# --- soft_range --------------------------------------------------------------------------------------
 
 
 @given(st.floats(-1e4, 1e4), st.floats(0, 1e3))
@@ -65,9 +59,6 @@ def test_soft_range_keeps_a_gradient(x: float) -> None:
     assert value.grad is not None
     distance = max(0.0, abs(x) - HIGH)
     assert 0.5 * math.exp(-distance) <= float(value.grad) <= math.exp(-distance) + 1e-6
-
-
-# --- extreme raw outputs -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -101,9 +92,6 @@ def test_evidence_against_its_closed_form() -> None:
         torch.testing.assert_close(value, torch.full_like(value, expected))
     torch.testing.assert_close(prediction.aleatoric_variance, torch.full((1, 4, 6), 0.5 / 3), rtol=1e-4, atol=0)
     torch.testing.assert_close(prediction.epistemic_variance, torch.full((1, 4, 6), 0.5 / 6), rtol=2e-4, atol=0)
-
-
-# --- depth is the backbone's -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", list(HEADS))

@@ -1,13 +1,16 @@
-"""Frames that nobody should send, thousands of them: state, streams and errors stay in order.
+"""Frames that nobody should send, and damaged recordings, thousands of them: state, streams and errors stay in order.
 
 ``pytest -m slow tests/test_hostile.py`` takes in 1,000 frames, ``UFMSTAR_HOSTILE_FRAMES=10000`` as many as it says.
-Frames come in sessions of 20, one seed each, so that a failure repeats by its session's number alone.
+Frames come in sessions of 20, one seed each, so that a failure repeats by its session's number alone. Damaged files:
+300 of each layout, likewise by seed.
 """
 
 from __future__ import annotations
 
 import os
 
+import layouts
+import layouts_more
 import numpy as np
 import pytest
 import torch
@@ -16,6 +19,7 @@ from modules import same
 import scenes
 from ufmstar_torch import AnchorConfig, MergeConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.eval.sequences import open_sequence
 
 H, W, LENGTH = 24, 32, 20
 FRAMES = int(os.environ.get("UFMSTAR_HOSTILE_FRAMES", "1000"))
@@ -115,7 +119,8 @@ def configuration(rng):
     return UfMStarConfig(
         segment=SPGFConfig(
             min_pixels=int(rng.choice([1, 20])), min_rows=1, prune=str(rng.choice(["both", "none"])),
-            max_depth=[None, 20.0][rng.integers(2)], scale_with_image=bool(rng.integers(2)),
+            scale_with_image=bool(rng.integers(2)),
+            **[{}, {"max_depth": 20.0}, {"max_depth": 1e6, "min_gaussian_length": 112.0}][rng.integers(3)],
         ),
         aleatoric_in_moments=bool(rng.integers(2)),
         disagreement=str(rng.choice(["w2", "overlap"])),
@@ -152,8 +157,22 @@ def assert_in_order(ufm, session):
         raise AssertionError(f"session {session}: {error}") from error
 
 
-def assert_sound(out, config, session):
-    """No NaN where a pixel was used, unless it was asked for; no value below 0."""
+def assert_sound(out, given, config, session):
+    """The pixels used are those of the accepted ranges, every other is counted; no NaN where a pixel was used, unless
+    it was asked for; no value below 0."""
+    depth, fine = given["depth"], (out.statistics.fault == 0)[:, None, None]
+    depth = depth if depth.dtype == torch.float64 else depth.float()
+    mask = given.get("valid", torch.ones_like(depth, dtype=torch.bool)) & fine
+    use = mask & (depth >= 1e-6) & (depth <= config.segment.depth_limit)
+    for name in ("aleatoric", "epistemic"):
+        value = given.get(name, torch.zeros_like(depth)).to(depth.dtype)
+        use &= (value >= 0) & (value <= 1e12)
+    if config.features:
+        use &= (given["features"].to(depth.dtype).abs() <= 1e12).all(1)
+    counts = out.statistics
+    assert torch.equal(out.valid, use), session
+    positive = (mask & (depth > 0) & depth.isfinite()).sum((1, 2))
+    assert torch.equal(counts.valid_pixels + counts.beyond + counts.out_of_range, positive), session
     values = out.variance[out.valid]
     assert bool(out.variance[~out.valid].isnan().all()), session
     assert not bool(values.isinf().any()), session
@@ -182,7 +201,8 @@ def run_session(session):
             continue
         taken += 1
         assert_in_order(ufm, session)
-        assert_sound(out, config, session)
+        if not spoilt:
+            assert_sound(out, given, config, session)
         compared = compared and not spoilt  # an optional argument that was left out is taken in, but by one of them
         if compared:
             beside = twin(**batch([other, watched], names))
@@ -203,6 +223,64 @@ def test_thousands_of_hostile_frames(part):
     sessions = range(part, max(FRAMES // LENGTH, 10), 10)
     taken = sum(run_session(session) for session in sessions)
     assert taken > 0.3 * LENGTH * len(sessions), "most frames must get as far as the algorithm"
+
+
+# ---- damaged recordings ----
+
+WRITERS = {
+    "generic": lambda folder: layouts.write_generic(folder / "one", frames=3)[0],
+    "tum": lambda folder: layouts.write_tum(folder)[0],
+    "scannet": lambda folder: layouts.write_scannet(folder, frames=3)[0],
+    "tartanair": lambda folder: layouts.write_tartanair(folder)[0],
+    "sens": lambda folder: layouts_more.write_sens(folder / "a.sens", frames=3)[0],
+}
+
+
+def damage(rng, content):
+    """The bytes cut off, doubled, or some of them changed."""
+    kind, data = rng.integers(4), bytearray(content)
+    if kind == 0:
+        return bytes(data[: rng.integers(len(data) + 1)])
+    if kind == 1:
+        return content + content
+    at = rng.integers(0, max(1, min(len(data), 400) if kind == 2 else len(data)), rng.integers(1, 9))
+    for place in at[at < len(data)]:
+        data[place] = rng.integers(256)
+    return bytes(data)
+
+
+def read_damaged(layout, folder, seeds):
+    """Damage a file of a recording at a time, and read all: how often it was refused whole, or in part."""
+    path, refused = WRITERS[layout](folder), 0
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        file = files[rng.integers(len(files))]
+        content = file.read_bytes()
+        file.write_bytes(damage(rng, content))
+        try:
+            errors = []
+            sequence = open_sequence(path)
+            for frame in sequence.readable(errors.append):
+                assert np.isfinite(frame.T_world_cam).all(), seed
+                assert frame.depth is None or bool((frame.depth >= 0).all()), seed
+            refused += bool(errors or sequence.skipped)
+        except (ValueError, OSError):
+            refused += 1
+        finally:
+            file.write_bytes(content)
+    return refused
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_a_few_damaged_recordings(layout, tmp_path):
+    assert read_damaged(layout, tmp_path, range(12)) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", WRITERS)
+def test_hundreds_of_damaged_recordings(layout, tmp_path):
+    assert read_damaged(layout, tmp_path, range(100, 400)) > 60
 
 
 @pytest.mark.slow

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
+from shared_data import require_shared
 
 import scenes
 from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.eval.check.image_fit import depth_fit, image_fit, track_corners
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.frame import check_intrinsics
+from ufmstar_torch.models import Preprocess
 
 H, W = 48, 64
 K = scenes.intrinsics(H, W)
@@ -64,3 +72,150 @@ def test_moving_frames_without_anchors_are_named(caplog):
     pixel = torch.tensor(np.stack([rng.uniform(0, W - 1, (2, n)), rng.uniform(0, H - 1, (2, n))], -1))
     far = Anchors(pixel, torch.full((2, n), 2.0).double(), torch.full((2, n), 1e-2).double())
     assert said(caplog, config=config, anchors=far)[0] == []
+
+
+# ---- what tracked corners show: each mistake on recordings and rendered tours ----
+
+RECORDINGS = ("rgbd_dataset_freiburg1_xyz", "rgbd_dataset_freiburg3_teddy", "hololens_office", "tartanair_sample/P000")
+TOURS = tuple(f"tour:{seed}?frames=50&size=120x160" for seed in (41, 42, 43, 44, 45, 46))
+OPENGL = np.diag([1.0, -1, -1, 1])
+
+
+def posed(sequence, change):
+    entries = (replace(entry, T_world_cam=change(entry.T_world_cam)) for entry in sequence.entries)
+    return replace(sequence, entries=tuple(entries))
+
+
+def late(sequence, frames):
+    T = [entry.T_world_cam for entry in sequence.entries]
+    delayed = (replace(e, T_world_cam=T[max(i - frames, 0)]) for i, e in enumerate(sequence.entries))
+    return replace(sequence, entries=tuple(delayed))
+
+
+def of_size(sequence, factor):
+    """Intrinsics for images ``factor`` times as large; raises ValueError as opening such a sequence does."""
+    K = sequence.intrinsics * np.array([[factor], [factor], [1]])
+    check_intrinsics("intrinsics", K, sequence.image_size)
+    return replace(sequence, intrinsics=K)
+
+
+def same(x):
+    return x
+
+
+# By name: the sequence that is made of a right one, its depth, and the words in which it is named.
+MISTAKES = {
+    "world-to-camera poses": (lambda s: posed(s, np.linalg.inv), same, "poses look|images belong together under no"),
+    "OpenGL axes": (lambda s: posed(s, lambda T: T @ OPENGL), same, "poses look|images belong together under no"),
+    "poses in millimetres": (lambda s: posed(s, lambda T: scaled(T, 1000)), same, "not in metres"),
+    "poses 20 times too large": (lambda s: posed(s, lambda T: scaled(T, 20)), same, "not in metres"),
+    "K of images 1.5 times as large": (lambda s: of_size(s, 1.5), same, "given for images 1.[2-8] times"),
+    "K of images .7 times as large": (lambda s: of_size(s, 0.7), same, "given for images 0.[5-8]"),
+    "K of images twice as large": (lambda s: of_size(s, 2), same, "another image size"),
+    "K of 224 px for 640": (lambda s: of_size(s, 0.35), same, "another image size"),
+    "K normalised": (lambda s: of_size(s, 1 / s.image_size[1]), same, "another image size"),
+    "trajectory 1 frame late": (lambda s: late(s, 1), same, "1 frame late"),
+    "trajectory 2 frames late": (lambda s: late(s, 2), same, "2 frames late"),
+    "trajectory 3 frames late": (lambda s: late(s, 3), same, "3 frames late"),
+    "depth in millimetres": (same, lambda d: 1000 * d, "not in metres"),
+    "inverse depth": (same, lambda d: 1 / np.maximum(d, 1e-3) * (d > 0), "is it inverse depth"),
+}
+# On tours, of which some move so evenly that poses of another frame fit as well; of six.
+LATE = {"trajectory 1 frame late": 2, "trajectory 2 frames late": 3, "trajectory 3 frames late": 4}
+
+
+@cache
+def followed(name):
+    """A sequence, corners in it, and its depth at them."""
+    sequence = open_sequence(name if name.startswith("tour:") else require_shared(f"data/{name}"))
+    corners = track_corners(sequence)
+    depth = {}
+    for one in corners:
+        u, v = np.rint(one.start).astype(int).T
+        depth[one.first, len(u)] = sequence[one.first].depth[v, u]
+    return sequence, corners, depth
+
+
+def problems(name, change=same, spoil=same):
+    """What is said of a sequence with changed poses or intrinsics and spoilt depth."""
+    sequence, corners, depth = followed(name)
+    try:
+        sequence = change(sequence)
+    except ValueError as error:
+        return str(error)
+    fit = image_fit(sequence, corners)
+    if fit.problem:
+        return fit.problem
+    depths = depth_fit(sequence, corners, lambda index, pixel: spoil(depth[index, len(pixel)]))
+    return "" if depths is None else depths.problem
+
+
+@pytest.mark.parametrize("name", [*RECORDINGS, *(pytest.param(tour, marks=pytest.mark.slow) for tour in TOURS)])
+def test_right_input_raises_no_alarm(name):
+    assert problems(name) == ""
+
+
+@pytest.mark.parametrize("name", [RECORDINGS[0], pytest.param(TOURS[0], marks=pytest.mark.slow)])
+def test_each_mistake_is_named(name):
+    missed = [
+        m for m, (change, spoil, words) in MISTAKES.items() if not re.search(words, problems(name, change, spoil))
+    ]
+    assert [one for one in missed if name == RECORDINGS[0] or one not in LATE] == []
+
+
+def rigid(R, t):
+    """[4, 4] of a rotation and a position."""
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = R, t
+    return out
+
+
+def noisy(T, rng, degrees):
+    """The pose turned about a random axis."""
+    turn = Rotation.from_rotvec(np.radians(degrees) * rng.normal(size=3)).as_matrix()
+    return rigid(T[:3, :3] @ turn, T[:3, 3])
+
+
+def wxyz(T):
+    """The pose whose quaternion was read in the other order."""
+    return rigid(Rotation.from_quat(np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), 1)).as_matrix(), T[:3, 3])
+
+
+CORRUPTED = {
+    "shuffled": lambda poses, rng: rng.permutation(poses),
+    "of the other direction": lambda poses, rng: poses[::-1],
+    "turned by 3 degrees": lambda poses, rng: [noisy(T, rng, 3) for T in poses],
+    "quaternions of another order": lambda poses, rng: [wxyz(T) for T in poses],
+    "transposed rotations": lambda poses, rng: [rigid(T[:3, :3].T, T[:3, 3]) for T in poses],
+}
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 10))])
+@pytest.mark.parametrize("kind", CORRUPTED)
+def test_corrupted_poses_are_named(kind, seed):
+    def change(sequence):
+        poses = np.array([entry.T_world_cam for entry in sequence.entries])
+        poses = CORRUPTED[kind](poses, np.random.default_rng(seed))
+        spoilt = (replace(e, T_world_cam=np.array(T)) for e, T in zip(sequence.entries, poses, strict=True))
+        return replace(sequence, entries=tuple(spoilt))
+
+    for name in RECORDINGS:
+        assert "poses disagree with the images" in problems(name, change), name
+
+
+@pytest.mark.slow
+def test_in_how_many_clips_each_mistake_is_named():
+    """The table of docs/results/mistakes.md (``-s`` prints it)."""
+    for mistake, (change, spoil, words) in {"none": (same, same, "."), **MISTAKES}.items():
+        found = [sum(bool(re.search(words, problems(n, change, spoil))) for n in part) for part in (RECORDINGS, TOURS)]
+        print(f"| {mistake} | {found[0]} of {len(RECORDINGS)} | {found[1]} of {len(TOURS)} |")
+        if mistake == "none":
+            assert found == [0, 0]
+        else:
+            assert found[0] == len(RECORDINGS), mistake
+            assert found[1] >= LATE.get(mistake, len(TOURS)), mistake
+
+
+def test_images_of_another_range_are_refused():
+    with pytest.raises(ValueError, match=r"must lie in \[0, 1\], got \[0, 255\]"):
+        Preprocess(size=(24, 32))(torch.linspace(0, 255, 3 * 48 * 64).reshape(1, 3, 48, 64), torch.tensor(K))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import copy
-import io
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,7 +18,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from walks import SPGF, run
 
-from ufmstar_torch import AnchorConfig, MergeConfig, PosteriorConfig, SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, MergeConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.fuse import make_room
 from ufmstar_torch.mixture import GaussianMixture
 
@@ -28,32 +28,23 @@ pytestmark = pytest.mark.numerics
 @pytest.mark.parametrize("cut", [1, 4])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["depth32", "depth64"])
 @pytest.mark.parametrize("own", [torch.float32, torch.float64], ids=["state32", "state64"])
-def test_saved_state_continues_bit_for_bit(cut, dtype, own):
+def test_saved_state_continues_bit_for_bit(tmp_path, cut, dtype, own):
     whole = UfMStar(CONFIG.replace(initial_capacity=4), dtype=own)
     expected = [whole(*frame(i, dtype)).variance for i in range(8)]
     assert {e.dtype for e in expected} == {dtype}
     first = UfMStar(CONFIG.replace(initial_capacity=4), dtype=own)
     for i in range(cut):
         first(*frame(i, dtype))
-    file = io.BytesIO()
-    torch.save(first.state_dict(), file)
-    file.seek(0)
     second = UfMStar(CONFIG.replace(initial_capacity=4), dtype=own)
-    second.load_state_dict(torch.load(file, weights_only=True))
+    if cut == 1:
+        safetensors.torch.save_file(first.state_dict(), tmp_path / "state.safetensors")
+        second.load_state_dict(safetensors.torch.load_file(tmp_path / "state.safetensors"))
+    else:
+        torch.save(first.state_dict(), tmp_path / "state.pt")
+        second.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
     for i in range(cut, 8):
         assert same(second(*frame(i, dtype)).variance, expected[i])
     assert unchanged(second, whole.state_dict())
-
-
-def test_state_survives_safetensors(tmp_path):
-    from safetensors.torch import load_file, save_file
-
-    ufm = UfMStar(CONFIG)
-    ufm(*frame(0))
-    save_file(ufm.state_dict(), tmp_path / "state.safetensors")
-    other = UfMStar(CONFIG)
-    other.load_state_dict(load_file(tmp_path / "state.safetensors"))
-    assert same(other(*frame(1)).variance, ufm(*frame(1)).variance)
 
 
 def test_loading_into_another_config_warns():
@@ -263,10 +254,6 @@ def test_reset_of_one_stream(streams):
     assert same(out.variance[1], alone.variance[0])
     assert ufm.frames.tolist() == [3, 1, 3]
     assert (out.disagreement[0][out.valid[0]] > 0).any()
-    with pytest.raises(IndexError):
-        ufm.reset([7])
-    with pytest.raises(ValueError, match="mask"):
-        ufm.reset(torch.tensor([True, False]))
 
 
 def test_growth_by_doubling_keeps_everything():
@@ -323,24 +310,27 @@ def test_of_equally_far_components_the_oldest_is_dropped_and_sums_follow():
         assert int(room.dropped) == dropped
 
 
-def test_mean_uncertainty():
-    dense, sampled, all_of_it = UfMStar(CONFIG), UfMStar(CONFIG), UfMStar(CONFIG)
-    inside = 0
+@pytest.mark.parametrize("average", [False, True], ids=["of the frame", "with the moving average"])
+def test_mean_uncertainty(average):
+    dense, sampled, all_of_it = (UfMStar(CONFIG) for _ in range(3))
     for i in range(8):
         depth, pose, intrinsics = frame(i, torch.float64)
         a = torch.full_like(depth, 0.01)
-        no_average = dense.config.replace(ema_alpha=1.0)
-        dense.config = no_average
+        if not average:
+            dense.config = dense.config.replace(ema_alpha=1.0)
         out = dense(depth, pose, intrinsics, a)
         truth = out.variance[out.valid].mean().item()
-        exact = all_of_it.mean_uncertainty(depth, pose, intrinsics, a, fraction=1.0)
-        assert exact.mean.item() == pytest.approx(truth, rel=1e-6)
+        exact = all_of_it.mean_uncertainty(depth, pose, intrinsics, a, fraction=1.0, average=average)
+        assert exact.mean.item() == pytest.approx(truth, rel=1e-5)
         assert exact.pixels.item() == out.valid.sum().item()
-        estimate = sampled.mean_uncertainty(depth, pose, intrinsics, a, pixels=200, seed=i)
-        assert estimate.pixels.item() == 200
-        inside += abs(estimate.mean.item() - truth) <= 3 * estimate.standard_error.item() + 1e-12
-    assert inside == 8
-    assert unchanged(sampled, all_of_it.state_dict())  # the state does not depend on where it is read
+        if not average:
+            estimate = sampled.mean_uncertainty(depth, pose, intrinsics, a, pixels=200, seed=i)
+            assert estimate.pixels.item() == 200
+            assert abs(estimate.mean.item() - truth) <= 3 * estimate.standard_error.item() + 1e-12
+    if not average:
+        assert unchanged(sampled, all_of_it.state_dict())  # the state does not depend on where it is read
+        other = sampled.mean_uncertainty(depth, pose, intrinsics, a, pixels=200, seed=i + 1)
+        assert not torch.equal(other.mean, estimate.mean)
 
 
 def test_the_standard_error_is_of_pixels_drawn_without_replacement():
@@ -358,15 +348,6 @@ def test_mean_uncertainty_is_seeded_and_checked():
 
     assert torch.equal(mean(pixels=50, seed=3), mean(pixels=50, seed=3))
     assert not torch.equal(mean(pixels=50, seed=3), mean(pixels=50, seed=4))
-    for bad in (
-        {"pixels": 0},
-        {"pixels": H * W + 1},
-        {"fraction": 0.0},
-        {"fraction": 1.5},
-        {"pixels": 5, "fraction": 0.5},
-    ):
-        with pytest.raises(ValueError, match=r"pixels|fraction"):
-            mean(**bad)
 
 
 def test_mean_uncertainty_with_the_moving_average_on_request():
@@ -391,13 +372,6 @@ def test_query_is_the_dense_map_at_its_own_points():
         result.disagreement.view(1, H, W), out.disagreement, rtol=1e-6, atol=1e-9, equal_nan=True
     )
     assert unchanged(ufm, before)
-    for bad in (torch.zeros(2, 5, 3), torch.zeros(5, 3), torch.zeros(1, 5, 2)):
-        with pytest.raises(ValueError, match="points"):
-            ufm.query(bad)
-    with pytest.raises(ValueError, match="frame"):
-        ufm.query(points, frame="camera")
-    with pytest.raises(ValueError, match="first"):
-        UfMStar().query(points)
 
 
 class Transfers(TorchDispatchMode):
@@ -435,35 +409,6 @@ def test_nothing_waits_for_the_accelerator(given):
     assert transfers.waits == []
     assert out.variance.shape == (1, 2, 6)
     assert out.variance.device.type == "cuda"
-
-
-# ---- config ----
-
-
-def test_config_rejects_unknown_keys_and_impossible_values():
-    for changes in (
-        {"eta": 0.0}, {"eta": 1.5}, {"eta_occlusion": -1.0}, {"prior_weight": 0.0}, {"ema_alpha": 0.0},
-        {"regression": "rtree"}, {"backend": "cuda"}, {"max_components": 0}, {"variance_floor": float("nan")},
-        {"near_radius": 0.6}, {"add_aleatoric": 1}, {"features": 1.5}, {"initial_capacity": True}, {"segment": 3},
-        {"segment": None}, {"merge": 1.0}, {"posterior": PosteriorConfig()},
-    ):  # fmt: skip
-        with pytest.raises(ValueError, match=next(iter(changes))):
-            UfMStarConfig(**changes)
-    with pytest.raises(ValueError, match="eta_oclusion"):
-        UfMStarConfig.from_dict({"eta_oclusion": 0.7})
-    with pytest.raises(ValueError, match="min_pixel"):
-        UfMStarConfig.from_dict({"segment": {"min_pixel": 7}})
-    for name, said in {"merge": "merge", "merge.los": "los", "eta.low": "eta", "mergers.loss": "mergers"}.items():
-        with pytest.raises(ValueError, match=said):
-            UfMStarConfig().with_values({name: 0.5})
-    with pytest.raises(ValueError, match="noise_floor"):
-        SPGFConfig(noise_floor=0.5)
-    with pytest.raises(Exception, match=r"frozen|assign"):
-        UfMStarConfig().eta = 0.3
-    with pytest.raises(TypeError, match="UfMStarConfig"):
-        UfMStar({"eta": 0.5})
-    with pytest.raises(ValueError, match="dtype"):
-        UfMStar(dtype=torch.float16)
 
 
 def test_config_round_trips_through_json():

@@ -1,81 +1,170 @@
-"""Bad input of UfMStar: an error that names the argument, or a counted skip; the state stays whole."""
+"""Bad input of the core: an error that names the argument, or a counted skip; the state stays whole."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from modules import CONFIG, POSES, H, K, W, frame, same, snapshot, unchanged
+from modules import CONFIG, POSES, SPGF, H, K, W, frame, same, snapshot, unchanged
+from torch import Tensor
 
 import scenes
-from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch import PosteriorConfig, SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.gaussian import barycenter
+from ufmstar_torch.segment import spgf
 
 pytestmark = pytest.mark.numerics
 
-
-def break_pose(pose, how):
-    pose = pose.clone()
-    if how == "nan":
-        pose[0, 0, 3] = torch.nan
-    elif how == "inf":
-        pose[0, 1, 1] = -torch.inf
-    elif how == "scaled":
-        pose[0, :3, :3] *= 1.05
-    elif how == "sheared":
-        pose[0, 0, 1] += 0.2
-    elif how == "mirrored":
-        pose[0, :3, 0] *= -1
-    elif how == "row":
-        pose[0, 3] = torch.tensor([0.0, 0, 0, 2])
-    return pose
+INF, NAN = torch.inf, torch.nan
+DEPTH, POSE, CAMERA = frame(0)
+D, K1 = torch.ones(2, 5, 6), torch.tensor([[5.0, 0, 3], [0, 5, 2], [0, 0, 1]]).expand(2, 3, 3)
 
 
-@pytest.mark.parametrize(
-    ("how", "message"),
-    [
-        ("nan", "stream 0: pose holds NaN"),
-        ("inf", "stream 0: pose holds NaN"),
-        ("scaled", "not orthonormal"),
-        ("sheared", "not orthonormal"),
-        ("mirrored", "reflection"),
-        ("row", "last row"),
-    ],
-)
-def test_bad_poses_raise_and_leave_the_state(how, message):
-    ufm, twin = UfMStar(CONFIG), UfMStar(CONFIG)
+def begun() -> UfMStar:
+    """A module with a frame."""
+    ufm = UfMStar(CONFIG)
+    ufm(*frame(0))
+    return ufm
+
+
+def mean(**options) -> object:
+    return begun().mean_uncertainty(*frame(1), **options)
+
+
+settings, segment = UfMStarConfig.from_dict, SPGFConfig.from_dict
+# Of arguments that are no frame's: those are in test_core_arguments.py.
+REFUSALS: list[tuple[Callable[[], object], str]] = [
+    (lambda: begun().reset([7]), "7"),
+    (lambda: begun().reset(torch.tensor([True, False])), "mask"),
+    (lambda: begun().query(torch.zeros(2, 5, 3)), "points"),
+    (lambda: begun().query(torch.zeros(5, 3)), "points"),
+    (lambda: begun().query(torch.zeros(1, 5, 2)), "points"),
+    (lambda: begun().query(torch.zeros(1, 5, 3), frame="camera"), "frame"),
+    (lambda: UfMStar().query(torch.zeros(1, 5, 3)), "first"),
+    (lambda: mean(pixels=0), "pixels"),
+    (lambda: mean(pixels=H * W + 1), "pixels"),
+    (lambda: mean(fraction=0.0), "fraction"),
+    (lambda: mean(fraction=1.5), "fraction"),
+    (lambda: mean(pixels=5, fraction=0.5), "pixels or fraction"),
+    (lambda: UfMStar().warm_up((0, 4)), "size and streams must be positive"),
+    (lambda: settings({"eta": 0.0}), "eta"),
+    (lambda: settings({"eta": 1.5}), "eta"),
+    (lambda: settings({"eta_occlusion": -1.0}), "eta_occlusion"),
+    (lambda: settings({"prior_weight": 0.0}), "prior_weight"),
+    (lambda: settings({"ema_alpha": 0.0}), "ema_alpha"),
+    (lambda: settings({"regression": "rtree"}), "regression"),
+    (lambda: settings({"backend": "cuda"}), "backend"),
+    (lambda: settings({"max_components": 0}), "max_components"),
+    (lambda: settings({"variance_floor": NAN}), "variance_floor"),
+    (lambda: settings({"near_radius": 0.6}), "near_radius"),
+    (lambda: settings({"add_aleatoric": 1}), "add_aleatoric"),
+    (lambda: settings({"features": 1.5}), "features"),
+    (lambda: settings({"initial_capacity": True}), "initial_capacity"),
+    (lambda: settings({"eta_oclusion": 0.7}), "eta_oclusion"),
+    (lambda: settings({"segment": {"min_pixel": 7}}), "min_pixel"),
+    (lambda: UfMStarConfig(segment=None), "segment"),  # type: ignore[arg-type]
+    (lambda: UfMStarConfig(merge=1.0), "merge"),  # type: ignore[arg-type]
+    (lambda: UfMStarConfig(posterior=PosteriorConfig()), "posterior"),
+    (lambda: UfMStarConfig().with_values({"merge": 0.5}), "merge"),
+    (lambda: UfMStarConfig().with_values({"merge.los": 0.5}), "los"),
+    (lambda: UfMStarConfig().with_values({"eta.low": 0.5}), "eta"),
+    (lambda: UfMStarConfig().with_values({"mergers.loss": 0.5}), "mergers"),
+    (lambda: setattr(UfMStarConfig(), "eta", 0.3), "assign"),
+    (lambda: segment({"noise_floor": 0.5}), "noise_floor"),
+    (lambda: SPGFConfig.preset("kitti"), "tum, tartanair_indoor, tartanair_outdoor, got 'kitti'"),
+    (lambda: spgf(D.numpy(), K1), "depth must be a torch.Tensor"),  # type: ignore[arg-type]
+    (lambda: spgf(D.long(), K1), "depth must have a floating-point dtype"),
+    (lambda: spgf(D[0], K1), r"depth must be \[B, H, W\]"),
+    (lambda: spgf(D[:0], K1[:0]), r"depth must be \[B, H, W\] with no empty dimension"),
+    (lambda: spgf(D, K1[:1]), r"intrinsics must have shape \(2, 3, 3\)"),
+    (lambda: spgf(D, torch.ones(2, 4, 4)), r"intrinsics must have shape \(2, 3, 3\)"),
+    (lambda: spgf(D, K1.int()), "intrinsics must have a floating-point dtype"),
+    (lambda: spgf(D, K1 * NAN), "intrinsics must be finite with fx, fy > 0"),
+    (lambda: spgf(D, -K1), "intrinsics must be finite with fx, fy > 0"),
+    (lambda: spgf(D, K1.to("meta")), "intrinsics must lie on the depth's device cpu"),
+    (lambda: spgf(D, K1, variance=D[:, :4]), r"variance must have shape \(2, 5, 6\)"),
+    (lambda: spgf(D, K1, variance=D.int()), "variance must have a floating-point"),
+    (lambda: spgf(D, K1, valid=D), "valid must be a torch.bool tensor"),
+    (lambda: spgf(D, K1, valid=D[:1] > 0), r"valid must have shape \(2, 5, 6\)"),
+    (lambda: spgf(D, K1, valid=(D > 0).to("meta")), "valid must lie on the depth's device"),
+    (lambda: spgf(D, K1, features=D), r"features must have shape \(2, -1, 5, 6\)"),
+    (lambda: spgf(D, K1, {}), "config must be an SPGFConfig"),  # type: ignore[arg-type]
+    (lambda: spgf(D, K1, SPGFConfig(min_gaussian_length=1e-6)), "config.min_gaussian_length = 1e-06 m"),
+    (lambda: spgf(D, K1, compute_dtype=torch.float16), "compute_dtype .* got torch.float16"),
+    (lambda: resize_intrinsics(K1, (0, 4), (5, 6)), "positive sizes"),
+    (lambda: barycenter(torch.zeros(2, 3), torch.eye(3).expand(2, 3, 3), -torch.ones(2)), "weight must be non-neg"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), REFUSALS, ids=range(len(REFUSALS)))
+def test_it_is_refused_and_named(call, message):
+    with pytest.raises((ValueError, TypeError, IndexError, AttributeError), match=message):
+        call()
+
+
+def edited(matrix: Tensor, at: tuple[int, int], value: float) -> Tensor:
+    matrix = matrix.clone()
+    matrix[(..., *at)] = value
+    return matrix
+
+
+# The camera of a frame, made wrong, and what is said.
+FAULTS: dict[str, tuple[Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], str]] = {
+    "NaN": (lambda T, K: (edited(T, (0, 3), NAN), K), "stream 0: pose holds NaN"),
+    "infinite": (lambda T, K: (edited(T, (1, 1), -INF), K), "stream 0: pose holds NaN"),
+    "scaled": (lambda T, K: (T * torch.tensor([[1.05], [1.05], [1.05], [1]]), K), "not orthonormal"),
+    "sheared": (lambda T, K: (T + edited(torch.zeros(4, 4), (0, 1), 0.2), K), "not orthonormal"),
+    "mirrored": (lambda T, K: (T * torch.tensor([-1.0, 1, 1, 1]), K), "reflection"),
+    "last row": (lambda T, K: (edited(T, (3, 3), 2.0), K), "last row"),
+    "far away": (lambda T, K: (edited(T, (0, 3), 1e12), K), "farther from the origin than 1e9 m"),
+    "K NaN": (lambda T, K: (T, edited(K, (0, 0), NAN)), "intrinsics hold NaN"),
+    "K negative": (lambda T, K: (T, edited(K, (1, 1), -100.0)), "intrinsics are not .* fx, fy > 0"),
+    "K zero": (lambda T, K: (T, edited(K, (1, 1), 0.0)), "intrinsics are not .* fx, fy > 0"),
+    "K homogeneous": (lambda T, K: (T, edited(K, (2, 2), 2.0)), "intrinsics are not"),
+    "K skewed": (lambda T, K: (T, edited(K, (0, 1), 3.0)), "intrinsics are not"),
+    "K too long": (lambda T, K: (T, edited(K, (0, 0), 1e100)), "focal length"),
+    "K too short": (lambda T, K: (T, edited(K, (1, 1), 1e-9)), "focal length"),
+    "K another image's": (
+        lambda T, K: (T, edited(K, (0, 2), 320.0)),
+        "principal point outside the depth map; expected the intrinsics of the depth map",
+    ),
+    "K above": (lambda T, K: (T, edited(K, (1, 2), -3.0)), "principal point outside the depth map"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_a_camera_at_fault_is_refused_or_skipped_and_the_state_stays(name, backend):
+    """Alone; and counted, beside a stream that goes on. A first frame at fault does not anchor its stream."""
+    spoil, message = FAULTS[name]
+    depth, pose, _ = frame(1)
+    config = CONFIG.replace(backend=backend)
+    bad_pose, bad_K = spoil(pose.double(), K[None].double())
+    ufm, twin = UfMStar(config), UfMStar(config)
     ufm(*frame(0)), twin(*frame(0))
     before = snapshot(ufm)
-    depth, pose, intrinsics = frame(1)
     with pytest.raises(ValueError, match=message):
-        ufm(depth, break_pose(pose, how), intrinsics)
+        ufm(depth, bad_pose, bad_K)
     assert unchanged(ufm, before)
-    assert same(ufm(*frame(2)).variance, twin(*frame(2)).variance)
-
-
-@pytest.mark.parametrize("how", ["nan", "inf", "scaled", "mirrored", "row"])
-def test_bad_poses_can_be_skipped_and_are_counted(how):
-    config = CONFIG.replace(on_bad_frame="skip")
-    ufm, single = UfMStar(config), UfMStar(config)
-    poses = [torch.cat([frame(i)[1]] * 2) for i in range(3)]
-    poses[1] = torch.cat([break_pose(frame(1)[1], how), frame(1)[1]])
-    outputs = [ufm(frame(i)[0].expand(2, H, W), poses[i], K) for i in range(3)]
-    assert outputs[1].statistics.fault.tolist()[0] > 0
-    assert outputs[1].statistics.fault.tolist()[1] == 0
-    assert outputs[1].variance[0].isnan().all()
-    assert outputs[1].variance[1].isfinite().any()
-    assert ufm.skipped.tolist() == [1, 0]
-    assert ufm.frames.tolist() == [2, 3]
-    single(*frame(0))
-    assert same(outputs[2].variance[0], single(*frame(2)).variance[0])
-
-
-def test_a_first_frame_at_fault_does_not_anchor_the_stream():
-    config = CONFIG.replace(on_bad_frame="skip")
-    ufm, clean = UfMStar(config), UfMStar(config)
-    ufm(frame(0)[0], break_pose(frame(0)[1], "nan"), K)
-    assert not ufm.started.item()
-    assert same(ufm(*frame(1)).variance, clean(*frame(1)).variance)
+    expected = twin(*frame(2)).variance
+    assert same(ufm(*frame(2)).variance, expected)
+    both = UfMStar(config.replace(on_bad_frame="skip"))
+    both(*(torch.cat([value] * 2) for value in frame(0)))
+    poses, cameras = torch.cat([bad_pose, pose]), torch.cat([bad_K, K[None]])
+    out = both(depth.expand(2, H, W), poses, cameras)
+    assert (out.statistics.fault > 0).tolist() == [True, False]
+    assert out.variance[0].isnan().all()
+    assert out.variance[1].isfinite().any()
+    last = both(*(torch.cat([value] * 2) for value in frame(2)))
+    assert same(last.variance[0], expected[0])
+    assert (both.skipped.tolist(), both.frames.tolist()) == ([1, 0], [2, 3])
+    late, clean = UfMStar(config.replace(on_bad_frame="skip")), UfMStar(config)
+    late(depth, bad_pose, bad_K)
+    assert not late.started.item()
+    assert same(late(*frame(1)).variance, clean(*frame(1)).variance)
 
 
 def test_slightly_skewed_rotations_are_projected_and_reported():
@@ -90,53 +179,34 @@ def test_slightly_skewed_rotations_are_projected_and_reported():
         assert b.statistics.rotation_deviation.item() == pytest.approx(1 - 0.9995 ** (2 / 3), rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        [[100.0, 0, 20], [0, -100, 15], [0, 0, 1]],
-        [[torch.nan, 0, 20], [0, 100, 15], [0, 0, 1]],
-        [[100.0, 0, 20], [0, 0, 15], [0, 0, 1]],
-        [[100.0, 0, 20], [0, 100, 15], [0, 0, 2]],
-        [[100.0, 3, 20], [0, 100, 15], [0, 0, 1]],
-    ],
-)
-def test_bad_intrinsics(bad):
-    depth, pose, _ = frame(0)
-    with pytest.raises(ValueError, match="intrinsics"):
-        UfMStar(CONFIG)(depth, pose, torch.tensor(bad))
-
-
 def test_bad_pixels_are_left_out_and_counted():
-    depth, pose, intrinsics = frame(0)
-    depth = depth.nan_to_num(2.0)
+    depth = DEPTH.nan_to_num(2.0)
     a = torch.full_like(depth, 0.1)
-    depth[0, 0, :4] = torch.tensor([torch.nan, torch.inf, 0.0, -1.0])
-    a[0, 1, :3] = torch.tensor([torch.nan, -0.1, torch.inf])
+    depth[0, 0, :4] = torch.tensor([NAN, INF, 0.0, -1.0])
+    a[0, 1, :3] = torch.tensor([NAN, -0.1, INF])
     valid = torch.ones_like(depth, dtype=torch.bool)
     valid[0, 2, :2] = False
-    out = UfMStar(CONFIG)(depth, pose, intrinsics, aleatoric=a, valid=valid)
+    out = UfMStar(CONFIG)(depth, POSE, CAMERA, aleatoric=a, valid=valid)
     assert out.statistics.valid_pixels.item() == H * W - 9
     assert torch.equal(out.variance.isnan(), ~out.valid)
 
 
 def test_all_invalid_depth_is_a_frame_without_segments():
-    ufm, twin = UfMStar(CONFIG), UfMStar(CONFIG)
-    ufm(*frame(0)), twin(*frame(0))
+    ufm, twin = begun(), begun()
     depth, pose, intrinsics = frame(1)
-    out = ufm(torch.full_like(depth, torch.nan), pose, intrinsics)
+    out = ufm(torch.full_like(depth, NAN), pose, intrinsics)
     assert out.variance.isnan().all()
     assert out.statistics.segments.item() == 0
     assert same(ufm(*frame(2)).variance, twin(*frame(2)).variance)
 
 
 def test_one_pixel_image():
-    ufm = UfMStar(UfMStarConfig(segment=SPGFConfig(prune="none", sparse=0, scale_with_image=False)))
-    for _ in range(2):
-        out = ufm(torch.full((1, 1, 1), 2.0), torch.eye(4), torch.eye(3))
-        assert out.variance.shape == (1, 1, 1)
-        assert out.variance.isfinite().all()
-        plain = UfMStar()(torch.full((1, 1, 1), 2.0), torch.eye(4), torch.eye(3))
-        assert plain.variance.isfinite().all()
+    for config in (UfMStarConfig(segment=replace(SPGF, prune="none", sparse=0)), UfMStarConfig()):
+        ufm = UfMStar(config)
+        for _ in range(2):
+            out = ufm(torch.full((1, 1, 1), 2.0), torch.eye(4), torch.eye(3))
+            assert out.variance.shape == (1, 1, 1)
+            assert out.variance.isfinite().all()
 
 
 def test_intrinsics_and_size_may_change_in_the_middle():
@@ -149,25 +219,3 @@ def test_intrinsics_and_size_may_change_in_the_middle():
     assert out.variance.shape == depth.shape
     assert out.statistics.matched.item() > 0
     assert ufm.smoothed.shape == depth.shape
-
-
-@given(st.data())
-@settings(max_examples=25)
-def test_any_depth_map_gives_a_variance_or_nan(data):
-    """Whatever lies in a depth map: finite non-negative variance where valid, NaN elsewhere, no crash."""
-    values = st.one_of(
-        st.floats(0.0625, 30, width=32),
-        st.sampled_from([0.0, -1.0, float("nan"), float("inf"), -float("inf"), 1e-30, 1e30, 20.0]),
-    )
-    height, width = data.draw(st.integers(1, 9)), data.draw(st.integers(1, 9))
-    ufm = UfMStar(UfMStarConfig(segment=SPGFConfig(prune="none", sparse=0, scale_with_image=False)))
-    for i in range(3):
-        cells = data.draw(st.lists(values, min_size=height * width, max_size=height * width))
-        depth = torch.tensor(cells, dtype=torch.float32).view(1, height, width)
-        pose = torch.tensor(scenes.look((0.05 * i, 0, 0), 0.02 * i))
-        out = ufm(depth, pose, torch.tensor(scenes.intrinsics(height, width)))
-        expected = (depth >= 1e-6) & (depth <= 20)  # the accepted range and segment.max_depth
-        assert torch.equal(out.valid, expected)
-        assert torch.equal(out.variance.isnan(), ~expected)
-        assert (out.variance[expected] >= 0).all()
-        assert out.variance[expected].isfinite().all()

@@ -66,9 +66,6 @@ def classifier_weights(layers: int = 18, seed: int = 1) -> dict[str, Tensor]:
     return {name: value.clone() for name, value in random_classifier(layers, seed).items()}
 
 
-# --- the network -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("layers", "encoder", "total"), [(18, 11_176_512, 14.3e6), (50, 23_508_032, 32.5e6)])
 def test_sizes_are_monodepth2s(layers: int, encoder: int, total: float) -> None:
     """ResNets without classifier, and the totals that the literature states for Monodepth2."""
@@ -129,9 +126,6 @@ def write_published(folder: Path, encoder: dict[str, Any], decoder: dict[str, Te
     torch.save({f"encoder.{k}": v for k, v in encoder.items()} | extra, folder / "encoder.pth")
     torch.save(decoder, folder / "depth.pth")
     return folder / "encoder.pth", folder / "depth.pth"
-
-
-# --- published Monodepth2 weights --------------------------------------------------------------------
 
 
 def test_published_weights_are_taken(tmp_path: Path) -> None:
@@ -205,9 +199,6 @@ def test_nothing_that_fits_is_an_error(tmp_path: Path) -> None:
         load_monodepth2(network, tmp_path / "none.pth", depth)
 
 
-# --- ImageNet ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
 @pytest.mark.parametrize("half", [False, True])
 def test_imagenet_from_a_file(tmp_path: Path, suffix: str, half: bool) -> None:
@@ -229,15 +220,6 @@ def test_imagenet_from_a_file(tmp_path: Path, suffix: str, half: bool) -> None:
         torch.testing.assert_close(network.encoder(image)[-1].flatten(1), published(image))
 
 
-def test_torchvision_has_those_weights() -> None:
-    """The real enum offers what the code above asks for; nothing is downloaded."""
-    import torchvision.models
-
-    default = torchvision.models.get_model_weights("resnet50").DEFAULT
-    assert default.url.startswith("https://")
-    assert callable(default.get_state_dict)
-
-
 def test_imagenet_counts_every_tensor(tmp_path: Path) -> None:
     weights = classifier_weights()
 
@@ -246,15 +228,8 @@ def test_imagenet_counts_every_tensor(tmp_path: Path) -> None:
         return MonodepthResNet.imagenet(tmp_path / "w.pth", layers, decoder=SMALL)
 
     load({k: v for k, v in weights.items() if not k.endswith("num_batches_tracked")})  # as old files are
-    for key, value, fault in (
-        ("layer1.0.bn1.bias", None, "missing"),
-        ("extra", torch.zeros(1), "unexpected"),
-        ("conv1.weight", torch.zeros(64, 3, 3), "of another shape"),
-        ("layer3.0.conv1.weight", weights["layer3.0.conv1.weight"] * float("nan"), "with NaN or infinity"),
-    ):
-        changed = {k: v for k, v in weights.items() if k != key} | ({} if value is None else {key: value})
-        with pytest.raises(CheckpointError, match=rf"w.pth does not fit ResNetEncoder \(120 keys\): 1 {fault}: {key}"):
-            load(changed)
+    with pytest.raises(CheckpointError, match=r"w.pth does not fit ResNetEncoder \(120 keys\): 1 unexpected: extra"):
+        load(weights | {"extra": torch.zeros(1)})
     with pytest.raises(CheckpointError, match="does not fit ResNetEncoder"):
         load(weights, 34)
 
@@ -290,9 +265,6 @@ def test_v1_strides_move_to_the_first_convolution() -> None:
     image = torch.randn(1, 3, 64, 64, generator=seeded())
     with torch.inference_mode():  # no bottlenecks, no difference
         assert torch.equal(v1(image).depth, v15(image).depth)
-
-
-# --- in company --------------------------------------------------------------------------------------
 
 
 def test_load_network(tmp_path: Path) -> None:

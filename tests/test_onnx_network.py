@@ -19,7 +19,7 @@ from torch import Tensor
 from ufmstar_torch.models import FastDepth, OnnxNetwork, OnnxSpec, OutputSpec, Preprocess
 from ufmstar_torch.models.onnx_network import load_onnx
 
-METRIC = OutputSpec("metric")
+METRIC, NAMED = OutputSpec("metric"), OutputSpec("metric", "depth")
 COEFFICIENTS = (0.5, 0.25, 2.0)  # depth = .5 R + .25 G + 2 B
 
 
@@ -198,27 +198,26 @@ def test_copies_and_pickles(tmp_path: Path, image: Tensor) -> None:
         assert twin.preprocess == network.preprocess
 
 
-# --- refusals ----------------------------------------------------------------------------------------
+REFUSALS: dict[str, tuple[OnnxSpec, Tensor | None, str]] = {
+    "several outputs": (OnnxSpec(METRIC), None, r"outputs are \['depth', 'spread'\]; declare which one is depth"),
+    "no such output": (OnnxSpec(OutputSpec("metric", "depth", aleatoric="sigma")), None, r"it has no \['sigma'\]"),
+    "no such input": (OnnxSpec(NAMED, input="x"), None, r"only input; it has \['image'\]"),
+    "batch": (OnnxSpec(OutputSpec("metric", "depth")), torch.zeros(3, 3, 6, 8), "fixed batch of 2, .* got 3"),
+    "size": (OnnxSpec(OutputSpec("metric", "depth")), torch.zeros(2, 3, 8, 6), "fixed size of 6 x 8, got 8 x 6"),
+    "bytes": (
+        OnnxSpec(OutputSpec("metric", "depth")),
+        torch.zeros(2, 3, 6, 8).byte(),
+        "image must be .* got torch.uint8",
+    ),
+}
 
 
-def test_names_that_the_graph_does_not_have(tmp_path: Path) -> None:
-    path = write(tmp_path / "n.onnx", spread="spread")
-    with pytest.raises(ValueError, match=r"outputs are \['depth', 'spread'\]; declare which one is depth"):
-        OnnxNetwork(path, OnnxSpec(METRIC))
-    with pytest.raises(ValueError, match=r"outputs are \['depth', 'spread'\]; it has no \['sigma'\]"):
-        OnnxNetwork(path, OnnxSpec(OutputSpec("metric", "depth", aleatoric="sigma")))
-    with pytest.raises(ValueError, match=r"input 'x' must be the graph's only input; it has \['image'\]"):
-        OnnxNetwork(path, OnnxSpec(OutputSpec("metric", "depth"), input="x"))
-
-
-def test_images_that_do_not_fit(tmp_path: Path, image: Tensor) -> None:
-    network = OnnxNetwork(write(tmp_path / "n.onnx", [2, 3, 6, 8]), OnnxSpec(METRIC))
-    with pytest.raises(ValueError, match="fixed batch of 2, which must divide the number of images, got 3"):
-        network(image)
-    with pytest.raises(ValueError, match="input 'image' has a fixed size of 6 x 8, got 8 x 6"):
-        network(torch.zeros(2, 3, 8, 6))
-    with pytest.raises(ValueError, match=r"image must be floating-point \[B, 3, H, W\].*, got torch.uint8"):
-        network(torch.zeros(2, 3, 6, 8, dtype=torch.uint8))
+@pytest.mark.parametrize("name", REFUSALS)
+def test_names_and_images_that_do_not_fit(tmp_path: Path, name: str) -> None:
+    spec, image, message = REFUSALS[name]
+    path = write(tmp_path / "n.onnx", [2, 3, 6, 8], spread="spread")
+    with pytest.raises(ValueError, match=message):
+        OnnxNetwork(path, spec)(image)  # type: ignore[arg-type]
 
 
 def pooled(tmp_path: Path) -> Path:

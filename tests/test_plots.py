@@ -78,16 +78,26 @@ class TestContactSheet:
         # Every colour of both depth maps is in the picture, so both rows were drawn on the one scale.
         shown = {tuple(c) for c in picture.reshape(-1, 3).tolist()}
         for one in panels:
-            expected = {tuple(c) for c in scales.depth.rgb(one.maps["depth"]).reshape(-1, 3).tolist()}
+            expected = {tuple(c) for c in scales["depth"].rgb(one.maps["depth"]).reshape(-1, 3).tolist()}
             assert len(expected & shown) > 0.95 * len(expected)
 
     def test_sigma_and_error_share_a_scale(self, tmp_path: Path) -> None:
         one = panel()  # the error is twice sigma
         scales = fit_scales([one])
-        assert scales.length.low == 0
-        assert scales.length.high == pytest.approx(np.percentile(2 * one.maps["sigma"][4:], 99))
+        assert scales["length"].low == 0
+        assert scales["length"].high == pytest.approx(np.percentile(2 * one.maps["sigma"][4:], 99))
         labels = [(c.label, c.scale) for c in map_columns([one])]
-        assert labels[1:] == [(name, scales.length) for name in ("σ", "|error|")]
+        assert labels[1:] == [(name, scales["length"]) for name in ("σ", "|error|")]
+
+    def test_the_posterior_has_a_scale_of_its_own(self) -> None:
+        """Its sigma was black beside the network's errors."""
+        one = panel()
+        small = {name: one.maps[of] / 50 for name, of in (("posterior_sigma", "sigma"), ("posterior_error", "error"))}
+        both = FramePanel("a", one.image, {**one.maps, "posterior": one.maps["depth"], **small})
+        columns = {c.field: c for c in map_columns([both])}
+        assert columns["posterior_sigma"].scale == columns["posterior_error"].scale != columns["sigma"].scale
+        assert columns["sigma"].scale == fit_scales([one])["length"]
+        np.testing.assert_array_equal(columns["posterior_sigma"].rgb(both), columns["sigma"].rgb(both))
 
     def test_frames_without_a_pixel_and_names_like_formulas(self, tmp_path: Path) -> None:
         import matplotlib
@@ -124,7 +134,7 @@ class TestPreview:
         step = 240 // size[0]
         left = step * size[1] + 4  # behind the image and a gap
         cell = frame[22 : 22 + 240 : step, left : left + step * size[1] : step]
-        np.testing.assert_array_equal(cell, fit_scales([one]).depth.rgb(one.maps["depth"]))
+        np.testing.assert_array_equal(cell, fit_scales([one])["depth"].rgb(one.maps["depth"]))
 
     def test_video_reads_back(self, tmp_path: Path) -> None:
         import cv2

@@ -1,13 +1,13 @@
-"""Gaussian mixture regression: oracle, kernels, the bound of the culling, sampling, the moving average."""
+"""Gaussian mixture regression: every backend against oracle and reference, the bound of the culling, sampling."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from backends import make_backend
+from hypothesis import given
 from hypothesis import strategies as st
-from modules import same
 from numba import njit
 from random_gaussians import as_lists, mixture
 
@@ -18,13 +18,14 @@ from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels import regress_cpu
 from ufmstar_torch.kernels.vectors_cpu import vectors
-from ufmstar_torch.regress import distribute, regress, regress_image, sample_pixels, shares, smooth
+from ufmstar_torch.regress import regress, regress_image, sample_pixels, shares
 
 pytestmark = pytest.mark.numerics
 
 K = torch.tensor(scenes.intrinsics(40, 56))[None]
 EXACT = UfMStarConfig(prior_mean=0.3, prior_weight=2.0)
 NEAR = EXACT.replace(regression="neighbourhood")
+BOTH = pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])
 
 
 def rendered(seed: int = 0) -> torch.Tensor:
@@ -33,28 +34,35 @@ def rendered(seed: int = 0) -> torch.Tensor:
     return depth
 
 
-@pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])
+@BOTH
 @given(seed=st.integers(0, 10**6))
-@settings(max_examples=10)
-def test_agrees_with_the_oracle(config, seed):
-    m = mixture(2, 9, seed, features=2)
+def test_agrees_with_the_oracle(backend, config, seed):
+    """At the pixels of a noisy image, some near components, and at a subset of them."""
+    m, camera = mixture(2, 9, seed, features=2), torch.tensor(scenes.intrinsics(3, 5))
     generator = torch.Generator().manual_seed(seed)
-    points = torch.randn(2, 20, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 3.0])
-    points[:, :7] = m.mean[:, :7] + 0.02
-    result = regress(m, points, config)
+    depth = 1 + 4 * torch.rand(2, 3, 5, generator=generator, dtype=torch.float64)
+    points = unproject(depth, camera.expand(2, 3, 3)).flatten(1, 2)
+    m = m.replace(mean=torch.cat([points[:, :7] + 0.02, m.mean[:, 7:]], 1))
+    given_ = (m, depth, camera.expand(2, 3, 3), depth > 0, config)
+    result = backend.kernels.regress_image(*given_)
+    some = backend.kernels.regress_image(*given_, torch.tensor([[14, 3], [0, 9]]))
     neighbourhood = (2.0, 0.1, 0.5) if config is NEAR else None
     for b in range(2):
-        for p in range(20):
-            components, prior = oracle.prepared(as_lists(m, b)), {"prior_weight": 2.0, "prior_mean": 0.3}
-            value, features = oracle.regress_point(
-                points[b, p].numpy(), components, **prior, neighbourhood=neighbourhood
-            )
-            assert result.disagreement[b, p].item() == pytest.approx(value, rel=1e-9)
-            np.testing.assert_allclose(result.features[b, p].numpy(), features, rtol=1e-9, atol=1e-300)
+        components = oracle.prepared(as_lists(m, b))
+        expected = [
+            oracle.regress_point(x, components, prior_weight=2.0, prior_mean=0.3, neighbourhood=neighbourhood)
+            for x in points[b].numpy()
+        ]
+        values, features = (np.array(list(part)) for part in zip(*expected, strict=True))
+        np.testing.assert_allclose(result.disagreement[b].flatten(), values, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(result.features[b].flatten(0, 1), features, rtol=1e-9, atol=1e-12)
+        chosen = [[14, 3], [0, 9]][b]
+        np.testing.assert_allclose(some.disagreement[b], values[chosen], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(some.features[b], features[chosen], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])
-def test_shares_make_up_the_regression(config):
+@BOTH
+def test_shares_make_up_the_regression(backend, config):
     m = mixture(2, 9, 4, features=2)
     m = m.replace(weight=m.weight * (torch.arange(9) != 5))  # an empty slot
     points = torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
@@ -68,33 +76,44 @@ def test_shares_make_up_the_regression(config):
     torch.testing.assert_close(value, result.disagreement, rtol=1e-11, atol=0)
     torch.testing.assert_close(share @ m.features, result.features, rtol=1e-11, atol=1e-300)
     values = torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    torch.testing.assert_close(distribute(m, points, values, config), share.mT @ values, rtol=1e-12, atol=1e-12)
+    for points_at in (slice(None), slice(0, 11)):
+        summed = backend.kernels.distribute(m, points[:, points_at], values[:, points_at], config)
+        torch.testing.assert_close(summed, share[:, points_at].mT @ values[:, points_at], rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-11), (torch.float32, 5e-5)])
-def test_the_kernel_agrees_with_the_reference(config, dtype, tolerance):
-    m = mixture(2, 40, 3, features=2)
-    depth = torch.cat([rendered(0), rendered(3)])
-    reference = regress_image(m, depth, K.expand(2, 3, 3), depth > 0, config)
-    fast = regress_cpu.regress_image(m, depth.to(dtype), K.expand(2, 3, 3), depth > 0, config)
-    assert fast.disagreement.dtype == dtype
-    assert fast.disagreement.isnan().sum() == 2
-    # float32: what the exponent's argument, up to some 100, loses to rounding.
-    for a, b in ((fast.disagreement, reference.disagreement), (fast.features, reference.features)):
-        torch.testing.assert_close(a.double(), b, rtol=0, atol=tolerance, equal_nan=True)
-
-
-def crowded(seed: int):
-    """300 Gaussians about the surface of ``rendered(2)`` and behind the camera, many of them thin, and its depth."""
+def crowded(seed: int, count: int = 300, features: int = 0):
+    """Gaussians about the surface of ``rendered(2)`` and behind the camera, many of them thin, and its depth."""
     depth = rendered(2)
-    m = mixture(1, 300, seed, empty=3)
+    m = mixture(1, count, seed, empty=3, features=features)
     generator = torch.Generator().manual_seed(seed)
     surface = unproject(depth.nan_to_num(1.0), K).flatten(1, 2)
-    near = surface[:, torch.randint(surface.shape[1], (300,), generator=generator)]
-    sign = 1 - 2 * (torch.arange(300) % 10 == 0).double()[:, None]
-    scale = 10 ** (-3 * torch.rand(300, generator=generator, dtype=torch.float64))
+    near = surface[:, torch.randint(surface.shape[1], (count,), generator=generator)]
+    sign = 1 - 2 * (torch.arange(count) % 10 == 0).double()[:, None]
+    scale = 10 ** (-3 * torch.rand(count, generator=generator, dtype=torch.float64))
     return m.replace(mean=near * sign, covariance=m.covariance * scale[:, None, None]), depth
+
+
+@BOTH
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-4)])
+@pytest.mark.parametrize(("size", "features"), [((40, 56), 2), ((33, 41), 0), ((7, 3), 4)])
+def test_agrees_with_the_reference(compiled_backend, config, dtype, tolerance, size, features):
+    """Images of any size, with holes and an outlier, and pixels of them: one, less than a tile, several in a block."""
+    m, depth = crowded(6, 60 if compiled_backend.slow else 300, features)
+    depth = depth[:, : size[0], : size[1]].contiguous()
+    valid = torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) > 0.4
+    valid[:, :9, 16:32] = False  # whole tiles
+    valid &= depth > 0
+    depth[0, 2, 2] = 1e30  # spoils no neighbour
+    exact = regress_image(m, depth, K, valid, config)
+    for count in (None, 1, 63, 700):
+        pixels, expected = None, (exact.disagreement, exact.features)
+        if count is not None:
+            pixels = torch.randperm(depth[0].numel(), generator=torch.Generator().manual_seed(count))[None, :count]
+            expected = exact.disagreement.flatten(1)[:, pixels[0]], exact.features.flatten(1, 2)[:, pixels[0]]
+        found = compiled_backend.kernels.regress_image(m, depth.to(dtype), K, valid, config, pixels)
+        assert found.disagreement.dtype == dtype
+        for a, b in zip((found.disagreement, found.features), expected, strict=True):
+            torch.testing.assert_close(a.double(), b, rtol=0, atol=tolerance, equal_nan=True)
 
 
 @pytest.mark.parametrize(("dtype", "least", "tolerance"), [(np.float32, -120, 4e-7), (np.float64, -1000, 4e-15)])
@@ -123,7 +142,11 @@ def test_culling_keeps_its_bound(monkeypatch, epsilon, weight):
     config = UfMStarConfig(prior_mean=0.7, prior_weight=weight)
     exact = regress_image(m, depth, K, depth > 0, config).disagreement
     monkeypatch.setitem(regress_cpu.EPSILON, torch.float64, epsilon)
-    error = (regress_cpu.regress_image(m, depth, K, depth > 0, config).disagreement - exact).abs().nan_to_num()
+    error = (
+        (make_backend("numba").kernels.regress_image(m, depth, K, depth > 0, config).disagreement - exact)
+        .abs()
+        .nan_to_num()
+    )
     greatest = max(m.disagreement.max().item(), 0.7)
     assert error.max() <= epsilon * greatest
     points = unproject(depth, K).flatten(1, 2).nan_to_num(1.0)
@@ -134,61 +157,14 @@ def test_culling_keeps_its_bound(monkeypatch, epsilon, weight):
         assert error.max() > 1e-9, "or nothing was left out, and the test tests nothing"
 
 
-@pytest.mark.parametrize("size", [(40, 56), (33, 41), (7, 3)])
-def test_the_kernel_agrees_on_images_of_any_size_and_with_holes(size):
-    m, depth = crowded(6)
-    depth = depth[:, : size[0], : size[1]].contiguous()
-    valid = torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) > 0.4
-    valid[:, :9, 16:32] = False  # whole tiles
-    valid &= depth > 0
-    depth[0, 2, 2] = 1e30  # spoils no neighbour
-    reference = regress_image(m, depth, K, valid, EXACT).disagreement
-    fast = regress_cpu.regress_image(m, depth, K, valid, EXACT).disagreement
-    torch.testing.assert_close(fast, reference, rtol=0, atol=1e-10, equal_nan=True)
-    single = regress_cpu.regress_image(m, depth.float(), K, valid, EXACT).disagreement
-    torch.testing.assert_close(single.double(), reference, rtol=0, atol=1e-4, equal_nan=True)
-
-
-@pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 5e-5)])
-def test_the_kernel_at_points_agrees_with_the_reference(config, dtype, tolerance):
-    m = mixture(2, 30, 3, features=2)
-    points = unproject(torch.cat([rendered(0), rendered(3)]), K.expand(2, 3, 3)).flatten(1, 2)
-    points[1, 5, 0] = torch.inf
-    reference, fast = regress(m, points, config), regress_cpu.regress(m, points.to(dtype), config)
-    finite = points.isfinite().all(-1)
-    assert fast.disagreement.dtype == dtype
-    for a, b in ((fast.disagreement, reference.disagreement), (fast.features, reference.features)):
-        torch.testing.assert_close(a[finite].double(), b[finite], rtol=0, atol=tolerance)
-    if config is EXACT:
-        assert fast.disagreement[~finite].isnan().all()
-
-
-def test_sorting_points_into_leaves_changes_nothing():
-    """Many small components, so that every leaf has a selection of its own, against one point at a time and the sum."""
-    m = mixture(1, 400, 5)
-    m = m.replace(mean=m.mean * 6, covariance=m.covariance * 0.05)
-    generator = torch.Generator().manual_seed(0)
-    at_components = m.mean[:, torch.randint(400, (500,), generator=generator)]
-    points = at_components + 0.01 * torch.randn(1, 500, 3, generator=generator, dtype=torch.float64)
-    points[0, 17, 1], points[0, 18, 2] = torch.nan, torch.inf
-    together = regress_cpu.regress(m, points, EXACT).disagreement[0]
-    alone = [regress_cpu.regress(m, points[:, i : i + 1], EXACT).disagreement[0, 0] for i in range(500)]
-    assert same(together, torch.stack(alone))
-    assert together[[17, 18]].isnan().all()
-    finite = points[0].isfinite().all(-1)
-    exact = regress(m, points, EXACT).disagreement[0]
-    torch.testing.assert_close(together[finite], exact[finite], rtol=0, atol=1e-12)
-    assert (exact[finite] - EXACT.prior_mean).abs().mean() > 0.02, "or the test tests nothing"
-
-
-def test_far_away_and_in_an_empty_mixture_the_prior_rules():
-    depth, empty = torch.full((1, 40, 56), 50.0, dtype=torch.float64), mixture(1, 3, 1, empty=3)
-    for function in (regress_image, regress_cpu.regress_image):
-        for m, d in ((mixture(1, 8, 1), depth), (empty, rendered())):
-            for config in (EXACT, NEAR):
-                out = function(m, d, K, d > 0, config).disagreement
-                assert out[~out.isnan()].numpy() == pytest.approx(0.3, rel=1e-12)
+@BOTH
+def test_far_away_and_in_an_empty_mixture_the_prior_rules(backend, config):
+    depth, empty = torch.full((1, 40, 56), 50.0, dtype=torch.float64), mixture(1, 3, 1, empty=3, features=1)
+    for m, d in ((mixture(1, 8, 1, features=1), depth), (empty, rendered())):
+        out = backend.kernels.regress_image(m, d, K, d > 0, config)
+        assert out.disagreement[d > 0].numpy() == pytest.approx(0.3, rel=1e-12)
+        assert (out.features[d > 0] == 0).all()
+        assert backend.kernels.regress_image(m, d, K, d < 0, config).disagreement.isnan().all()
 
 
 def test_chunks_change_nothing(monkeypatch):
@@ -213,12 +189,11 @@ def test_on_cuda_free_memory_decides_how_much_is_regressed_at_a_time(monkeypatch
     assert pairs(1 << 20) == pairs(64 << 30, device="cpu") == 2**22
 
 
-@pytest.mark.parametrize("function", [smooth, regress_cpu.smooth], ids=["torch", "numba"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_smooth_averages_where_both_are_known(function, dtype):
+def test_smooth_averages_where_both_are_known(backend, dtype):
     nan = float("nan")
     before, now = torch.tensor([[[1.0, nan, 2.0, nan]]]), torch.tensor([[[3.0, 4.0, nan, nan]]], dtype=dtype)
-    memory, shown = function(before, now, 0.25)
+    memory, shown = backend.kernels.smooth(before, now, 0.25)
     torch.testing.assert_close(memory, torch.tensor([[[1.5, 4.0, 2.0, nan]]]), equal_nan=True)
     torch.testing.assert_close(shown, torch.tensor([[[1.5, 4.0, nan, nan]]], dtype=dtype), equal_nan=True)
 
@@ -245,19 +220,3 @@ def test_sample_is_seeded_uniform_and_valid():
     # Binomial(400, 0.2) per valid pixel: mean 80, sigma 8.
     assert (counts[:50] - 80).abs().max() < 5 * 8
     assert counts[50:].sum() == 0
-
-
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-11), (torch.float32, 5e-5)])
-def test_some_pixels_read_what_the_dense_map_reads(dtype, tolerance):
-    m, depth = crowded(7)
-    depth, valid = depth.to(dtype), depth > 0
-    valid[0, 20:24] = False
-    everywhere = regress_cpu.regress_image(m, depth, K, valid, EXACT)
-    for count in (1, 63, 700):  # a pixel, less than a tile, several in each of the image's blocks
-        order = torch.randperm(depth[0].numel(), generator=torch.Generator().manual_seed(count))[None, :count]
-        some = regress_cpu.regress_image(m, depth, K, valid, EXACT, order)
-        dense = everywhere.disagreement.flatten(1).gather(1, order)
-        torch.testing.assert_close(some.disagreement, dense, rtol=0, atol=tolerance, equal_nan=True)
-        features = everywhere.features.flatten(1, 2)[:, order[0]]
-        torch.testing.assert_close(some.features, features, rtol=0, atol=tolerance, equal_nan=True)
-    assert dense.isnan().any()

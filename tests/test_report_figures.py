@@ -178,7 +178,7 @@ def swept() -> Results:
 
 
 def points_of(results: Results) -> tuple[Point, ...]:
-    """Of plain UfM* over the rotation noise."""
+    """The points of plain UfM* over the rotation noise."""
     lines = sweep_lines(results, "ensemble", "rotation_noise")
     return next(line.points for line in lines if line.method == UFM_STAR.method and not line.rest)
 

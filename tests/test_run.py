@@ -141,10 +141,10 @@ def test_pictures_and_mixture(path, tmp_path):
 
 
 def test_own_depth_has_no_error_and_shows_the_floor(path, tmp_path):
-    summary = run(own_depth_job(path), tmp_path / "out")
+    summary = run(own_depth_job(path, config=CONFIG.replace(unmeasured="paper")), tmp_path / "out")
     assert summary["metrics"]["delta1"] == 1
     assert summary["metrics"]["rmse"] == 0
-    assert 0 < summary["uncertainty"]["mean_disagreement"] < 0.2
+    assert 0 < summary["uncertainty"]["mean_disagreement"] < 0.3  # with that of pixels that no two views compared
     assert summary["time"]["median_ms"]["network"] is None
     lines = [json.loads(line) for line in (tmp_path / "out" / "frames.jsonl").read_text().splitlines()]
     assert all(line["member"] is None for line in lines)

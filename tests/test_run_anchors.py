@@ -132,7 +132,7 @@ def test_without_anchors_nothing_is_said_of_them(tour, tmp_path):
     assert summary["time"]["median_ms"]["anchors"] is None
     assert not {"anchors", "mean_anchored", "mean_bias"} & records(tmp_path / "out")[0].keys()
     stored = read_frame(tmp_path / "out" / "frames" / f"{tour.names[0]}.npz")
-    assert stored.keys() == {"depth", "variance", "disagreement", "valid", "T_world_cam", "intrinsics"}
+    assert stored.keys() == {"depth", "variance", "disagreement", "measured", "valid", "T_world_cam", "intrinsics"}
 
 
 # ---- frames without anchors ----

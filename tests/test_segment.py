@@ -1,4 +1,4 @@
-"""SPGF: oracle against the authors' partitions, torch and numba against both, and its properties."""
+"""SPGF: the oracle against the authors' partitions, every backend against both, its properties and its input."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from backends import make_backend
 from hypothesis import given
 from hypothesis import strategies as st
-from segment_scenes import REFERENCES, TIERS, camera, clutter, reference, room, run_oracle
+from segment_scenes import REFERENCES, camera, clutter, reference, room, run_oracle
 
 from ufmstar_torch import segment, segment_fusion
-from ufmstar_torch.config import SPGFConfig
+from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.mixture import GaussianMixture
 
 pytestmark = pytest.mark.numerics
@@ -22,6 +23,7 @@ JITTER = float(np.float32(1e-5)) * np.eye(3)
 # How many of each file's Gaussians that concerns: the Gaussians without thickness (see below).
 SLOWEST = ("spgf_vga_tum", "torch")
 JITTERED = {"spgf_224_tum": 45, "spgf_224_tartanair_indoor": 64, "spgf_vga_tum": 49}
+SMALL = SPGFConfig(sparse=2, min_pixels=10, min_rows=3, scale_with_image=False)
 
 configs = st.builds(
     SPGFConfig,
@@ -40,7 +42,7 @@ configs = st.builds(
     min_pixels=st.integers(1, 60),
     min_rows=st.integers(1, 10),
     prune=st.sampled_from(["both", "either", "none"]),
-    scale_with_image=st.just(False),
+    scale_with_image=st.booleans(),
 )
 
 
@@ -79,14 +81,21 @@ def test_oracle_is_what_the_authors_program_computed(name):
     np.testing.assert_allclose((covariance + JITTER)[off], expected["cov"][off], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("name", "tier"),
-    [(n, t) if (n, t) != SLOWEST else pytest.param(n, t, marks=pytest.mark.slow) for n in REFERENCES for t in TIERS],
-)
-def test_reference_partitions(name, tier):
-    """All 17 frames: labels and order identical, moments to 1e-9, also those with upstream's 1e-5 I."""
+@pytest.mark.parametrize("name", REFERENCES)
+def test_reference_partitions(name, backend):
+    """All 17 frames: labels and order identical, moments to 1e-9, also those with upstream's 1e-5 I. Where that takes a
+    minute, crops of three frames, against the compiled kernel's."""
     r = reference(name)
-    mixture, labels = TIERS[tier](r.depth, r.intrinsics, r.config, before_pruning=True)
+    if backend.slow or (name, backend.name) == SLOWEST:
+        depth = r.depth[:3, 100:120, 80:144].contiguous()
+        K = r.intrinsics[:3] - torch.tensor([[0.0, 0, 80], [0, 0, 100], [0, 0, 0]])
+        labels, expected = (
+            b.spgf(depth, K, r.config, before_pruning=True)[1] for b in (backend, make_backend("numba"))
+        )
+        assert torch.equal(labels, expected)
+        assert labels.max() > 1
+        return
+    mixture, labels = backend.spgf(r.depth, r.intrinsics, r.config, before_pruning=True)
     jittered = 0
     for b, expected in enumerate(r.frames):
         assert np.array_equal(labels[b].numpy(), expected["labels"])
@@ -103,7 +112,7 @@ def test_reference_partitions(name, tier):
 
 
 @given(st.integers(0, 10**6), configs, st.integers(1, 24), st.integers(1, 30), st.booleans())
-def test_torch_and_numba_against_the_oracle(seed, config, height, width, with_options):
+def test_agrees_with_the_oracle(backend, seed, config, height, width, with_options):
     depth, K = clutter(seed, height, width)
     rng = np.random.default_rng(seed)
     options = {}
@@ -112,49 +121,42 @@ def test_torch_and_numba_against_the_oracle(seed, config, height, width, with_op
         variance[rng.random(depth.shape) < 0.05] = rng.choice([np.nan, -1.0, np.inf])
         options = {"variance": torch.from_numpy(variance), "valid": torch.from_numpy(rng.random(depth.shape) < 0.9)}
     pieces, expected = run_oracle(depth[0], K[0], config, **{name: value[0].numpy() for name, value in options.items()})
-    large = np.array([config.min_pixels <= p.N for p in pieces], dtype=bool)
-    tall = np.array([p.n >= config.min_rows for p in pieces], dtype=bool)
+    scaled = config.scaled_to(height, width)
+    large = np.array([scaled.min_pixels <= p.N for p in pieces], dtype=bool)
+    tall = np.array([p.n >= scaled.min_rows for p in pieces], dtype=bool)
     keep = {"both": large | tall, "either": large & tall, "none": large | True}[config.prune]
     slot = np.append(np.where(keep, keep.cumsum() - 1, -1), -1)
-    results = {}
-    for name, spgf in TIERS.items():
-        mixture, labels = spgf(depth, K, config, before_pruning=True, **options)
-        assert np.array_equal(labels[0].numpy(), expected), name
-        assert_moments(occupied(mixture), moments(pieces))
-        pruned, labels = spgf(depth, K, config, **options)
-        assert np.array_equal(labels[0].numpy(), slot[expected]), name
-        assert_moments(occupied(pruned), tuple(value[keep] for value in moments(pieces)))
-        results[name] = pruned
-    for field, value in results["torch"].tensors().items():
-        torch.testing.assert_close(getattr(results["numba"], field), value, rtol=1e-10, atol=1e-12)
+    mixture, labels = backend.spgf(depth, K, config, before_pruning=True, **options)
+    assert np.array_equal(labels[0].numpy(), expected)
+    assert_moments(occupied(mixture), moments(pieces))
+    pruned, labels = backend.spgf(depth, K, config, **options)
+    assert np.array_equal(labels[0].numpy(), slot[expected])
+    assert_moments(occupied(pruned), tuple(value[keep] for value in moments(pieces)))
 
 
-@pytest.mark.parametrize("tier", TIERS)
-def test_streams_are_independent(tier):
+def test_streams_are_independent(backend):
     """Three scenes with three cameras at once equal three single runs: depth bins and thresholds per stream."""
     scenes = [clutter(seed, 20, 26) for seed in (3, 4, 5)]
     depth, K = (torch.cat(parts) for parts in zip(*scenes, strict=True))
     config = SPGFConfig(sparse=2, min_pixels=20, min_rows=4)
     features = torch.rand(3, 2, 20, 26, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    together, labels = TIERS[tier](depth, K, config, features=features)
-    assert together.capacity == int(together.components.max())
+    together, labels = backend.spgf(depth, K, config, features=features)
     for b in range(3):
         own = slice(b, b + 1)
-        single, own_labels = TIERS[tier](depth[own], K[own], config, features=features[own])
+        single, own_labels = backend.spgf(depth[own], K[own], config, features=features[own])
         assert torch.equal(labels[own], own_labels)
-        for name, value in single.padded(together.capacity).tensors().items():
-            torch.testing.assert_close(together.tensors()[name][own], value, rtol=1e-13, atol=1e-14)
+        for name, value in single.tensors().items():
+            torch.testing.assert_close(together.tensors()[name][own, : single.capacity], value, rtol=1e-13, atol=1e-14)
 
 
-@pytest.mark.parametrize("tier", TIERS)
-def test_pruning_at_the_boundary(tier):
+def test_pruning_at_the_boundary(backend):
     """A plate of 8 rows x 30 px: exactly min_pixels and min_rows are enough, one more is not."""
     depth, K = torch.zeros(1, 12, 40, dtype=torch.float64), camera(80.0, 80.0, 20.0, 6.0)
     depth[:, 2:10, 5:35] = 1.0
 
     def kept(pixels, rows, prune):
         config = SPGFConfig(min_pixels=pixels, min_rows=rows, prune=prune, scale_with_image=False)
-        mixture, labels = TIERS[tier](depth, K, config)
+        mixture, labels = backend.spgf(depth, K, config)
         assert bool((labels >= 0).any()) == bool(mixture.components[0])
         return int(mixture.components[0])
 
@@ -163,16 +165,15 @@ def test_pruning_at_the_boundary(tier):
         assert actual == expected, prune
 
 
-@pytest.mark.parametrize("tier", TIERS)
-def test_features_and_variance(tier):
+def test_features_and_variance(backend):
     depth, K = clutter(11, 24, 30)
     config = SPGFConfig(sparse=2, min_pixels=10, min_rows=3, scale_with_image=False)
     generator = torch.Generator().manual_seed(1)
     features = torch.randn(1, 3, 24, 30, dtype=torch.float64, generator=generator)
     variance = 0.1 * torch.rand(1, 24, 30, dtype=torch.float64, generator=generator)
-    plain, labels = TIERS[tier](depth, K, config)
+    plain, labels = backend.spgf(depth, K, config)
     spoiled = torch.where(labels[:, None] < 0, torch.nan, features)
-    mixture, same = TIERS[tier](depth, K, config, features=spoiled, variance=variance)
+    mixture, same = backend.spgf(depth, K, config, features=spoiled, variance=variance)
     assert torch.equal(labels, same), "the partition does not depend on the variance"
     assert mixture.components[0] > 3
     fx, fy, cx, cy = K[0, 0, 0], K[0, 1, 1], K[0, 0, 2], K[0, 1, 2]
@@ -202,7 +203,7 @@ def test_thresholds_follow_the_image():
     pick = ((torch.arange(518) + 0.5) * 224 / 518).long()
 
     def partitions(config):
-        small, large = (TIERS["numba"](*room(n, n), config) for n in (224, 518))
+        small, large = (make_backend("numba").spgf(*room(n, n), config) for n in (224, 518))
         return small, large, weighted_iou(small[1][0][pick][:, pick], large[1][0])
 
     upstream = SPGFConfig.preset("tum")
@@ -240,8 +241,8 @@ def test_float32_with_centred_moments():
     are off by up to 6.8 (median .1)."""
     r = reference("spgf_vga_tum")
     r = replace(r, depth=r.depth[2:], intrinsics=r.intrinsics[2:])
-    exact, labels = TIERS["numba"](r.depth, r.intrinsics, r.config, before_pruning=True)
-    mixture, single = TIERS["torch"](r.depth, r.intrinsics, r.config, before_pruning=True, compute_dtype=torch.float32)
+    exact, labels = make_backend("numba").spgf(r.depth, r.intrinsics, r.config, before_pruning=True)
+    mixture, single = segment.spgf(r.depth, r.intrinsics, r.config, before_pruning=True, compute_dtype=torch.float32)
     assert float((labels == single).double().mean()) > 0.9999
     large = exact.weight[0] >= 200
     torch.testing.assert_close(mixture.mean[0][large], exact.mean[0][large], rtol=0, atol=1e-5)
@@ -284,6 +285,7 @@ def test_no_value_is_read_on_other_devices(prune):
     assert mixture.features.shape == (b, mixture.capacity, 4)
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_cuda_agrees_and_never_waits():
     scenes = [clutter(seed, 20, 26) for seed in (3, 4, 5)]
@@ -300,3 +302,88 @@ def test_cuda_agrees_and_never_waits():
     assert torch.equal(actual.cpu(), labels)
     for name, value in expected.padded(mixture.capacity).tensors().items():
         torch.testing.assert_close(mixture.tensors()[name].cpu(), value, rtol=1e-10, atol=1e-12)
+
+
+def test_presets_are_upstreams():
+    """../shared/spec's table, column by column."""
+    tum, inside, outside = (SPGFConfig.preset(n) for n in ("tum", "tartanair_indoor", "tartanair_outdoor"))
+    columns = {
+        "adaptive_thresh_scale": (2.4, 0.70, 0.70),
+        "noise_floor": (0.08, 0.05, 0.25),
+        "noise_thresh": (0.2, 0.2, 0.5),
+        "line_thresh": (0.3, 0.3, 0.3),
+        "occlusion_gap": (10, 10, 10),
+        "n_check": (16, 16, 16),
+        "max_open": (2, 2, 2),
+        "angle_cosine": (0.5, 0.5, 0.5),
+        "sparse": (5, 2, 5),
+        "min_rows": (16, 8, 8),
+        "min_pixels": (200, 200, 200),
+        "min_gaussian_length": (0.5, 0.5, 0.6),
+        "frame_max_scale": (4.0, 4.0, 4.0),
+        "max_depth": (20.0, 20.0, 20.0),
+        "prune": ("both", "both", "both"),
+        "reference_focal": (525.0, 320.0, 320.0),
+        "reference_height": (480, 480, 480),
+        "reference_width": (640, 640, 640),
+    }
+    for name, values in columns.items():
+        assert tuple(getattr(c, name) for c in (tum, inside, outside)) == values, name
+
+
+def test_nothing_to_segment(backend):
+    for depth in (torch.zeros(1, 1, 1), torch.full((2, 7, 9), torch.nan), torch.full((1, 8, 3), 1e6)):
+        K = camera(5.0, 5.0, 3.0, 2.0).expand(len(depth), 3, 3)
+        mixture, labels = backend.spgf(depth, K, features=torch.ones(len(depth), 2, *depth.shape[1:]))
+        assert bool((labels == -1).all())
+        assert not any(value.any() for value in mixture.tensors().values())
+        assert mixture.features.shape[::2] == (len(depth), 2)
+
+
+def test_single_pixels_have_no_covariance(backend):
+    config = replace(SMALL, sparse=0, prune="none")
+    depth, K = torch.full((1, 1, 1), 2.0), camera(5.0, 5.0, 3.0, 2.0)
+    mixture, labels = backend.spgf(depth, K, config, variance=torch.ones_like(depth))
+    assert labels.tolist() == [[[0]]]
+    assert mixture.weight.tolist() == [[1.0]]
+    assert mixture.count.tolist() == [[1]]
+    torch.testing.assert_close(mixture.mean[0, 0], torch.tensor([-1.2, -0.8, 2.0]))
+    assert not mixture.covariance.any()
+
+
+def test_dtypes(backend):
+    depth, K = clutter(21, 20, 24)
+    for dtype, expected in (
+        (torch.float64, torch.float64),
+        (torch.float32, torch.float32),
+        (torch.float16, torch.float32),
+        (torch.bfloat16, torch.float32),
+    ):
+        given = depth.to(dtype)
+        mixture, labels = backend.spgf(given, K.float(), SMALL, features=given[:, None].nan_to_num(0, 0, 0))
+        assert {v.dtype for n, v in mixture.tensors().items() if n != "count"} == {expected}
+        assert (labels.dtype, mixture.count.dtype) == (torch.int64, torch.int64)
+        exact, same = backend.spgf(given.double(), K.float(), SMALL)
+        assert torch.equal(labels, same)
+        torch.testing.assert_close(mixture.covariance, exact.covariance.to(expected))
+        assert torch.equal(mixture.weight, exact.weight.to(expected))
+        assert torch.equal(mixture.count, (mixture.weight > 0).long())
+        assert not mixture.disagreement.any()
+
+
+def test_arguments_are_left_alone_and_may_be_views(backend):
+    depth, K = clutter(22, 20, 24)
+    wide = torch.stack([depth, depth + 1], -1).requires_grad_()
+    view = wide[..., 0]
+    options = {"valid": (depth > 0.5), "variance": torch.full_like(depth, 0.01), "features": depth[:, None].clone()}
+    before = {name: value.clone() for name, value in options.items()}
+    mixture, labels = backend.spgf(view, K.expand(1, 3, 3), UfMStarConfig(segment=SMALL), **options)
+    expected, same = backend.spgf(depth, K, SMALL, **options)
+    assert torch.equal(labels, same)
+    torch.testing.assert_close(mixture.mean, expected.mean, rtol=1e-14, atol=1e-15)  # strides may choose the loops
+    assert not mixture.mean.requires_grad
+    assert torch.equal(view.detach().nan_to_num(), depth.nan_to_num())
+    for name, value in options.items():
+        assert torch.equal(value.nan_to_num(), before[name].nan_to_num()), name
+    with torch.inference_mode():
+        assert torch.equal(backend.spgf(depth, K, SMALL, **options)[1], labels)

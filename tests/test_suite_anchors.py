@@ -13,7 +13,7 @@ from tiny_suite import Biased, base_network, evaluate, row, unbatched, write_net
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.eval.engine.anchors import TRUTH_SIGMA, AnchorSource, Tracks, anchor_sources
+from ufmstar_torch.eval.engine.anchors import TRUTH_SIGMA, AnchorSource, Tracks
 from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
@@ -157,7 +157,8 @@ def test_no_anchors_at_most_is_plain_ufm_star(tour, networks):
 
 
 def test_ground_truth_helps_a_network_whose_views_agree_on_what_is_wrong(tour):
-    rows = [row(NAME), row(NAME, anchors="truth"), row(NAME, anchors="truth", corrected=True)]
+    kinds = ({}, {"anchors": "truth"}, {"anchors": "truth", "corrected": True})
+    rows = [row(NAME, overrides={"unmeasured": "paper"}, **kind) for kind in kinds]
     plain, anchored, corrected = (r.figures for r in evaluate(tour, rows, {"depth_only": Biased()}).values())
     assert anchored["nll"] < 3 < plain["nll"]
     assert anchored["ece_delta"] < 0.75 * plain["ece_delta"]
@@ -210,15 +211,6 @@ def test_track_noise_has_the_size_that_the_tracker_states_for_it(tour):
     assert len(change) > 60
     assert change[:, :2].std() == pytest.approx(0.5, rel=0.2)
     assert (change[:, 2] / torch.cat(stated)).std() == pytest.approx(0.5, rel=0.25)
-
-
-def test_rows_of_the_same_poses_share_a_tracker():
-    alike = [row(NAME, anchors="tracked"), row(NAME, anchors="tracked", anchor_count=5, corrected=True)]
-    others = [row(NAME, anchors="tracked", rotation_noise=1.0, seed=seed) for seed in (0, 1)]
-    sources = anchor_sources([row(NAME), *alike, *others, row(NAME, anchors="tracked", skip=1)])
-    assert row(NAME) not in sources
-    assert sources[alike[0]].tracks is sources[alike[1]].tracks
-    assert len({id(source.tracks) for source in sources.values()}) == 4
 
 
 def test_tracking_needs_images(tour):

@@ -197,9 +197,11 @@ def test_rows_of_one_drift_share_a_tracker_and_a_reference():
         for name in ("translation_drift", "rotation_noise")
         for seed in (0, 1)
     ]
-    sources = anchor_sources([*alike, *others, row(NAME, anchors="tracked")])
+    alone = [row(NAME), row(NAME, anchors="tracked"), row(NAME, anchors="tracked", skip=1)]
+    sources = anchor_sources([*alike, *others, *alone])
+    assert alone[0] not in sources
     assert sources[alike[0]].tracks is sources[alike[1]].tracks
-    assert len({id(source.tracks) for source in sources.values()}) == 6
+    assert len({id(source.tracks) for source in sources.values()}) == 7
     plain, drift = (row("UfM-Ensemble-100K", **values) for values in ({}, {"rotation_drift": 0.1}))
     rows = [plain, drift, row("UfM*-Ensemble", rotation_drift=0.1), row("UfM*-Ensemble", anchors="truth", seed=7)]
     assert references(rows[2], rows) == [drift]

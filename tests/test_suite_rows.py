@@ -260,7 +260,7 @@ def test_files_that_are_not_there(tmp_path):
 
 
 def test_a_in_h_agrees_with_the_oracle():
-    config = UfMStarConfig(segment=SPGF, features=2, add_aleatoric=False, backend="torch")
+    config = UfMStarConfig(segment=SPGF, features=2, add_aleatoric=False, backend="torch", unmeasured="paper")
     estimator = Gaussians(config, CPU, Setting(aleatoric_in_h=True))
     judge = oracle.Oracle(oracle_settings(SPGF))
     depths, poses, K = scenes.sequence(3, 30, 40, 0.05)

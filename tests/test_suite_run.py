@@ -138,7 +138,7 @@ def test_images_without_poses_are_for_networks_alone(tmp_path):
     outcome, message = go(job, evaluate_sequence)
     assert outcome.finished
     folder, (item,) = folder_of(job), job.items
-    done = sorted(path.stem for path in folder.place(item).glob("*.json") if path.stem != "failed")
+    done = sorted(path.stem for path in folder.sequence_folder(item).glob("*.json") if path.stem != "failed")
     assert done == ["DepthOnly"]
     failure = folder.failure(item)
     assert "no poses" in failure["reason"]
@@ -205,7 +205,7 @@ def test_a_kill_loses_the_sequence_at_work_alone(rooms, tmp_path):
     child.join(60)
     assert child.exitcode == -signal.SIGKILL
     assert {path.split("/")[2] for path in kept(job.out)} == {"ash"}
-    place = folder_of(job).place(job.items[1])
+    place = folder_of(job).sequence_folder(job.items[1])
     begun, own = place / ".A.pt.0123456789ab.tmp", place / ".mine.tmp"
     for file in (begun, own):
         file.write_text("x")

@@ -198,8 +198,8 @@ def test_a_row_without_its_sums_or_with_half_a_record_is_missing(tmp_path):
     folder, item, rows = EvalFolder(job.out), job.items[0], job.suite.rows
     assert folder.missing(item, rows) == []
     assert folder.missing(item, [Row(rows[3].method, Setting(skip=1))]) == [Row(rows[3].method, Setting(skip=1))]
-    (folder.place(item) / "DepthOnly.pt").unlink()
-    (folder.place(item) / "UfM-DepthOnly.json").write_text('{"format": 1')
+    (folder.sequence_folder(item) / "DepthOnly.pt").unlink()
+    (folder.sequence_folder(item) / "UfM-DepthOnly.json").write_text('{"format": 1')
     assert [row.method.name for row in folder.missing(item, rows)] == ["DepthOnly", "UfM-DepthOnly"]
     go(job, resume=True)
     assert folder.missing(item, rows) == []

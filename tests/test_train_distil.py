@@ -148,7 +148,7 @@ def test_the_target_is_ufmstars_of_every_clip_alone(room):
     T[CLIP + 1] = torch.nan
     variance, measured = Teacher(CLIP)(depth, T, K)
     for first in range(0, FRAMES, CLIP):
-        ufm = UfMStar(UfMStarConfig(on_bad_frame="skip"))
+        ufm = UfMStar(UfMStarConfig(on_bad_frame="skip", unmeasured="paper"))
         for i in range(first, first + CLIP):
             out = ufm(depth[i : i + 1], T[i : i + 1], K[i : i + 1])
             expected = out.variance[0].clamp_min(1e-6)

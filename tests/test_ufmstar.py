@@ -9,9 +9,8 @@ import pytest
 import torch
 from modules import CONFIG, same
 from torch.utils._python_dispatch import TorchDispatchMode
-from walks import HEIGHT, SPGF, WIDTH, oracle_run, oracle_settings, run, walk, walks
+from walks import HEIGHT, WIDTH, run, walk, walks
 
-import oracle
 import scenes
 from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig
 
@@ -20,90 +19,11 @@ pytestmark = pytest.mark.numerics
 BACKENDS = ("torch", "numba")
 
 
-@pytest.fixture(scope="module")
-def truth():
-    return oracle_run()
-
-
-def test_the_rendered_sequence_has_what_it_is_meant_to_test(truth):
-    depths, poses, K, _, _, matches, mixture, sizes = truth
-    per_c = [len(ks) for frame in matches for ks in frame]
-    per_k = [sum(k in ks for ks in frame) for frame in matches for k in range(100)]
-    assert max(per_c) > 1, "one current component must match many"
-    assert max(per_k) > 1, "many must match one"
-    assert min(per_c) == 0
-    assert sizes[-1] > sizes[0] + 5, "new places must be seen"
-    assert max(g["count"] for g in mixture) > 8, "places must be revisited"
-    # The occlusion filter must have had work to do: without it, other matches follow.
-    judge = oracle.Oracle(oracle_settings(SPGF), eta_occl=1.0)
-    hidden = 0
-    for i in range(12):
-        valid = np.isfinite(depths[i])
-        current = oracle.segment(np.where(valid, depths[i], 0), K, judge.spgf, valid=valid)
-        if judge.T_first is None:
-            judge.T_first = poses[i]
-        to_cam = oracle.relative(judge.T_first, poses[i])
-        previous = [oracle.transform(g, *to_cam) for g in judge.mixture]
-        loose, overlaps = oracle.correspond(previous, current, K, depths[i].shape, 0.5, 1.0, 0.05)
-        strict, _ = oracle.correspond(previous, current, K, depths[i].shape, 0.5, 0.7, 0.05)
-        hidden += sum(len(a) - len(b) for a, b in zip(loose, strict, strict=True))
-        to_first = oracle.relative(poses[i], judge.T_first)
-        judge.mixture = oracle.fuse(judge.mixture, [oracle.transform(g, *to_first) for g in current], strict, overlaps)
-    assert hidden > 0
-
-
-@pytest.mark.parametrize(("backend", "streams"), [("torch", 2), ("numba", 1), ("numba", 4)])
-def test_a_walk_agrees_with_the_oracle(truth, backend, streams):
-    depths, poses, K, aleatoric, maps, matches, mixture, sizes = truth
-    config = CONFIG.replace(backend=backend, features=2, initial_capacity=8)
-    ufm = UfMStar(config, dtype=torch.float64)
-
-    def batch(x):
-        return torch.tensor(np.asarray(x)).expand(streams, *np.shape(x)).contiguous()
-
-    for i, (depth, T, a) in enumerate(zip(depths, poses, aleatoric, strict=True)):
-        features = np.stack([a, np.nan_to_num(depth)])
-        out = ufm(batch(depth), batch(T), batch(K), aleatoric=batch(a), features=batch(features))
-        V, M = maps[i]
-        assert out.statistics.components.tolist() == [sizes[i]] * streams
-        assert out.statistics.pairs.tolist() == [sum(map(len, matches[i]))] * streams
-        for b in range(streams):
-            np.testing.assert_allclose(out.disagreement[b].numpy(), M, rtol=0, atol=1e-10)
-            np.testing.assert_allclose(out.variance[b].numpy(), V, rtol=0, atol=1e-10)
-    for b in range(streams):
-        for k, g in enumerate(mixture):
-            np.testing.assert_allclose(ufm.mixture.mean[b, k].numpy(), g["mean"], atol=1e-10)
-            np.testing.assert_allclose(ufm.mixture.covariance[b, k].numpy(), g["cov"], atol=1e-10)
-            np.testing.assert_allclose(ufm.mixture.features[b, k].numpy(), g["features"], atol=1e-10)
-            assert ufm.mixture.disagreement[b, k].item() == pytest.approx(g["m"], abs=1e-10)
-            assert ufm.mixture.weight[b, k].item() == g["weight"]
-            assert ufm.mixture.count[b, k].item() == g["count"]
-
-
 VARIANTS = {
     "overlap": {"disagreement": "overlap", "overlap_weighted": True, "initial_capacity": 2},
     "neighbourhood": {"regression": "neighbourhood", "features": 1},
     "anchored": {"anchors": AnchorConfig(), "features": 1},
 }
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_streams_together_equal_streams_alone_to_the_last_bit(backend, variant):
-    """Three streams in one batch give what each gives alone, however many slots the others need."""
-    config = CONFIG.replace(backend=backend, **VARIANTS[variant])
-    frames = list(walks(3, 5))
-    together, all_three = walk(config, frames)
-    for s in range(3):
-        alone, single = walk(config, frames, slice(s, s + 1))
-        for a, b in zip(together, alone, strict=True):
-            for name in ("variance", "disagreement", "labels", "bias", "features"):
-                x, y = getattr(a, name), getattr(b, name)
-                assert x is y is None or same(x[s], y[0]), name
-            assert a.statistics.components[s] == b.statistics.components[0]
-        k = int(single.mixture.components)
-        for name, value in single.mixture.tensors().items():
-            assert same(all_three.mixture.tensors()[name][s, :k], value[0, :k]), name
 
 
 class Products(TorchDispatchMode):

@@ -35,21 +35,6 @@ def oracle_settings(config: SPGFConfig) -> oracle.Segmentation:
     return oracle.Segmentation(settings, config.min_pixels, config.min_rows, config.prune)
 
 
-def oracle_run():
-    """The oracle's run over 20 rendered frames: inputs, maps, mixtures, matches."""
-    depths, poses, K = scenes.sequence(20, HEIGHT, WIDTH, 0.04)
-    rng = np.random.default_rng(1)
-    aleatoric = [0.01 + 0.02 * rng.random(d.shape) for d in depths]
-    judge = oracle.Oracle(oracle_settings(SPGF))
-    maps, matches, sizes = [], [], []
-    for depth, T, a in zip(depths, poses, aleatoric, strict=True):
-        features = np.stack([a, np.nan_to_num(depth)])
-        maps.append(judge.step(depth, T, K, aleatoric=a, features=features))
-        matches.append(judge.matches)
-        sizes.append(len(judge.mixture))
-    return depths, poses, K, aleatoric, maps, matches, judge.mixture, sizes
-
-
 def walks(streams, frames=8):
     """Rendered sequences of ``streams`` cameras with anchors: the arguments of every frame, batched over streams."""
     rng = np.random.default_rng(0)

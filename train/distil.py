@@ -73,9 +73,9 @@ def distillation_sums(
         variance: [N, H, W] V [m^2].
         measured: [N, H, W] bool, where it may be learnt from.
     """
-    known = valid & target.isfinite() & (target > 0)
-    depth = torch.where(known, distribution.depth.float(), 1.0)
+    with_truth = valid & target.isfinite() & (target > 0)
+    depth = torch.where(with_truth, distribution.depth.float(), 1.0)
     s = torch.where(measured, distribution.log_variance.float(), 0.0)
-    off = torch.where(known, depth_l1(depth, torch.where(known, target, 1.0)), 0.0)
+    off = torch.where(with_truth, depth_l1(depth, torch.where(with_truth, target, 1.0)), 0.0)
     spread = 0.5 * (s - torch.where(measured, variance, 1.0).log()).square()
-    return (off + torch.where(measured, spread, 0.0)).sum(), (known | measured).sum()
+    return (off + torch.where(measured, spread, 0.0)).sum(), (with_truth | measured).sum()

@@ -139,8 +139,8 @@ def _conclude(job: Job, stopped: str | None, seconds: float, command: Sequence[s
 def _mean_figures(results: Sequence[dict[str, Any]]) -> dict[str, float]:
     """The members' last validation figures, averaged over members (not those of the ensemble)."""
     figures = [result["figures"] for result in results if result.get("figures")]
-    common = [name for name in FIGURES if figures and all(name in own for own in figures)]
-    return {name: sum(own[name] for own in figures) / len(figures) for name in common}
+    common = [name for name in FIGURES if figures and all(name in of_member for of_member in figures)]
+    return {name: sum(of_member[name] for of_member in figures) / len(figures) for name in common}
 
 
 def report(summary: dict[str, Any]) -> str:

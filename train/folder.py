@@ -32,8 +32,8 @@ def identity(job: Job) -> dict[str, Any]:
     """The settings that decide the weights."""
     data = {name: value for name, value in asdict(job.data).items() if name not in (*_SPEED, "seed", "batch_size")}
     s = job.settings
-    own = {"seed": s.seed, "init": s.init, "trainable": s.trainable, "precision": s.precision}
-    return {"recipe": job.recipe.to_dict(), "data": data, **own}
+    session = {"seed": s.seed, "init": s.init, "trainable": s.trainable, "precision": s.precision}
+    return {"recipe": job.recipe.to_dict(), "data": data, **session}
 
 
 @contextmanager

@@ -80,8 +80,8 @@ class TrainingModule(pl.LightningModule):
     def on_train_start(self) -> None:
         """Put the parts that are not trained into eval mode, so that their batch norms keep their statistics."""
         for part in self.network.modules():
-            own = list(part.parameters(recurse=False))
-            if own and not any(p.requires_grad for p in own):
+            parameters = list(part.parameters(recurse=False))
+            if parameters and not any(p.requires_grad for p in parameters):
                 part.eval()
 
     def on_train_epoch_start(self) -> None:
@@ -211,12 +211,12 @@ class TrainingModule(pl.LightningModule):
         return [loader.dataset.source.name(key.frame) for key in next(islice(batches, batch_idx, None))]
 
     def _blame(self, what: str, batch_idx: int, mine: float | None = None) -> str:
-        place = f"epoch {self.current_epoch}, batch {batch_idx} (step {self.global_step})"
+        moment = f"epoch {self.current_epoch}, batch {batch_idx} (step {self.global_step})"
         samples = f"samples {', '.join(self._samples(batch_idx))}"
         if self.trainer.world_size > 1:
             samples = f"process {self.global_rank}{f' with loss {mine}' if mine is not None else ''}, {samples}"
         return (
-            f"the {what} is not finite in {place}, {samples}; a smaller learning rate or --clip 1 may help; "
+            f"the {what} is not finite in {moment}, {samples}; a smaller learning rate or --clip 1 may help; "
             "the checkpoint before it is kept"
         )
 

@@ -83,8 +83,8 @@ def _from_trained(spec: NetworkSpec, path: Path, member: int) -> DepthNetwork:
     source = build_network(info.spec)
     fill(source, {k: v.float() if v.is_floating_point() else v for k, v in state.items()}, str(path))
     shared = ("size", "preprocess", "dropout", "dropout_both", "method", "members")
-    own = replace(info.spec, **{name: getattr(spec, name) for name in shared})
-    if own != spec:
+    adapted = replace(info.spec, **{name: getattr(spec, name) for name in shared})
+    if adapted != spec:
         raise ValueError(f"init: {path} holds {info.spec}, which does not fit {spec}")
     # "mc_dropout" is an aleatoric network that samples at test time.
     trained, expected = ("aleatoric" if m == "mc_dropout" else m for m in (info.spec.method, spec.method))

@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ufmstar_torch.array_files import read_npy
 from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.eval.tour.style import style_of
 from ufmstar_torch.models.atomic import write_together
@@ -104,8 +105,8 @@ class TourFrames:
     def _mapped(self, seed: int) -> tuple[NDArray[Any], ...]:
         if seed not in self._maps:
             image, depth, *small = tour_files(self.folder, seed)
-            maps = (np.load(file, mmap_mode="r") for file in (image, depth))
-            self._maps[seed] = (*maps, *map(np.load, small))
+            maps = (read_npy(file, mapped=True) for file in (image, depth))
+            self._maps[seed] = (*maps, *map(read_npy, small))
         return self._maps[seed]
 
 

@@ -8,10 +8,12 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Sequence
+from io import BytesIO
 from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
+import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
@@ -23,8 +25,9 @@ _DAMAGED = (
 )
 
 
-def read_npy(path: str | Path) -> NDArray[Any]:
-    """The array of a .npy file. Nothing is unpickled.
+def read_npy(path: str | Path, *, mapped: bool = False) -> NDArray[Any]:
+    """The array of a .npy file, or, ``mapped``, the file as an array in memory, of any size and read-only. Nothing is
+    unpickled.
 
     Raises:
         OSError: the file cannot be opened.
@@ -33,6 +36,8 @@ def read_npy(path: str | Path) -> NDArray[Any]:
     """
     with Path(path).open("rb") as file:
         try:
+            if mapped:
+                return np.load(path, mmap_mode="r", allow_pickle=False)
             return _array(file, Path(path).stat().st_size)
         except _DAMAGED as error:
             raise ValueError(f"{path} is no readable .npy file: {error}") from error
@@ -42,19 +47,35 @@ def read_npz(path: str | Path, names: Sequence[str], *, or_single: bool = False)
     """The arrays ``names`` of a .npz file; with ``or_single``, its only array whatever its name. Errors as
     :func:`read_npy`; also ValueError: an array is not in the file."""
     with Path(path).open("rb") as file:
-        try:
-            with zipfile.ZipFile(file) as archive:
-                members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
-                names = list(members) if or_single and len(members) == 1 else names
-                if missing := [name for name in names if name not in members]:
-                    raise ValueError(f"expected the arrays {', '.join(missing)}, got {', '.join(sorted(members))}")
-                arrays = []
-                for name in names:
-                    with archive.open(members[name]) as member:  # ends after file_size bytes, whatever it expands to
-                        arrays.append(_array(cast(BinaryIO, member), members[name].file_size))
-                return arrays
-        except _DAMAGED as error:
-            raise ValueError(f"{path} is no readable .npz file: {error}") from error
+        return list(_arrays(file, path, names, or_single=or_single).values())
+
+
+def read_npz_whole(path: str | Path, content: bytes | None = None) -> dict[str, NDArray[Any]]:
+    """All arrays of a .npz file by name, or of its ``content``, which a message calls ``path``; together at most
+    ``LARGEST`` bytes. Errors as :func:`read_npy`."""
+    with Path(path).open("rb") if content is None else BytesIO(content) as file:
+        return _arrays(file, path)
+
+
+def _arrays(
+    file: BinaryIO, path: str | Path, names: Sequence[str] | None = None, *, or_single: bool = False
+) -> dict[str, NDArray[Any]]:
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+            if names is None or (or_single and len(members) == 1):
+                names = list(members)
+            if missing := [name for name in names if name not in members]:
+                raise ValueError(f"expected the arrays {', '.join(missing)}, got {', '.join(sorted(members))}")
+            if (total := sum(members[name].file_size for name in names)) > LARGEST + 2**20:
+                raise ValueError(f"its arrays would take {total:,} bytes")
+            arrays = {}
+            for name in names:
+                with archive.open(members[name]) as member:  # ends after file_size bytes, whatever it expands to
+                    arrays[name] = _array(cast(BinaryIO, member), members[name].file_size)
+            return arrays
+    except _DAMAGED as error:
+        raise ValueError(f"{path} is no readable .npz file: {error}") from error
 
 
 def _array(file: BinaryIO, size: int) -> NDArray[Any]:

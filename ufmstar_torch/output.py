@@ -112,6 +112,8 @@ class UfMStarOutput:
             ``config.anchors``.
         bias: the relative error r = g/d - 1 that anchors lead to expect; None unless ``config.anchors``.
         posterior_depth, posterior_variance: what :meth:`posterior` returns; None unless ``config.posterior``.
+        posterior_outlier: probability that the pixel lies on another surface than the anchors that corrected it; its
+            variance is counted in ``posterior_variance``. NaN before any anchor; None likewise.
         features: regressed further entries of H, [B, H, W, F], in the caller's units.
         measured: share in [0, 1] of M that rests on surfaces seen from two views or more; below one half the pixel
             counts as not measured (``config.unmeasured``). NaN where not valid.
@@ -136,6 +138,7 @@ class UfMStarOutput:
     bias: Tensor | None = None
     posterior_depth: Tensor | None = None
     posterior_variance: Tensor | None = None
+    posterior_outlier: Tensor | None = None
 
     def __repr__(self) -> str:
         """Shape, median standard deviation and counts in a line."""

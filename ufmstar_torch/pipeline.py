@@ -331,10 +331,12 @@ class UncertainDepth(NetworksInTurn):
         """The prediction for the next image, or, with ``ahead``, for the one after that."""
         if not self.networks:
             raise ValueError("UncertainDepth(None) has no networks: give the predictions to update")
-        image, T, K_image = as_image(image), as_pose(pose), as_intrinsics(intrinsics)
+        picture, T, K_image = as_image(image), as_pose(pose), as_intrinsics(intrinsics)
+        if not isinstance(image, Tensor):  # a tensor's device is the caller's choice
+            picture = picture.to(next((p.device for p in self.networks.parameters()), picture.device))
         member = None if self.mode == "full" else self.turn(self._next + ahead)
         with torch.no_grad():
-            x, K = self.prepare(image, K_image.expand(len(image), 3, 3))
+            x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
             self._warn_of_size(x)
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
         H = None if features is None else as_tensor("features", features)
@@ -348,17 +350,19 @@ class UncertainDepth(NetworksInTurn):
         (depth, *variances, K_there, H), ready = _copied(parts, self.multiview_device)
         assert depth is not None
         assert K_there is not None
-        return _Predicted(image, T, K_image, DepthPrediction(depth, *variances), K_there, member, H, ready)
+        return _Predicted(picture, T, K_image, DepthPrediction(depth, *variances), K_there, member, H, ready)
 
     def _warn_of_size(self, x: Tensor) -> None:
         """Name a network that states the size of its input and gets another one, as where ``preprocess`` was
         forgotten; once."""
+        if self._warned or self.preprocess is not None:
+            return
         sizes = {getattr(getattr(network, "preprocess", None), "size", None) for network in self.networks}
-        if self.preprocess is None and not self._warned and not sizes & {None, tuple(x.shape[-2:])}:
+        if not sizes & {None, tuple(x.shape[-2:])}:
             self._warned = True
             LOGGER.warning(
                 "the network states an input of %s px and gets %s: UncertainDepth(..., preprocess=network.preprocess) "
-                "resizes and normalises images (said once)", *sizes, tuple(x.shape[-2:]),
+                "resizes and normalises images (said once)", " or ".join(map(str, sizes)), tuple(x.shape[-2:]),
             )  # fmt: skip
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:

@@ -91,10 +91,19 @@ def _without_segments(
         yield b, "segments", text + "intrinsics the depth map's?"
 
 
+def hardly_compared(alone: int, components: int, frames: int) -> str:
+    """A warning where one frame alone has seen nearly all of so many components after so many frames; else ""."""
+    if frames < _FRAMES or components < _COMPONENTS or alone <= _ALONE * components:
+        return ""
+    text = (
+        f"after {frames} frames {alone} of {components} Gaussians were seen in one view alone, so hardly anything is "
+    )
+    return text + f"compared between views. {_CAUSES}, or views that do not overlap"
+
+
 def _alone(statistics: FrameStatistics, frames: Tensor) -> Iterator[tuple[int, str, str]]:
     assert statistics.single_view is not None
-    counts = torch.stack([statistics.single_view, statistics.components, frames]).tolist()
-    for b, (alone, components, seen) in enumerate(zip(*counts, strict=True)):
-        if seen >= _FRAMES and components >= _COMPONENTS and alone > _ALONE * components:
-            text = f"after {seen} frames {alone} of {components} Gaussians were seen in one view alone, so hardly "
-            yield b, "views", text + f"anything is compared between views. {_CAUSES}, or views that do not overlap"
+    counts = torch.stack([statistics.single_view, statistics.components, frames]).T.tolist()
+    for b, each in enumerate(counts):
+        if text := hardly_compared(*each):
+            yield b, "views", text

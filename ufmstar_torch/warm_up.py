@@ -26,7 +26,7 @@ class Module(Protocol):
 
     @property
     def mean(self) -> torch.Tensor:
-        """Of the mixture [B, K, 3]."""
+        """The mixture's means [B, K, 3]."""
         ...
 
     def __call__(self, *frame: Any, **options: Any) -> Any:

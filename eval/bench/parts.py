@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.landmarks import landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
@@ -41,7 +42,7 @@ class MultiviewStep:
     def __init__(self, row: Row, device: torch.device) -> None:
         self.estimator, self._device = make_estimator(row, device), device
         anchors = ANCHORS[row.setting.anchors]
-        self._landmarks = None if anchors is None else StreamLandmarks(anchors)
+        self._landmarks = None if anchors is None else StreamLandmarks(landmark_source(anchors))
 
     def __call__(self, image: Tensor | None, frame: Frame, predicted: Predicted, *, first: bool = False) -> Answer:
         """Move a frame's maps to the device, and run the step; the ``first`` one begins with an empty state.
@@ -73,8 +74,8 @@ class MultiviewStep:
         """Bytes and number of the points or components, with what anchors add; bytes of the map for smoothing."""
         memory = self.estimator.memory()
         landmarks = {} if self._landmarks is None else self._landmarks.state()
-        kept = memory["bytes"] + sum(value.nbytes for value in landmarks.values())
-        return {"bytes_end": kept, "count_end": memory["count"], "smoothing_bytes": memory["smoothing_bytes"]}
+        state_bytes = memory["bytes"] + sum(value.nbytes for value in landmarks.values())
+        return {"bytes_end": state_bytes, "count_end": memory["count"], "smoothing_bytes": memory["smoothing_bytes"]}
 
 
 class TimedParts:

@@ -1,8 +1,10 @@
-"""Do a sequence's depth, poses and images fit together? Checked by warping depth between its frames.
+"""Do a sequence's depth, poses and images fit together? Checked by warping depth between its frames, and by corners
+tracked in its images.
 
 Wrong conventions are silent: inverted poses or millimetres read as metres give a variance map that is
-merely wrong. Depth of one frame, moved into a later one, must agree with that frame's depth; the check
-also tries what people get wrong (inverse poses, other axes, another depth scale) and names what fits.
+merely wrong. Depth of one frame, moved into a later one, must agree with that frame's depth, and corners must move as
+poses and intrinsics say; the check also tries what people get wrong (inverse poses, other axes, another depth scale,
+intrinsics of another size, a late trajectory) and names what fits.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ufmstar_torch.eval.check.depth_image_fit import DepthImageFit, depth_image_fit
+from ufmstar_torch.eval.check.image_fit import GIVEN, ImageFit, image_fit, track_corners
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
@@ -29,6 +32,7 @@ _SCALE_TOLERANCE = 1.25
 # See depth_image_fit(): with 10 frames, registered recordings have at least .5, displaced ones at most .2.
 _ALIGNED, _NOT_ALIGNED, _REGISTRATION_FRAMES = 0.4, 0.25, 12
 _MIN_EDGES, _MIN_CONTRAST = 500, 0.03  # contrast observed: .04 to .25
+_READING, _DISAGREE, _APART = "the poses look", "depth and poses disagree", "no two frames overlap"
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,7 @@ class SequenceCheck:
     scale: float  # by what depth must be multiplied then,
     best_error: float  # and the error with both
     registration: DepthImageFit | None  # how depth lies on the image, None where it was not checked
+    images: ImageFit | None  # how poses and intrinsics fit the images, None where no corner could be followed
     unreadable: tuple[str, ...]  # files that could not be decoded
     problems: tuple[str, ...]
     undecided: tuple[str, ...]  # what this sequence leaves open
@@ -66,15 +71,14 @@ class _Pair:
 def check_sequence(sequence: FrameSequence, pairs: int = 8) -> SequenceCheck:
     """Check pose convention, depth scale and registration on evenly spaced pairs of frames.
 
-    Of a sequence without poses only the registration is checked; there are no pairs then, and ``error`` is NaN. Raises
-    ValueError: fewer than two frames with depth (one, without poses) can be read; ``pairs`` is not positive.
+    Without poses or depth there are no pairs, and ``error`` is NaN. Raises ValueError: ``pairs`` is not positive.
     """
     if pairs < 1:
         raise ValueError(f"pairs must be at least 1, got {pairs}")
     check = _Check(sequence)
-    figures, registration = check.geometry(pairs), check.registration()
+    figures, images, registration = check.geometry(pairs), check.images(), check.registration()
     unreadable = tuple(dict.fromkeys(check.unreadable))
-    return SequenceCheck(*figures, registration, unreadable, tuple(check.problems), tuple(check.undecided))
+    return SequenceCheck(*figures, registration, images, unreadable, tuple(check.problems), tuple(check.undecided))
 
 
 def warp_error(pair: _Pair, poses: str, scale: float) -> float:
@@ -125,7 +129,8 @@ class _Check:
             if any(np.isfinite(curve).any() for curve in errors.values()):
                 break
         if not pairs:
-            raise ValueError(f"sequence {self.sequence.name!r} has no two readable frames with depth to compare")
+            self.undecided.append("no two readable frames have depth, whose scale and poses could be compared")
+            return 0, 0, float("nan"), OURS, 1.0, float("nan")
         poses = min(errors, key=lambda name: float(errors[name].min()))
         around = _SCALES[int(np.argmin(errors[poses]))]
         fine = around * 10.0 ** np.linspace(-0.125, 0.125, 21)
@@ -138,6 +143,15 @@ class _Check:
             scale = 1.0
         self._judge_geometry(errors, given, best, poses, scale)
         return len(pairs), gap, given, poses, scale, best
+
+    def images(self) -> ImageFit | None:
+        """Check poses and intrinsics with tracked corners; what they name explains why no depth fits."""
+        fit = image_fit(self.sequence, track_corners(self.sequence))
+        if fit is not None and fit.problem and not any(_READING in problem for problem in self.problems):
+            if fit.reading != GIVEN:
+                self.problems = [p for p in self.problems if _DISAGREE not in p and _APART not in p]
+            self.problems.append(fit.problem)
+        return fit
 
     def registration(self) -> DepthImageFit | None:
         """Check how depth lies on the image, where the depth maps claim to lie there."""
@@ -172,15 +186,15 @@ class _Check:
     ) -> None:
         """Note problems and undecided questions of poses and depth scale."""
         if not np.isfinite(best):
-            self.problems.append("no two frames overlap under any reading of the poses")
+            self.problems.append(f"{_APART} under any reading of the poses")
             return
         as_given = f"by {given:.1%} as given" if np.isfinite(given) else "as given frames do not overlap"
         measured = f"warped depth is off by {best:.1%} then, {as_given}"
         if best > _MAX_ERROR:
-            self.problems.append(f"depth and poses disagree under every reading tried ({measured})")
+            self.problems.append(f"{_DISAGREE} under every reading tried ({measured})")
             return
         if poses != OURS:
-            self.problems.append(f"the poses look {CONVENTIONS[poses].description} ({measured})")
+            self.problems.append(f"{_READING} {CONVENTIONS[poses].description} ({measured})")
         if not 1 / _SCALE_TOLERANCE < scale < _SCALE_TOLERANCE:
             size = "small" if scale > 1 else "large"
             self.problems.append(f"depth looks too {size}: times {scale:.3g} fits ({measured})")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.eval.check.check import SequenceCheck, check_sequence
-from ufmstar_torch.eval.run.files import to_json
+from ufmstar_torch.eval.check.image_fit import GIVEN
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.poses import OURS
@@ -62,10 +62,6 @@ class DataReport:
         decided = self.checked.get("registration") and not any(_REGISTERED in text for text in self.undecided)
         return bool(self.checked.get("pairs") or decided)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; what is not finite is None."""
-        return {"ok": self.ok, "compared": self.compared, **to_json(self)}
-
 
 def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **options: Any) -> DataReport:
     """Open a sequence (``options`` as ``open_sequence`` takes them) and check all that needs no network on ``pairs`` of
@@ -110,42 +106,55 @@ def _verdict(sequence: FrameSequence, path: str | Path, pairs: int, options: Map
     if len(sequence) < _FEW * len(sequence.names_on_disk):
         problems.append(f"only {len(sequence)} of {len(sequence.names_on_disk)} frames are usable")
         remedies.append("see why frames are skipped above; if it is poses: --time-offset, --fps, --max-pose-gap")
-    try:
-        outcome = check_sequence(sequence, pairs)
-    except ValueError as error:
-        undecided = (f"nothing was compared: {error}",)
-        return {"problems": tuple(problems), "remedies": tuple(remedies), "undecided": undecided}
+    outcome = check_sequence(sequence, pairs)
     read, broken = _read_frames(sequence)
     if broken:
         problems.append(f"{len(broken)} of the {read} frames read cannot be decoded, first {broken[0]}")
         remedies.append("they are skipped and counted when the sequence is used; copy them again if it is many")
     problems += outcome.problems
     remedies += _remedies(outcome, sequence, path, options)
-    figures = ("pairs", "gap", "error", "poses", "scale", "best_error", "registration")
+    figures = ("pairs", "gap", "error", "poses", "scale", "best_error", "registration", "images")
     checked = {name: value for name, value in asdict(outcome).items() if name in figures}
     checked |= {"read": read, "unreadable": broken}
+    if outcome.images is not None:
+        checked["images"]["words"] = outcome.images.words
     words = {"problems": tuple(problems), "remedies": tuple(remedies), "undecided": outcome.undecided}
     return {"checked": checked, **words}
 
 
 def _remedies(check: SequenceCheck, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
     remedies = []
-    if check.poses != OURS:
+    seen = GIVEN if check.images is None else check.images.reading
+    if (poses := seen.poses if check.poses == OURS else check.poses) != OURS:
         given = options.get("poses", OURS)
-        remedies.append(f"--poses {check.poses}" if given == OURS else f"leave --poses {given} out")
-    if any("depth looks too" in problem for problem in check.problems):
-        remedies.append(_scale_remedy(check.scale, sequence, path, options))
-    if any("disagree" in problem or "no two frames overlap" in problem for problem in check.problems):
+        remedies.append(f"--poses {poses}" if given == OURS else f"leave --poses {given} out")
+    elif seen.late:
+        remedies.append(_time_remedy(seen.late, sequence, options))
+    elif seen.factor != 1:
+        remedies.append(f"--intrinsics: those of images of this size, about {seen.factor:.2g} times what is given")
+    elif any("disagree" in problem or "no two frames overlap" in problem for problem in check.problems):
         remedies.append(
             "the trajectory may be another recording's, or shifted in time: --trajectory, --time-offset; or the "
             "intrinsics belong to other images: --intrinsics"
         )
+    if any("depth looks too" in problem for problem in check.problems):
+        remedies.append(_scale_remedy(check.scale, sequence, path, options))
     if any("not registered" in problem for problem in check.problems):
         remedies.append(
             "if the depth camera is another one, say so: --depth-intrinsics; if it stands beside the colour camera, "
             "warp its maps into that first (7-Scenes: --T-color-depth)"
         )
     return remedies
+
+
+def _time_remedy(late: int, sequence: FrameSequence, options: Mapping[str, Any]) -> str:
+    """The change that gives images the poses of so many frames later."""
+    times = [entry.timestamp for entry in sequence.entries]
+    known = [time for time in times if time is not None]
+    by_line = f"give each image the pose {_count(abs(late), 'line')} {'further down' if late > 0 else 'further up'}"
+    if len(known) < len(times) or (options.get("trajectory") is None and sequence.layout != "tum"):
+        return by_line
+    return f"--time-offset {options.get('time_offset', 0.0) + late * float(np.median(np.diff(known))):.3g}"
 
 
 def _scale_remedy(factor: float, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> str:
@@ -235,12 +244,13 @@ def page(report: DataReport) -> str:
         f"  depth         {_depth(report)}",
         f"  poses         {f'path of {report.walked:.1f} m' if report.posed else 'none: single images'}",
     ]
-    if report.checked and report.posed:
+    if report.checked.get("pairs"):
         pairs, gap, error = (report.checked[key] for key in ("pairs", "gap", "error"))
         fit = f"off by {error:.1%}" if error < float("inf") else "does not overlap"
         lines.append(f"  geometry      depth warped {_count(gap, 'frame')} on {fit} ({_count(pairs, 'pair')})")
-    lies = report.checked.get("registration")
-    if lies is not None:
+    if (images := report.checked.get("images")) is not None:
+        lines.append(f"  corners       {images['words']}, {_count(images['pairs'], 'pair')}")
+    if (lies := report.checked.get("registration")) is not None:
         lines.append(f"  registration  {lies['quality']:.2f} of 1: how well depth edges meet image edges as they are")
     lines += [f"  undecided     {text}" for text in report.undecided]
     return "\n".join([*lines, *_problems(report), _end(report)])

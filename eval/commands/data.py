@@ -47,13 +47,15 @@ def read(words: Sequence[str]) -> CheckOptions:
 def main(options: CheckOptions) -> int:
     """Check, and print what was found; the exit code."""
     from ufmstar_torch.eval.check.data_check import lines, page
+    from ufmstar_torch.eval.run.files import to_json
 
     try:
         reports, several = _check(options)
     except (OSError, ValueError) as error:
         raise UsageError(error) from error
     if options.json:
-        print(json.dumps([report.to_dict() for report in reports], indent=2))
+        plain = [{"ok": report.ok, "compared": report.compared, **to_json(report)} for report in reports]
+        print(json.dumps(plain, indent=2))
     else:
         print(lines(reports) if several else page(reports[0]))
     return 0 if all(report.ok for report in reports) else 1

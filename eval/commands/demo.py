@@ -170,17 +170,17 @@ def _networks(weights: Path | None, device: torch.device) -> tuple[NetworkSource
 def _figures(result: RowFigures, state_bytes: int) -> dict[str, Any]:
     """A row of the table: figures, median times [ms] and the bytes of its state."""
     ms = result.ms
-    own = ms.get("anchors", 0.0) + ms["uncertainty"] if result.state else None
+    uncertainty_ms = ms.get("anchors", 0.0) + ms["uncertainty"] if result.state else None
     return {
         "figures": result.figures,
         "network_ms": ms["network"],
-        "uncertainty_ms": own,
+        "uncertainty_ms": uncertainty_ms,
         "state_bytes": state_bytes,
     }
 
 
 def _own_curves(result: RowFigures) -> dict[str, Any]:
-    """The curves of a row but for those that depend on other rows (``RowMetrics.curves``)."""
+    """The curves of a row but for those that depend on other rows (``RowJudge``)."""
     return {name: values for name, values in result.curves.items() if ":" not in name}
 
 
@@ -193,8 +193,8 @@ def _weights(path: Path | None) -> Iterator[Path]:
             raise FileNotFoundError(f"--weights: no such file: {path}")
         yield path
         return
-    own = files("ufmstar_torch.models").joinpath(*_WEIGHTS)
-    if not own.is_file():
+    packaged = files("ufmstar_torch.models").joinpath(*_WEIGHTS)
+    if not packaged.is_file():
         raise FileNotFoundError(f"the package was installed without {'/'.join(_WEIGHTS)}; --weights FILE names another")
-    with as_file(own) as file:
+    with as_file(packaged) as file:
         yield file

@@ -49,9 +49,9 @@ def predictions(rows: Iterable[Row], network: DepthSource, frames: int) -> int:
     needed: set[tuple[str, int, int | None]] = set()
     for row in rows:
         every = row.method.every_member and network.passes > 1
-        taken = [number for number in range(frames) if selects(row.setting, number)]
+        numbers = [number for number in range(frames) if selects(row.setting, number)]
         how = row.setting.preprocess
-        needed |= {(how, number, None if every else network.turn(place)) for place, number in enumerate(taken)}
+        needed |= {(how, number, None if every else network.turn(position)) for position, number in enumerate(numbers)}
     return len(needed)
 
 
@@ -69,5 +69,5 @@ def _bytes_per_file(sequence: FrameSequence, networks: Mapping[str, DepthSource]
 
 def _maps(maps: DepthPrediction, several: bool) -> int:
     """Bytes of the maps in single precision; all of several members have an epistemic variance together."""
-    own = [value for value in (maps.aleatoric_variance, maps.epistemic_variance) if value is not None]
-    return 4 * maps.depth.numel() * (3 if several else 1 + len(own))
+    variances = [value for value in (maps.aleatoric_variance, maps.epistemic_variance) if value is not None]
+    return 4 * maps.depth.numel() * (3 if several else 1 + len(variances))

@@ -305,12 +305,12 @@ def _settings(wanted: _Fields, values: Mapping[str, Any]) -> dict[str, Any]:
     *path, _ = wanted.prefix.split(".")
     for key in path:
         values = values[key]
-    own = {f.name: values.get(f.name) for f in fields(wanted.config) if f.name not in wanted.without}
+    settings = {f.name: values.get(f.name) for f in fields(wanted.config) if f.name not in wanted.without}
     for f in fields(wanted.config):
-        section = own.get(f.name)
+        section = settings.get(f.name)
         if _default(f) is None and isinstance(section, Mapping):  # off unless one of its values is given
-            own[f.name] = {name: value for name, value in section.items() if value is not None} or None
-    return {name: value for name, value in own.items() if not (wanted.unset and value is None)}
+            settings[f.name] = {name: value for name, value in section.items() if value is not None} or None
+    return {name: value for name, value in settings.items() if not (wanted.unset and value is None)}
 
 
 @cache

@@ -54,8 +54,8 @@ def main(options: RecalibrateOptions) -> int:
         rows = [row for row in results.rows if row.method.fusion == UFM_STAR and not row.setting.recalibration]
         row = next((row for row in rows if row.label == options.row), None)
         if row is None:
-            known = ", ".join(row.label for row in rows) or "(none: no row of UfM*)"
-            raise ValueError(f"--row must be one of {known}, got {options.row!r}")
+            labels = ", ".join(row.label for row in rows) or "(none: no row of UfM*)"
+            raise ValueError(f"--row must be one of {labels}, got {options.row!r}")
         counts = _counts(results, row)
         fitted = fit(list(counts.values()), options.kind)
         _about(fitted, results, row).save(options.to)

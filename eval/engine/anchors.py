@@ -42,7 +42,7 @@ class Tracks:
     """
 
     def __init__(self, source: LandmarkSource | None = None) -> None:
-        self._streams = StreamLandmarks(CORNERS if source is None else source)
+        self._streams = StreamLandmarks(landmark_source(CORNERS) if source is None else source)
         self._last: tuple[Frame, Landmarks, float] | None = None
 
     def of(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:

@@ -232,8 +232,8 @@ def load_members(
                 raise ValueError(f"model {model!r} does not take {sorted(how)}: {error}") from error
         if member is not None and member >= len(loaded):
             raise ValueError(f"{path} has {len(loaded)} members, there is no {member} (counted from 0)")
-        own = loaded if member is None else [loaded[member]]
-        members += [inference.ready(network, path, device) for network in own]
+        selected = loaded if member is None else [loaded[member]]
+        members += [inference.ready(network, path, device) for network in selected]
     inputs = [network.preprocess for network in members]
     if any(other != inputs[0] for other in inputs[1:]):
         raise ValueError(f"weights: the members of an ensemble must want the same input, got {inputs}")

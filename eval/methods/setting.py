@@ -77,8 +77,8 @@ class Setting(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.anchors not in ("", TRACKED, DENSE, TRUTH) and not str(self.anchors).lower().endswith(FILE_TYPES):
-            known = f"{TRACKED!r}, {DENSE!r}, {TRUTH!r} or a file {', '.join(FILE_TYPES)}"
-            raise ValueError(f"Setting.anchors must be {known}, got {self.anchors!r}")
+            allowed = f"{TRACKED!r}, {DENSE!r}, {TRUTH!r} or a file {', '.join(FILE_TYPES)}"
+            raise ValueError(f"Setting.anchors must be {allowed}, got {self.anchors!r}")
         count = self.anchor_count
         if count is not None and not isinstance(count, int):
             raise ValueError(f"Setting.anchor_count must be a whole number, got {count!r}")
@@ -104,8 +104,8 @@ class Setting(Checked):
 
     def to_dict(self) -> dict[str, Any]:
         """The values that differ from the default, flat: {} for the row as it is."""
-        own = {f.name: f.default for f in fields(self) if f.name not in ("overrides", "seed")}
-        changed = {name: getattr(self, name) for name, plain in own.items() if getattr(self, name) != plain}
+        defaults = {f.name: f.default for f in fields(self) if f.name not in ("overrides", "seed")}
+        changed = {name: getattr(self, name) for name, plain in defaults.items() if getattr(self, name) != plain}
         return {**dict(self.overrides), **changed, **({"seed": self.seed} if self.draws else {})}
 
     @property
@@ -121,8 +121,8 @@ class Setting(Checked):
     @property
     def of_ufm_star(self) -> tuple[str, ...]:
         """Names of what is changed of UfM*, which other methods do without."""
-        own = ("ufm_preset", "aleatoric_in_h", "anchors", "recalibration")
-        return (*self.overrides, *(name for name in own if getattr(self, name) != getattr(DEFAULT, name)))
+        names = ("ufm_preset", "aleatoric_in_h", "anchors", "recalibration")
+        return (*self.overrides, *(name for name in names if getattr(self, name) != getattr(DEFAULT, name)))
 
     @property
     def draws(self) -> bool:
@@ -157,11 +157,11 @@ def setting_from(values: Mapping[str, Any]) -> Setting:
     Raises:
         ValueError: an unknown name, or a value that it does not take.
     """
-    own = {name: value for name, value in values.items() if name in _OWN}
+    direct = {name: value for name, value in values.items() if name in _OWN}
     overrides = {name: value for name, value in values.items() if name not in _OWN}
-    preset = own.get("ufm_preset", DEFAULTS)
+    preset = direct.get("ufm_preset", DEFAULTS)
     changed = {name: value for name, value in overrides.items() if value != default_of(name, preset)}
-    setting = Setting(overrides=changed, **own)
+    setting = Setting(overrides=changed, **direct)
     configured(setting)
     return setting
 
@@ -187,10 +187,12 @@ def default_of(name: str, preset: str = DEFAULTS) -> Any:
         raise ValueError(f"setting {name!r} is a group: name one of its values, as {inner[0]}")
     if name in values:
         return values[name]
-    known = [own for own in _OWN if own != "seed"]
-    near = get_close_matches(name, [*known, *values], n=1)
+    expected = [field_ for field_ in _OWN if field_ != "seed"]
+    near = get_close_matches(name, [*expected, *values], n=1)
     meant = f"; did you mean {near[0]}?" if near else ""
-    raise ValueError(f"no setting is called {name!r}: expected {', '.join(known)}, or UfM*'s own, as ema_alpha{meant}")
+    raise ValueError(
+        f"no setting is called {name!r}: expected {', '.join(expected)}, or UfM*'s own, as ema_alpha{meant}"
+    )
 
 
 def configured(setting: Setting) -> UfMStarConfig:

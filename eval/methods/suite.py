@@ -80,14 +80,14 @@ class Suite:
 
     def with_bases(self, bases: Iterable[str]) -> Suite:
         """The suite with the rows of some bases only. Raises ValueError: none is left."""
-        given = set(bases)
-        kept = tuple(row for row in self.rows if row.method.base in given)
-        if not kept:
+        available = set(bases)
+        rows = tuple(row for row in self.rows if row.method.base in available)
+        if not rows:
             raise ValueError(
                 f"suite {self.name} has rows of {', '.join(self.bases)}, but there are networks of "
-                f"{', '.join(sorted(given)) or 'none'} only: give --network BASE=MODEL:FILES for one of them"
+                f"{', '.join(sorted(available)) or 'none'} only: give --network BASE=MODEL:FILES for one of them"
             )
-        return replace(self, rows=kept)
+        return replace(self, rows=rows)
 
 
 def names() -> tuple[str, ...]:
@@ -126,11 +126,11 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
         if base is not None and "base" not in values:
             raise ValueError("--base goes with figures and ablations of one network, the suite names its own")
         rows = tuple(dict.fromkeys(_rows_of(values, base or values.get("base"), preset)))
-        own = Path(name).stem
+        stem = Path(name).stem
         if base is not None and not rows:
             raise ValueError(f"the suite has no rows of {base}")
         sweep = tuple(dict.fromkeys(_sweep(values)))
-        return Suite(values.get("name", own), values.get("title", own), rows, sweep, values.get("efficiency", False))
+        return Suite(values.get("name", stem), values.get("title", stem), rows, sweep, values.get("efficiency", False))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{name}: {error}") from error
 
@@ -157,11 +157,11 @@ def _read(name: str) -> dict[str, Any]:
 
 def _rows_of(values: Mapping[str, Any], base: str | None, preset: str | None) -> Iterator[Row]:
     """The rows of a suite and of those that it includes, for a base or for the suite's own bases."""
-    for own in values.get("bases", [base]):
+    for network in values.get("bases", [base]):
         for n, part in enumerate(values.get("rows", [])):
             _check(part, _ROW_KEYS, f"rows {n + 1}")
             try:
-                yield from _expanded(part, own, preset)
+                yield from _expanded(part, network, preset)
             except ValueError as error:
                 raise ValueError(f"rows {n + 1}: {error}") from error
     for name in values.get("include", []):

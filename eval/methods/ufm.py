@@ -186,11 +186,11 @@ class UfM(StatefulModule):
             keep = ~self._chosen(streams, b)
             of_point = keep.repeat_interleave(self.points)
             fresh = _empty(b, dtype, device)
-            kept = {"moments": self.moments[of_point], "count": self.count[of_point]}
+            remaining = {"moments": self.moments[of_point], "count": self.count[of_point]}
             for name in _STATE[2:]:
                 old = getattr(self, name)
-                kept[name] = torch.where(keep.view(-1, *[1] * (old.dim() - 1)), old, fresh[name])
-            self._store(kept)
+                remaining[name] = torch.where(keep.view(-1, *[1] * (old.dim() - 1)), old, fresh[name])
+            self._store(remaining)
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         """Also that no stream has more points than ``max_points``, and every covariance is one that points can have."""
@@ -213,17 +213,17 @@ class UfM(StatefulModule):
         R, t = relative_pose(frame.T_world_cam, first)
         s2 = self._observation_variance(frame)
         # No pixel of a stream at fault is valid: it stays as it is.
-        given = zip(clouds, frame.depth, s2, frame.valid, frame.intrinsics, R, t, strict=True)
-        taken = [take_in(cloud, View(*view), self.config.max_points) for cloud, *view in given]
+        observed = zip(clouds, frame.depth, s2, frame.valid, frame.intrinsics, R, t, strict=True)
+        fused = [take_in(cloud, View(*view), self.config.max_points) for cloud, *view in observed]
 
         def each(values: Iterable[int]) -> Tensor:
             return torch.tensor(list(values), device=s2.device)
 
-        points = each(len(one.cloud.count) for one in taken)
+        points = each(len(one.cloud.count) for one in fused)
         self._store(
             {
-                "moments": _joined([one.cloud.moments for one in taken]),
-                "count": _joined([one.cloud.count for one in taken]),
+                "moments": _joined([one.cloud.moments for one in fused]),
+                "count": _joined([one.cloud.count for one in fused]),
                 "points": points,
                 "T_world_first": first,
                 "started": state["started"] | fine,
@@ -233,15 +233,15 @@ class UfM(StatefulModule):
         )
         statistics = UfMStatistics(
             points=points,
-            memory=points * taken[0].cloud.bytes_per_point,
-            fused=each(one.fused for one in taken),
-            new=each(one.new for one in taken),
-            dropped=each(one.dropped for one in taken),
+            memory=points * fused[0].cloud.bytes_per_point,
+            fused=each(one.fused for one in fused),
+            new=each(one.new for one in fused),
+            dropped=each(one.dropped for one in fused),
             valid_pixels=frame.valid.sum((1, 2)),
             fault=frame.fault,
             rotation_deviation=frame.rotation_deviation,
         )
-        return torch.stack([one.variance for one in taken]), statistics
+        return torch.stack([one.variance for one in fused]), statistics
 
     def _observation_variance(self, frame: FrameInput) -> Tensor:
         """[B, H, W] s^2 of one observation [m^2]: the network's variance, 0 if it states none."""

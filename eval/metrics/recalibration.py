@@ -59,8 +59,8 @@ def fit(joints: Sequence[Array], kind: str = ISOTONIC, groups: int = GROUPS) -> 
         knots.append(float(np.exp((share @ np.log(np.maximum(value, LOW))) / share.sum())))
         scales.append(_scale(errors, value))
     fitted = isotonic_regression(np.log(scales), weights=np.array(mass)).x
-    kept = [0, *(i for i in range(1, len(knots)) if knots[i] > knots[i - 1] * 1.0001)]
-    return Recalibration(tuple(knots[i] for i in kept), tuple(float(np.exp(fitted[i])) for i in kept))
+    rising = [0, *(i for i in range(1, len(knots)) if knots[i] > knots[i - 1] * 1.0001)]
+    return Recalibration(tuple(knots[i] for i in rising), tuple(float(np.exp(fitted[i])) for i in rising))
 
 
 def figures(joint: Array, recalibration: Recalibration | None) -> dict[str, float]:

@@ -120,11 +120,11 @@ def mean_and_ci(values: Iterable[float], *, level: float = 0.95) -> tuple[float,
     """
     if not 0 < level < 1:
         raise ValueError(f"level must lie in (0, 1), got {level}")
-    kept = [float(v) for v in values if not math.isnan(v)]
-    if len(kept) < 2:
-        return (kept[0] if kept else math.nan), math.nan
+    finite = [float(v) for v in values if not math.isnan(v)]
+    if len(finite) < 2:
+        return (finite[0] if finite else math.nan), math.nan
     from scipy.stats import t
 
-    n, mean = len(kept), math.fsum(kept) / len(kept)
-    deviation = math.sqrt(math.fsum((v - mean) ** 2 for v in kept) / (n - 1))
+    n, mean = len(finite), math.fsum(finite) / len(finite)
+    deviation = math.sqrt(math.fsum((v - mean) ** 2 for v in finite) / (n - 1))
     return mean, float(t.ppf(0.5 + level / 2, n - 1)) * deviation / math.sqrt(n)

@@ -20,8 +20,7 @@ from ufmstar_torch.eval.report.table import Cell, Column, Line, Table
 # Keys and words of ``efficiency.json``, as eval/bench writes them.
 DEPTH, NETWORK, MULTIVIEW = "depth", "network_uncertainty", "multiview"
 CPU, GPU, GROSS = "cpu", "gpu", "gross"
-NOT_MEASURABLE = "not measurable here"
-NOT_SEPARABLE = "not separable"
+NOT_MEASURABLE, NOT_SEPARABLE = "not measurable here", "not separable"
 UNITS = {GPU: "GPU", CPU: "CPU"}
 _SMALLEST = 0.01  # less prints as "<0.01"
 

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch import unmeasured
+from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.run.colours import known_where, striped
 
 Map = NDArray[np.float32]
@@ -133,11 +133,7 @@ def find_examples(folder: Path, labels: Mapping[str, str] | None = None) -> list
 
 def load_arrays(file: Path, names: Sequence[str]) -> dict[str, NDArray]:
     """The arrays of an npz file. Raises ValueError: it is none, or broken, or one of ``names`` is missing."""
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (BadZipFile, EOFError, KeyError, ValueError) as error:
-        raise ValueError(f"{file} is not a readable npz file: {error}") from error
+    arrays = read_npz_whole(file)
     missing = [name for name in names if name not in arrays]
     if missing:
         raise ValueError(f"{file} must hold {', '.join(names)}; {', '.join(missing)} is missing")

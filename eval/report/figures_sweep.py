@@ -26,7 +26,7 @@ COUNT = "anchor_count"
 Rest = tuple[tuple[str, Any], ...]
 # Rows without a number of anchors have at most so many.
 _COUNTS = {"": 0, TRACKED: TrackerConfig().max_points, TRUTH: TRUTH_COUNT}
-# What a row without anchors cannot have, beside what begins with "anchor_" or "anchors.".
+# Settings that a row without anchors cannot have, beside those that begin with "anchor_" or "anchors.".
 _OF_ANCHORS = ("anchors", "track_noise", "corrected", "posterior")
 _ANCHORED = {TRACKED: "anchored", DENSE: "dense anchors", TRUTH: "truth anchors"}
 

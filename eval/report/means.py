@@ -24,15 +24,10 @@ class Mean(NamedTuple):
     half: float = math.nan  # half-width of its 95 % confidence interval, NaN below MIN_SEQUENCES
     sequences: int = 0  # that have the figure
 
-    @property
-    def beyond(self) -> bool:
-        """Whether 0 lies outside the interval; False where there is no interval."""
-        return abs(self.value) > self.half
-
     def better(self, quantity: Quantity) -> bool | None:
-        """Whether a difference beyond its interval is an improvement; None within the interval, or where neither
-        direction is better."""
-        if not self.beyond or quantity.better is None:
+        """Whether a difference beyond its interval is an improvement; None within the interval, without one, or where
+        neither direction is better."""
+        if not abs(self.value) > self.half or quantity.better is None:
             return None
         return (self.value < 0) == (quantity.better == LOWER)
 

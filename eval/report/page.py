@@ -22,7 +22,7 @@ from ufmstar_torch.eval.run.files import write_atomic
 
 PAGE = "report.html"
 TEMPLATES = Path(__file__).parent / "templates"
-# Of WebP: below it letters in pictures get visible rings.
+# WebP's; with less, letters in pictures get visible rings.
 QUALITY = 84
 # Kinds of figures, the first words of their files' names, by the part of the page in which they stand.
 CURVES, COST = ("calibration", "error", "entropy", "sweep"), ("latency", "tradeoff")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from hashlib import sha256
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from ufmstar_torch.eval.report.examples import Example, find_examples
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.report.rooms import Snapshot, choose_times, draw_room, find_rooms
 from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
-from ufmstar_torch.eval.run.panels import Bar, Box, GridRow, Panel, PanelScales, draw_grid
+from ufmstar_torch.eval.run.panels import Bar, Box, GridRow, Panel, draw_grid
 from ufmstar_torch.eval.suite.work_items import WorkItem
 
 STRIP, BREAKDOWN, COMPARE, ROOM = "strip", "breakdown", "compare", "room"
@@ -37,12 +37,10 @@ DIFFERENCE_MAP = "RdBu_r"
 ZOOM = 1 / 3
 
 
-@dataclass(frozen=True)
-class Picture:
-    """One picture, as pictures.json lists it."""
+class Picture(NamedTuple):
+    """One picture and its words."""
 
     file: str  # name within the figures' folder
-    kind: str  # "strip", "breakdown", "compare" or "room"
     title: str
     caption: str  # how to read it
     alt: str  # for a reader who cannot see it
@@ -140,7 +138,7 @@ def _picture(example: Example, rows: Sequence[str], kind: str, base: str, title:
     listed = ", ".join(f"{label} ({'no NLL' if nll is None else f'mean NLL {nll:.2f}'})" for label, nll in means)
     name = file_name(kind, example.dataset, example.sequence, example.frame, *filter(None, (base,)))
     title = f"{example.sequence}, frame {example.frame}: {title}"
-    return Picture(name, kind, title, caption, f"{title}; {listed}")
+    return Picture(name, title, caption, f"{title}; {listed}")
 
 
 def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequence[Snapshot]) -> Picture:
@@ -152,7 +150,14 @@ def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequenc
     )
     title = f"{sequence}: the Gaussians of {label}"
     alt = f"{title}: {counts} Gaussians, coloured by disagreement from 0 to {scale.high:.2g} m"
-    return Picture(name, ROOM, title, caption, alt)
+    return Picture(name, title, caption, alt)
+
+
+class PanelScales(NamedTuple):
+    """The colour scales of a frame's pictures: of depth, and of sigma and error together."""
+
+    depth: ColourScale
+    length: ColourScale
 
 
 def fit_strip_scales(example: Example, rows: Sequence[str]) -> PanelScales:
@@ -193,17 +198,11 @@ def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Pictu
     body = []
     for row in rows:
         maps = example.rows[row]
-        parts = [
-            Panel(None if part is None else scales.length.rgb(maps.root(part)), absent="none")
-            for part in (maps.aleatoric, maps.epistemic)
-        ]
-        views = None if maps.disagreement is None else maps.striped(scales.length.rgb(maps.root(maps.disagreement)))
+        parts = (maps.aleatoric, maps.epistemic, maps.disagreement)
+        a, e, m = (None if part is None else scales.length.rgb(maps.root(part)) for part in parts)
+        panels = [Panel(rgb, absent="none") for rgb in (a, e, None if m is None else maps.striped(m))]
         error, sigma, nll = _judged(example, row, scales)
-        body.append(
-            GridRow(
-                example.label(row), figures_of(example, row), [*parts, Panel(views, absent="none"), sigma, error, nll]
-            )
-        )
+        body.append(GridRow(example.label(row), figures_of(example, row), [*panels, sigma, error, nll]))
     captions = ("√A, aleatoric", "√E, epistemic", "√M, between views", "σ = √V, V = A + E + M", "|error|", "NLL")
     body[0] = body[0].captioned(captions)
     bars = [Bar("√A, √E, √M, σ and |error| [m]", scales.length, 0, span=5), Bar("NLL [nats]", NLL_SCALE, 5)]

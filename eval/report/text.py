@@ -22,7 +22,9 @@ NLL_OF_FEW = 100.0
 _CALIBRATION = {"nll": "NLL", "ece_delta": "ECE_delta", "ece_q": "ECE_q"}
 _DEMO_COLUMNS = {"delta1": "delta1", **_CALIBRATION, "ause_rmse": "AUSE [m]"}
 _RUN_COLUMNS = {"delta1": "delta1", "abs_rel": "AbsRel", "rmse": "RMSE [m]", **_CALIBRATION, "spearman": "Spearman"}
-# What the counts of a frame's anchors mean, by their source: how many have a depth there, and of how many.
+_CALIBRATED = 4.0  # mean z^2 of held-out anchors, and its inverse: sigma is right to a factor of two
+_UNSUPPORTED = "mean sigma not shown: neither truth nor held-out anchors (--posterior) support it"
+# The counts of a frame's anchors by their source: how many have a depth, and of how many.
 _FOUND = {
     "tracked": ("triangulated", "tracked"),
     "landmarks": ("in view", "in the map"),
@@ -94,7 +96,7 @@ def demo_explanation(summary: Mapping[str, Any]) -> str:
         "Better: a high delta1, a low NLL, ECE and AUSE, and a sigma that equals the RMSE beside it.",
     ]
     hints = {
-        SHEET: f"the last four columns share a scale, so sigma can be compared with the error; {unseen} rooms below",
+        SHEET: f"sigma and the error beside it share a scale, so that they can be compared; {unseen} rooms below",
         CURVES: "nearer to the diagonal is better; on the left, a curve below it is over-confident",
         PLY: f"the mixture, brighter = views disagree more; for splat viewers ({ELLIPSOIDS}: MeshLab, Blender)",
     }
@@ -128,8 +130,8 @@ def run_table(summary: Mapping[str, Any]) -> str:
                 f"0 and {1000 * NEAR_ZERO:g} mm; --ufm.variance_floor 1e-4 bounds what they cost"
             )
     else:
-        sigma = number(uncertainty["mean_sigma"])
-        lines.append(f"no metrics: {summary['metrics_reason']}; mean sigma {sigma} m")
+        sigma = f"mean sigma {number(uncertainty['mean_sigma'])} m" if supported(summary) else _UNSUPPORTED
+        lines.append(f"no metrics: {summary['metrics_reason']}; {sigma}")
     if uncertainty["unmeasured_share"]:
         lines.append(
             f"not compared: {uncertainty['unmeasured_share']:.0%} of the pixels show what one view alone has seen; "
@@ -139,7 +141,7 @@ def run_table(summary: Mapping[str, Any]) -> str:
     stages = ", ".join(f"{s} {ms:.1f}" for s, ms in time["median_ms"].items() if ms is not None)
     rate = time["frames_per_second"]
     if summary["anchors"] is not None:
-        lines += _anchor_lines(summary["anchors"], summary["frames"]["done"], summary["source"]["anchors"])
+        lines += _anchor_lines(summary)
     lines += [
         f"K = {mixture['components']} components in {mixture['bytes_in_use'] / 1000:.1f} kB "
         f"({mixture['bytes_allocated'] / 1000:.1f} kB allocated), mean disagreement "
@@ -148,14 +150,23 @@ def run_table(summary: Mapping[str, Any]) -> str:
     ]
     lines += [f"skipped {count}: {reason}" for reason, count in summary["frames"]["skipped"].items()]
     lines += [f"left out {count}: {reason}" for reason, count in summary["sequence"]["left_out"].items()]
-    return "\n".join(lines)
+    if (fit := summary["image_fit"]) is not None and not fit["problem"]:
+        lines.append(f"poses disagree with the images by {fit['error']:.1f} px (fine: below 1)")
+    return "\n".join([*lines, *(f"warning: {text}" for text in summary["warnings"])])
 
 
-def _anchor_lines(anchors: Mapping[str, Any], frames: int, kind: str) -> list[str]:
+def supported(summary: Mapping[str, Any]) -> bool:
+    """Whether held-out anchors are off by as much as the posterior states, to a factor of two."""
+    calibration = summary.get("posterior", {}).get("calibration")
+    return calibration is not None and 1 / _CALIBRATED < calibration < _CALIBRATED
+
+
+def _anchor_lines(summary: Mapping[str, Any]) -> list[str]:
     """A line on the effect of anchors, and one on the frames that had none."""
+    anchors, frames, kind = summary["anchors"], summary["frames"]["done"], summary["source"]["anchors"]
     used, actual, tracked = (anchors[f"{key}_per_frame"] for key in ("used", "found", "tracked"))
     line = f"anchors: {used:.1f} used a frame, of {actual:.1f} {_FOUND[kind][0]} and {tracked:.1f} {_FOUND[kind][1]}"
-    if used and anchors["mean_bias"] is not None:
+    if used and anchors["mean_bias"] is not None and supported(summary):
         way = "nearer" if anchors["mean_bias"] < 0 else "farther"
         expected = f"{abs(anchors['mean_bias']):.0%} {way} than predicted"
         line += f"; mean B {number(anchors['mean_anchored'])} m^2, true depth expected {expected}"

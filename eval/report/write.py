@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,9 +14,8 @@ from ufmstar_torch.eval.report.page import write_page
 from ufmstar_torch.eval.report.pictures import Picture, pictures_of
 from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.report.tables import write_tables, write_tidy
-from ufmstar_torch.eval.run.files import remove_temporaries, write_json_atomic
+from ufmstar_torch.eval.run.files import remove_temporaries
 
-INDEX = "pictures.json"
 KINDS = ("svg", "png")
 # Errors of drawing, after which a report goes on without the picture.
 _DRAWING_ERRORS = (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError)
@@ -44,7 +42,7 @@ def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> R
     if pictures not in KINDS:
         raise ValueError(f"figures must be {' or '.join(KINDS)}, got {pictures!r}")
     results = load_results(out, with_sums=figures)
-    # What a killed report has left; eval.json and the records are those of `ufmstar eval`.
+    # Remains of a killed report; eval.json and the records belong to `ufmstar eval`.
     for pattern in ("tables/.*.tmp", "figures/.*.tmp", ".results.*.tmp", ".table.*.tmp", ".report.*.tmp"):
         remove_temporaries(out.glob(pattern))
     files = [*write_tidy(results), *write_tables(results)]
@@ -72,7 +70,7 @@ def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 
 def _draw(results: Results, kind: str, undrawn: dict[str, str]) -> list[Path]:
-    """Draw figures and pictures into ``figures/``, with an index of the pictures, and write the page; their paths."""
+    """Draw figures and pictures into ``figures/``, and write the page; their paths."""
     folder = results.out / "figures"
     folder.mkdir(exist_ok=True)
     figures: list[Path] = []
@@ -88,8 +86,5 @@ def _draw(results: Results, kind: str, undrawn: dict[str, str]) -> list[Path]:
                 figures.append(path)
         except _DRAWING_ERRORS as error:
             undrawn[name] = " ".join(str(error).split()) or type(error).__name__
-    written = [*figures, *(folder / picture.file for picture in pictures)]
-    if pictures:
-        write_json_atomic(folder / INDEX, {"pictures": [asdict(picture) for picture in pictures]})
-        written.append(folder / INDEX)
-    return [*written, write_page(results, figures, pictures, undrawn)]
+    page = write_page(results, figures, pictures, undrawn)
+    return [*figures, *(folder / picture.file for picture in pictures), page]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from ufmstar_torch.anchors.landmarks import LandmarkSource
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.eval.check.image_fit import FollowedCorners, ImageFit, image_fit, track_corners
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
 from ufmstar_torch.eval.engine.estimators import Gaussians
 from ufmstar_torch.eval.engine.judge import UFM
@@ -43,6 +45,16 @@ class RunJob:
     # makes the source of the anchors, in its initial state; for ``config.anchors``.
     landmarks: Callable[[], LandmarkSource] = LandmarkTracker
     scale: NetworkScale | None = None  # of the poses, where it is the network's own; anchors then show shape alone
+
+    @cached_property
+    def corners(self) -> list[FollowedCorners]:
+        """Corners tracked over some of the frames."""
+        return track_corners(self.sequence, self.indices)
+
+    @cached_property
+    def image_fit(self) -> ImageFit | None:
+        """How poses and intrinsics fit the images; None where no corner could be followed."""
+        return image_fit(self.sequence, self.corners)
 
     def row(self, checkpoint: Checkpoint) -> RowRunner:
         """UfM* on the source, in the state of a checkpoint."""

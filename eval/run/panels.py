@@ -97,8 +97,8 @@ def draw_grid(
 
     grey = (colours.INVALID_GREY / 255,) * 3
     figure.add_artist(Rectangle((_MARGIN, bottom), 0.12, _BAR, color=grey, transform=figure.dpi_scale_trans))
-    words = "no value, no truth;\nstripes: not compared"
-    say(figure, _MARGIN + 0.18, bottom + _BAR / 2, words, size=7.5, color=FAINT, va="center", linespacing=1.2)
+    legend = "no value, no truth;\nstripes: not compared"
+    say(figure, _MARGIN + 0.18, bottom + _BAR / 2, legend, size=7.5, color=FAINT, va="center", linespacing=1.2)
     colours.save_png(figure, path)
 
 
@@ -178,8 +178,9 @@ MAPS = {
     "sigma": ("σ", "length"),
     "anchored": ("√B", "length"),
     "error": ("|error|", "length"),
-    "posterior_sigma": ("σ, posterior", "length"),
-    "posterior_error": ("|error|, posterior", "length"),
+    # Of its own: beside the network's errors the posterior's would all be black.
+    "posterior_sigma": ("σ, posterior", "posterior length"),
+    "posterior_error": ("|error|, posterior", "posterior length"),
 }
 
 
@@ -214,13 +215,6 @@ class FramePanel:
         return self.maps["depth"].shape
 
 
-class PanelScales(NamedTuple):
-    """The colour scales that all frames of a sheet or a video share: of depth, and of sigma and error together."""
-
-    depth: ColourScale
-    length: ColourScale
-
-
 class MapColumn(NamedTuple):
     """One kind of map: its label, its scale, and its name in ``MAPS``."""
 
@@ -239,21 +233,23 @@ class MapColumn(NamedTuple):
 
 def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:
     """The columns right of the image, of all maps that some panel has, on scales that fit all panels."""
-    scales = fit_scales(panels)._asdict()
+    scales = fit_scales(panels)
     shown = (name for name in MAPS if any(name in panel.maps for panel in panels))
     return [MapColumn(MAPS[name][0], scales[MAPS[name][1]], name) for name in shown]
 
 
-def fit_scales(panels: Sequence[FramePanel]) -> PanelScales:
-    """Scales over all panels: depths between their 1st and 99th percentile; sigma and error share one, from 0.
-
-    That one ends at the larger of their 99th percentiles, so that a sigma as large as the error has its colour.
-    """
+def fit_scales(panels: Sequence[FramePanel]) -> dict[str, ColourScale]:
+    """The scales of ``MAPS`` over all panels: depths between their 1st and 99th percentile; a sigma and its error share
+    one, from 0 to the larger of their 99th percentiles, so that a sigma as large as the error has its colour."""
     of = {name: [panel.maps[name] for panel in panels if name in panel.maps] for name in MAPS}
     depth = colours.robust_range([*of["depth"], *of["posterior"]], from_zero=False)
-    lengths = (of[name] for name in ("sigma", "error", "posterior_sigma", "posterior_error") if of[name])
-    high = max(colours.robust_range(maps, from_zero=True)[1] for maps in lengths)
-    return PanelScales(ColourScale(*depth, colours.DEPTH_MAP), ColourScale(0.0, high, colours.ERROR_MAP))
+
+    def length(*names: str) -> ColourScale:
+        high = max(colours.robust_range(of[name], from_zero=True)[1] for name in names if of[name] or name == names[0])
+        return ColourScale(0.0, high, colours.ERROR_MAP)
+
+    lengths = {"length": length("sigma", "error"), "posterior length": length("posterior_sigma", "posterior_error")}
+    return {"depth": ColourScale(*depth, colours.DEPTH_MAP), **lengths}
 
 
 def contact_sheet(

@@ -16,7 +16,7 @@ from ufmstar_torch.eval.run.run_folder import Checkpoint, RunFolder
 from ufmstar_torch.eval.run.summary import GOING_ON, NEAR_ZERO, write_summary
 
 _MAPS = ("depth", "variance", "disagreement", "measured", "anchored", "bias", "posterior_depth", "posterior_variance")
-_COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured")
+_COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured", "single_view")
 _SUMMARY_EVERY = 30.0  # [s] between two summaries of an unfinished run
 
 

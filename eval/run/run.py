@@ -21,6 +21,7 @@ from ufmstar_torch.eval.run.pictures import Finished, common_columns, draw_sheet
 from ufmstar_torch.eval.run.recorder import FrameRecorder
 from ufmstar_torch.eval.run.run_folder import RunFolder
 from ufmstar_torch.eval.run.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
+from ufmstar_torch.stream_warnings import LOGGER
 
 
 def run(
@@ -54,7 +55,8 @@ def run(
         Exception: whatever else the network or UfM* raise, after the summary was written.
     """
     with RunFolder.open(out, job.identity(), resume=resume, overwrite=overwrite) as folder:
-        write_summary(job, folder, *GOING_ON)
+        for text in write_summary(job, folder, *GOING_ON)["warnings"]:
+            LOGGER.warning("%s", text)
         ending, outputs = (FAILED, "an error in the program"), {}
         try:
             _frames(job, folder, progress, stop)

@@ -8,13 +8,19 @@ from collections.abc import Mapping, Sequence
 from statistics import mean, median
 from typing import Any
 
+import numpy as np
+
+from ufmstar_torch.eval.check.image_fit import DepthFit, depth_fit
 from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM, RunMetrics
 from ufmstar_torch.eval.run import machine
 from ufmstar_torch.eval.run.files import to_json, write_json_atomic
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
+from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences import FrameSequence
+from ufmstar_torch.eval.sequences.intrinsics import pinhole
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.stream_warnings import hardly_compared
 
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
 # [m] A sigma below it claims more than any depth network can measure.
@@ -67,9 +73,41 @@ def write_summary(
         "settings": job.settings,
         "versions": versions(),
     }
+    depth = None if job.image_fit is None or job.image_fit.problem else _depth_fit(job, folder, done)
+    summary |= {"image_fit": job.image_fit, "depth_fit": depth, "warnings": _warnings(job, depth, done)}
     plain: dict[str, Any] = to_json(summary)
     write_json_atomic(folder.path / "summary.json", plain)
     return plain
+
+
+def _depth_fit(job: RunJob, folder: RunFolder, done: Sequence[Mapping[str, Any]]) -> DepthFit | None:
+    """The maps of finished frames beside the depth of corners tracked in their images."""
+    records, sequence = {record["index"]: record for record in done}, job.sequence
+
+    def depth_at(index: int, pixel: np.ndarray) -> np.ndarray | None:
+        if index not in records:
+            return None
+        record = records[index]
+        stored = read_frame(folder.writer.paths(record["name"])["frames"])
+        to_map = pinhole(*record["intrinsics"]) @ np.linalg.inv(sequence.intrinsics_of(sequence.entries[index]))
+        u, v, _ = np.rint(to_map @ np.vstack([pixel.T, np.ones(len(pixel))])).astype(int)
+        height, width = stored["depth"].shape
+        inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        v, u = np.where(inside, v, 0), np.where(inside, u, 0)
+        return np.where(inside & stored["valid"][v, u], stored["depth"][v, u], 0.0)
+
+    return depth_fit(job.sequence, job.corners, depth_at)
+
+
+def _warnings(job: RunJob, depth: DepthFit | None, done: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Likely mistakes in what the run was given, each in a line."""
+    fits = [fit.problem for fit in (job.image_fit, depth) if fit is not None]
+    if done:
+        fits.append(hardly_compared(done[-1]["single_view"], done[-1]["components"], len(done)))
+        without_depth = len(job.sequence.without_depth) == len(job.sequence)
+        if without_depth and job.sequence.layout == "generic" and (depth is None or depth.problem):
+            fits.append("nothing ties the poses to metres: sigma and disagreement are in the poses' unit")
+    return [text for text in fits if text]
 
 
 def _posterior(done: Sequence[Mapping[str, Any]], figures: Mapping[str, float] | None) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch import unmeasured
+from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.run.files import write_together
 
 # Metres per count that a run may choose from, finest first: up to 65.5 m, 256 m (KITTI's), 655 m, 6.6 km.
@@ -120,9 +121,8 @@ def _write(content: bytes, file: BinaryIO) -> None:
 def read_frame(path: str | Path) -> dict[str, NDArray[Any]]:
     """The maps of a frame's npz: depth [m], variance [m^2], disagreement [m^2], valid, each [H, W]; with anchors
     also anchored [m^2] and bias, with a posterior its depth and variance; and T_world_cam [4, 4] [m] and intrinsics
-    [3, 3] [px]."""
-    with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+    [3, 3] [px]. Errors as ``read_npz_whole``."""
+    return read_npz_whole(path)
 
 
 def fitting_unit(depth: NDArray[Any]) -> float:

@@ -1,6 +1,6 @@
 """Decoding of colour images and depth maps; every file that cannot be decoded raises ``FrameError``.
 
-Plain PNGs (8-bit RGB, 16-bit grey) are decoded by kornia_rs, in a third of Pillow's time; everything else by Pillow,
+PNGs of 8-bit RGB are decoded by kornia_rs, in a third of Pillow's time; everything else by Pillow,
 which raises on truncated files, where OpenCV returns what it got. Pixels are taken as stored (an EXIF orientation is
 not applied: intrinsics hold for the stored pixels).
 """
@@ -30,7 +30,7 @@ _BROKEN_IMAGE = (OSError, SyntaxError, ValueError, EOFError, Image.Decompression
 # Key of a PNG's text chunk: metres per unit of its 16-bit values.
 SCALE_KEY = "depth_scale"
 # Bit depth, colour type, compression, filter and interlacing, from a PNG's header.
-_RGB, _GREY_16 = (8, 2, 0, 0, 0), (16, 0, 0, 0, 0)
+_RGB = (8, 2, 0, 0, 0)
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _HEADER = struct.Struct(">8s8x2I5B")
 _MILLIMETRE = 1e-3
@@ -41,7 +41,7 @@ _DEPTH_NAMES = ("Z", "depth", "V", "Y", "R")
 def read_color(path: str | Path, content: bytes | None = None) -> np.ndarray:
     """An 8-bit image as [H, W, 3] uint8 RGB (grey is repeated, alpha dropped), of a file or of the ``content`` of one.
     Raises FrameError: missing, truncated, corrupt, or not an 8-bit image."""
-    if content is None and (plain := _plain_png(Path(path), _RGB)) is not None:
+    if content is None and (plain := _plain_png(Path(path))) is not None:
         return plain
     try:
         with Image.open(path if content is None else BytesIO(content)) as image:
@@ -192,25 +192,21 @@ def positive(depth: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def _plain_png(path: Path, kind: tuple[int, ...]) -> np.ndarray | None:
-    """The pixels of a PNG of a kind, ``_RGB`` or ``_GREY_16``; None of another file, of a damaged one, and of a map
-    with a scale in its text, all of which are Pillow's."""
+def _plain_png(path: Path) -> np.ndarray | None:
+    """The pixels of a PNG of 8-bit RGB; None of another file and of a damaged one, both of which are Pillow's."""
     if path.suffix.lower() != ".png" or not path.is_file():
         return None
     with path.open("rb") as file:
-        content = file.read(_HEADER.size if kind == _RGB else -1)
+        content = file.read(_HEADER.size)
     if len(content) < _HEADER.size:
         return None
-    signature, width, height, *found = _HEADER.unpack_from(content)
-    largest = Image.MAX_IMAGE_PIXELS or 0
-    if signature != _SIGNATURE or tuple(found) != kind or width * height > largest or SCALE_KEY.encode() in content:
+    signature, width, height, *found = _HEADER.unpack(content)
+    if signature != _SIGNATURE or tuple(found) != _RGB or width * height > (Image.MAX_IMAGE_PIXELS or 0):
         return None
     from kornia_rs import io
 
     try:
-        if kind == _RGB:
-            return np.asarray(io.read_image_png_u8(str(path), "rgb"))
-        return np.asarray(io.read_image_png_u16(str(path), "mono"))[..., 0]
+        return np.asarray(io.read_image_png_u8(str(path), "rgb"))
     except Exception as error:
         # kornia_rs has no exception class of its own: it raises a bare Exception for a file that it cannot decode.
         if type(error) is not Exception:
@@ -219,8 +215,6 @@ def _plain_png(path: Path, kind: tuple[int, ...]) -> np.ndarray | None:
 
 
 def _from_image(path: Path) -> tuple[np.ndarray, float | None]:
-    if (plain := _plain_png(path, _GREY_16)) is not None:
-        return plain, None
     with Image.open(path) as image:
         image.load()
         if image.mode[0] not in "IF":

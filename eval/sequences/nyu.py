@@ -27,7 +27,7 @@ PARTS = ("train", "val")
 # The colour camera's calibration in the dataset's toolbox [px], for images of 640 x 480.
 INTRINSICS = (518.857901, 519.469611, 325.582449, 253.736166)
 NATIVE_SIZE = (480, 640)
-# What h5py raises for files that are damaged in one way or another, and for datasets that are missing.
+# Errors of h5py for damaged files and missing datasets.
 _BROKEN = (OSError, KeyError, RuntimeError, ValueError)
 
 

@@ -30,7 +30,7 @@ _VERSION = 4
 _COLOR = {0: "raw", 1: "png", 2: "jpeg"}
 _DEPTH = {0: "raw_ushort", 1: "zlib_ushort", 2: "occi_ushort"}
 _MATRIX = ("<f4", (4, 4))
-# What follows the sensor's name; sizes are width, height.
+# The header behind the sensor's name; sizes are width, height.
 _HEADER = np.dtype(
     [
         *[(f"{name}_{camera}", *_MATRIX) for camera in ("color", "depth") for name in ("K", "T")],
@@ -42,6 +42,7 @@ _FRAME = np.dtype([("T_world_cam", *_MATRIX), ("times", "<u8", 2), ("bytes", "<u
 _BYTES_PER_DEPTH = 2
 _MAX_NAME = 10_000  # [bytes] a longer sensor name is no name: the file is something else
 _MAX_FRAMES = 10_000_000  # 92 hours at 30 Hz: more is a broken header
+_FEW_FRAMES = 10_000  # as many are believed of whatever file: it may be truncated
 _MAX_PIXELS = 100_000_000  # of a depth map
 _MICROSECOND = 1e-6
 
@@ -65,6 +66,9 @@ def read(path: Path, options: Options) -> FrameSequence:
     file = _files(path)[0] if path.is_dir() else path
     with file.open("rb") as opened:
         header = _read_header(opened, file)
+        # Each of the frames claimed is an entry, there or missing; a frame takes a thousand times its header.
+        if header["frames"] > max(_FEW_FRAMES, (size := file.stat().st_size) // _FRAME.itemsize):
+            raise ValueError(f"{file}: broken header: {header['frames']} frames cannot be in a file of {size:,} bytes")
         color_size, depth_size = (tuple(header[key].tolist()[::-1]) for key in ("color_size", "depth_size"))
         scale = options.depth_scale or 1 / float(header["units_per_metre"])
         frames = _frames(opened, file, int(header["frames"]), depth_size, scale)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.prediction import DepthPrediction
@@ -54,8 +55,7 @@ class PredictionCache:
             return None
         if len(packed) < _DIGEST or hashlib.sha256(packed[_DIGEST:]).digest() != packed[:_DIGEST]:
             return None
-        with np.load(io.BytesIO(packed[_DIGEST:]), allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+        arrays = read_npz_whole(path, packed[_DIGEST:])
         if bytes(arrays.pop("content")).decode() != content:
             return None
         K = torch.from_numpy(arrays.pop("intrinsics"))

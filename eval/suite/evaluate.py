@@ -68,7 +68,7 @@ def evaluate_item(
     left_out = [row for row in missing if row not in possible]
     lines = []
     if todo:
-        sinks = [ExampleWriter(folder.place(item))] if job.stores_examples(item) else []
+        sinks = [ExampleWriter(folder.sequence_folder(item))] if job.stores_examples(item) else []
         needed = with_references(todo, possible)
         try:
             results = evaluate(sequence, needed, judge, sinks=sinks, stop=stop, progress=progress)

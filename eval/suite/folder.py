@@ -64,20 +64,20 @@ class EvalFolder:
         if self._lock is not None:
             self._lock.release()
 
-    def place(self, item: WorkItem) -> Path:
+    def sequence_folder(self, item: WorkItem) -> Path:
         """The folder of a sequence."""
         return self.path / "records" / item.folder
 
     def begin(self, item: WorkItem, rows: Iterable[Row]) -> list[Row]:
         """Make the folder of a sequence, remove files that a killed process had begun, and return the missing rows."""
-        place = self.place(item)
-        place.mkdir(parents=True, exist_ok=True)
-        remove_temporaries(path for pattern in (".*.tmp", "*/.*.tmp") for path in place.glob(pattern))
+        folder = self.sequence_folder(item)
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_temporaries(path for pattern in (".*.tmp", "*/.*.tmp") for path in folder.glob(pattern))
         return self.missing(item, rows)
 
     def is_finished(self, item: WorkItem, rows: Iterable[Row]) -> bool:
         """Whether every row has a record, or the sequence has failed."""
-        return (self.place(item) / FAILED).exists() or not self.missing(item, rows)
+        return (self.sequence_folder(item) / FAILED).exists() or not self.missing(item, rows)
 
     def missing(self, item: WorkItem, rows: Iterable[Row]) -> list[Row]:
         """The rows without a record; a record that cannot be read counts as none."""
@@ -87,7 +87,7 @@ class EvalFolder:
     def records(self, item: WorkItem) -> dict[str, Record]:
         """The finished rows of a sequence, by slug."""
         records = {}
-        for path in sorted(self.place(item).glob("*.json")):
+        for path in sorted(self.sequence_folder(item).glob("*.json")):
             if path.name != FAILED and path.with_suffix(".pt").is_file():
                 try:
                     records[path.stem] = Record.load(path)
@@ -113,7 +113,7 @@ class EvalFolder:
 
     def write(self, item: WorkItem, record: Record, result: RowFigures) -> None:
         """Store a row, completely or not at all. Raises OSError: it cannot be written."""
-        path = self.place(item) / f"{result.row.slug}.json"
+        path = self.sequence_folder(item) / f"{result.row.slug}.json"
         sums = {name: {key: pack(value) for key, value in states.items()} for name, states in result.sums.items()}
         path.unlink(missing_ok=True)  # one that could not be read
         write_atomic(path.with_suffix(".pt"), lambda file: torch.save(sums, file), durable=True)
@@ -123,12 +123,12 @@ class EvalFolder:
         """Store why rows of a sequence cannot be computed, and return a line about it."""
         reason = " ".join(str(error).split()) or type(error).__name__
         about = {"dataset": item.dataset, "sequence": item.sequence, "reason": reason}
-        write_json_atomic(self.place(item) / FAILED, {**about, "rows": [row.slug for row in rows]})
+        write_json_atomic(self.sequence_folder(item) / FAILED, {**about, "rows": [row.slug for row in rows]})
         return f"{item.label}: failed: {reason}"
 
     def failure(self, item: WorkItem) -> dict[str, Any] | None:
         """The failure that :meth:`fail` has stored for a sequence; None if nothing."""
-        path = self.place(item) / FAILED
+        path = self.sequence_folder(item) / FAILED
         try:
             failure = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
@@ -144,7 +144,7 @@ class EvalFolder:
 
     def succeeded(self, item: WorkItem) -> None:
         """Forget an earlier failure."""
-        (self.place(item) / FAILED).unlink(missing_ok=True)
+        (self.sequence_folder(item) / FAILED).unlink(missing_ok=True)
 
 
 def _identity(about: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:

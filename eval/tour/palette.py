@@ -13,7 +13,7 @@ Color = tuple[float, float, float]
 
 # Textures that show a thing rather than a material; they are used where that thing is meant only.
 _PICTURES = ("books", "painting", "window")
-# What a surface may be made of: textures, ranges of saturation and value of its first colour, and of its
+# The materials of a surface: textures, ranges of saturation and value of its first colour, and of its
 # pattern's period [m].
 _ROLES: dict[str, tuple[tuple[str, ...], Range, Range, Range]] = {
     "wall": (

@@ -23,8 +23,7 @@ class TourView:
 
     image: Tensor  # [H, W, 3] uint8 RGB
     depth: Tensor  # [H, W] float64 along z [m]
-    surface: Tensor  # [H, W] int64 which primitive, -1 where there is none
-    valid: Tensor  # [H, W] bool whether there is one; everywhere, inside of a room
+    surface: Tensor  # [H, W] int64 which primitive, -1 where there is none (nowhere, inside of a room)
 
 
 def intrinsics(height: int, width: int, fov_degrees: float = 70.0) -> NDArray[np.float64]:
@@ -57,22 +56,13 @@ def render(
     near = torch.where(valid, depth, 0.0).flatten().float()
     color = shade(tour, flat, near, direction, pose[:3, 3].float(), (fx * fy) ** -0.5)
     image = develop((color * valid.flatten()).view(3, height, width), frame_seed)
-    return TourView(image, torch.where(valid, depth, 0.0), surface, valid)
+    return TourView(image, torch.where(valid, depth, 0.0), surface)
 
 
-def cast(
-    tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int, *, cull: bool = True
-) -> tuple[Tensor, Tensor]:
-    """Depth [H, W] float64 [m], infinite where nothing is, and the primitives seen [H, W] int64, -1 for none.
-
-    Args:
-        tour, T_world_cam, K, height, width: as :func:`render` takes them.
-        cull: leave out where a primitive cannot be seen; the result is the same without, but slow.
-    """
-    if cull:
-        seen = surface_windows(tour, T_world_cam, K, height, width)
-    else:
-        seen = [(i, (0, height, 0, width)) for i in range(len(tour.surfaces))]
+def cast(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Depth [H, W] float64 [m], infinite where nothing is, and the primitives seen [H, W] int64, -1 for none; arguments
+    as of :func:`render`."""
+    seen = surface_windows(tour, T_world_cam, K, height, width)
     u = torch.arange(width, dtype=torch.float64)
     v = torch.arange(height, dtype=torch.float64)[:, None]
     depth = torch.full((height, width), float("inf"), dtype=torch.float64)

@@ -14,7 +14,7 @@ from ufmstar_torch.eval.tour.shapes import NOBODY, Surfaces
 GRID = (14, 22, 22)  # points of a room along y, z, x
 # Where a light's rays end, as parts of its size: the corners of a tetrahedron.
 _SAMPLES = ((1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, -1.0, -1.0))
-# What stands nearer to a lamp would shade half of the room [m].
+# A surface nearer to a lamp would shade half of the room, and casts no shadow [m].
 _TOO_NEAR = 0.5
 _SMALL = 0.05  # half extents below this cast no shadow worth a ray [m]
 

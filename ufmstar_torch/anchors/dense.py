@@ -157,7 +157,7 @@ class DenseEvidence(SavedState):
     def _measured(self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray) -> Landmarks:
         """The depths of a reduced image: landmarks that it shows, measured again where the camera has moved, and new
         ones in the cells between them. The running estimates follow."""
-        from ufmstar_torch.kernels.beside_cpu import beside  # kernels compile when they are first needed
+        from ufmstar_torch.kernels.anchor_check_cpu import check_anchors  # kernels compile when they are first needed
         from ufmstar_torch.kernels.dense_cpu import measure
 
         cell, K = _cell(small.shape[1]), self._errors.camera(K)
@@ -193,7 +193,7 @@ class DenseEvidence(SavedState):
             step = (1 - self.config.memory) * np.log(np.median(1 / rho[kept]) / self._depth)
             self._depth *= float(np.exp(step))
         stated = variance[kept] + self._memory.apart * np.square(rho[kept])
-        surface, alone = beside(small, pixel[kept], rho[kept], stated, cell)
+        surface, alone = check_anchors(small, pixel[kept], rho[kept], stated, cell)
         depth, position = 1 / rho[kept], (surface - scale[:2, 2]) / scale.diagonal()[:2]
         return Landmarks(position, depth, (stated + alone) * depth**4, searched + known)
 

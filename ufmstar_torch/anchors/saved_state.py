@@ -45,8 +45,8 @@ class SavedState:
         for attribute, name in self.HELD.items():
             value, own = np.array(state[name].numpy()), np.asarray(getattr(self, attribute))
             if value.shape != own.shape or value.dtype != own.dtype:
-                expected = f"{own.dtype} of shape {own.shape}"
-                raise ValueError(f"state[{name!r}] must be {expected}, got {value.dtype} {value.shape}")
+                text = f"must have shape {own.shape} and dtype {own.dtype}, got {value.shape} and {value.dtype}"
+                raise ValueError(f"state[{name!r}] {text}")
             if not (np.abs(value, dtype=np.float64) <= LARGEST).all():  # NaN is not
                 text = f"finite and within {LARGEST:g}: the state is damaged, start with reset()"
                 raise ValueError(f"state[{name!r}] must be {text}")

@@ -6,6 +6,7 @@ Thresholds are rounded to the maps' dtype as torch rounds them.
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -28,72 +29,71 @@ def check_values(
 ) -> FrameInput:
     """As :func:`ufmstar_torch.frame.check_values`, for the CPU. Depth that is valid everywhere is not copied."""
     b, height, width = maps.depth.shape
-    poses, cameras = ([m for m in _matrices(given) for _ in range(b if given.dim() == 2 or len(given) == 1 else 1)]
-                      for given in (pose, intrinsics))  # fmt: skip
+    poses, cameras = (_matrices(given, b) for given in (pose, intrinsics))
     checked = [_camera(T, K, height, width, rotation_tolerance) for T, K in zip(poses, cameras, strict=True)]
     T_safe, K_safe, faults, deviations = zip(*checked, strict=True)
     depth, mask = array(maps.depth), None if maps.mask is None else array(maps.mask)
-    fine = np.array(faults) == 0
-    use = _valid(maps, depth, mask, min(max_depth, DEPTH_RANGE[1]))
-    if not fine.all():
-        use &= fine[:, None, None]
-    beyond, out_of_range = np.zeros(b, np.int64), np.zeros(b, np.int64)
-    kept = [int(np.count_nonzero(one)) for one in use]
-    whole = [count == height * width for count in kept]
-    safe = depth
-    if not all(whole):
-        safe = np.where(use, depth, np.zeros((), depth.dtype))
-        for s in np.flatnonzero(fine & ~np.array(whole)):
-            given = (depth[s] > 0) & (depth[s] < np.inf)
-            if mask is not None:
-                given &= mask[s]
-            far = int(np.count_nonzero(given & (depth[s] > max_depth)))
-            beyond[s], out_of_range[s] = far, int(np.count_nonzero(given)) - far - kept[s]
-    arrays = safe, np.array(T_safe), np.array(K_safe), use, np.array(deviations), beyond, out_of_range
-    safe_depth, T, K, valid, deviation, beyond_count, out_count = map(torch.from_numpy, arrays)
-    fault = torch.tensor(faults)
+    use = np.ones(depth.shape, np.bool_) if mask is None else mask.copy()
+    _restrict(use, depth, DEPTH_RANGE[0], min(max_depth, DEPTH_RANGE[1]))
+    for variance in (maps.aleatoric, maps.epistemic):
+        if variance is not None:
+            _restrict(use, array(variance), 0.0, LARGEST)
+    for channel in [] if maps.features is None else array(maps.features).swapaxes(0, 1):
+        _restrict(use, channel, -LARGEST, LARGEST)
+    if any(faults):
+        use[np.flatnonzero(faults)] = False
+    safe, counts = depth, np.zeros((3, b), np.int64)
+    counts[0] = faults
+    if not use.all():
+        left_out = np.flatnonzero(~use)
+        values, stream = depth.reshape(-1)[left_out], left_out // (height * width)
+        given = (values > 0) & (values < np.inf) & (counts[0] == 0)[stream]
+        if mask is not None:
+            given &= mask.reshape(-1)[left_out]
+        far = values > max_depth
+        for kind, chosen in enumerate((given & far, given & ~far), start=1):
+            counts[kind] = np.bincount(stream[chosen], minlength=b)
+        safe = depth.copy()
+        safe.reshape(-1)[left_out] = 0
+    arrays = safe, np.array(T_safe), np.array(K_safe), use, np.array(deviations), *counts
+    safe_depth, T, K, valid, deviation, fault, beyond, out_of_range = map(torch.from_numpy, arrays)
     return FrameInput(
-        safe_depth, T, K, maps.aleatoric, maps.epistemic, maps.features, valid, fault, deviation, beyond_count,
-        out_count, fault,
+        safe_depth, T, K, maps.aleatoric, maps.epistemic, maps.features, valid, fault, deviation, beyond, out_of_range,
+        fault,
     )  # fmt: skip
 
 
-def _matrices(cameras: Tensor) -> list[_Matrix]:
-    """[B, n, n] or [n, n] as lists of float64."""
-    return np.asarray(array(cameras), np.float64).reshape(-1, *cameras.shape[-2:]).tolist()
+def _matrices(cameras: Tensor, streams: int) -> list[_Matrix]:
+    """A camera of each stream, of [B, n, n], [1, n, n] or [n, n], in plain numbers."""
+    matrices = cameras.tolist() if cameras.dim() == 3 else [cameras.tolist()]
+    return matrices if len(matrices) == streams else matrices * streams
 
 
-def _valid(maps: FrameMaps, depth: NDArray[Any], mask: NDArray[np.bool_] | None, farthest: float) -> NDArray[np.bool_]:
-    """[B, H, W] pixels whose values can be used; NaN fails every comparison."""
-    use = depth >= DEPTH_RANGE[0]
-    use &= depth <= farthest
-    if mask is not None:
-        use &= mask
-    for variance in (maps.aleatoric, maps.epistemic):
-        if variance is not None:
-            values = array(variance)
-            use &= (values >= 0) & (values <= LARGEST)
-    if maps.features is not None:
-        use &= (np.abs(array(maps.features)) <= LARGEST).all(1)
-    return use
+def _restrict(use: NDArray[np.bool_], values: NDArray[Any], least: float, most: float) -> None:
+    """Leave those pixels [B, H, W] out of ``use`` whose values do not lie in [least, most]; NaN fails every comparison.
+
+    The extremes alone, which need no memory, decide where all values do.
+    """
+    if not (values.min() >= least and values.max() <= most):
+        use &= values >= least
+        use &= values <= most
 
 
 def _camera(T: _Matrix, K: _Matrix, height: int, width: int, tolerance: float) -> tuple[_Matrix, _Matrix, int, float]:
-    """Of a stream the pose with its nearest rotation and the intrinsics (an identity and a unit camera where there is a
+    """The pose with its nearest rotation and the intrinsics of a stream (an identity and a unit camera where there is a
     fault), the code of the first fault (``FRAME_FAULTS``), and max |R^T R - I| of the given pose."""
-    off = [abs(value - (i == j)) for i, row in enumerate(_gram(T)) for j, value in enumerate(row)]
-    deviation = math.nan if any(map(math.isnan, off)) else max(off)
-    finite = all(math.isfinite(value) for row in T for value in row)
-    fault = (_pose_fault(T, deviation, tolerance) if finite else 1) or _intrinsics_fault(K, height, width)
+    gram = _gram(T)
+    deviation = _deviation(gram)
+    fault = _pose_fault(T, deviation, tolerance) or _intrinsics_fault(K, height, width)
     if fault:
         return _EYE4, _EYE3, fault, deviation
     rotation = [row[:3] for row in T[:3]]
     for _ in range(POLAR_STEPS):  # as ``camera.nearest_rotation``: R <- R (3 I - R^T R)/2
-        gram = _gram(rotation)
-        if max(abs(value - (i == j)) for i, row in enumerate(gram) for j, value in enumerate(row)) < _ROUNDING:
+        if _deviation(gram) < _ROUNDING:
             break
         Q = [[(1.5 if i == j else 0.0) - 0.5 * value for j, value in enumerate(row)] for i, row in enumerate(gram)]
         rotation = [[a * Q[0][j] + b * Q[1][j] + c * Q[2][j] for j in _AXES] for a, b, c in rotation]
+        gram = _gram(rotation)
     return [[*row, T[i][3]] for i, row in enumerate(rotation)] + _EYE4[3:], K, 0, deviation
 
 
@@ -103,8 +103,21 @@ def _gram(R: _Matrix) -> _Matrix:
     return [[x[i] * x[j] + y[i] * y[j] + z[i] * z[j] for j in _AXES] for i in _AXES]
 
 
+def _deviation(gram: _Matrix) -> float:
+    """max |G - I|, NaN where an entry is."""
+    (a, b, c), (_, d, e), (_, _, f) = gram
+    off = abs(a - 1), abs(b), abs(c), abs(d - 1), abs(e), abs(f - 1)
+    return math.nan if math.isnan(sum(off)) else max(off)
+
+
+def _finite(matrix: _Matrix) -> bool:
+    return all(map(math.isfinite, itertools.chain.from_iterable(matrix)))
+
+
 def _pose_fault(T: _Matrix, deviation: float, tolerance: float) -> int:
-    """Code 2 to 4 or 7 of a finite pose, 0 for none."""
+    """Code 1 to 4 or 7 of a pose, 0 for none."""
+    if not _finite(T):
+        return 1
     x, y, z, last = T
     if max(abs(a - b) for a, b in zip(last, _EYE4[3], strict=True)) > tolerance:
         return 2
@@ -119,7 +132,7 @@ def _pose_fault(T: _Matrix, deviation: float, tolerance: float) -> int:
 def _intrinsics_fault(K: _Matrix, height: int, width: int) -> int:
     """Code 5, 6, 8 or 9, 0 for none."""
     (fx, skew, cx), (other, fy, cy), last = K
-    if not all(math.isfinite(value) for row in K for value in row):
+    if not _finite(K):
         return 5
     if skew or other or last != [0.0, 0.0, 1.0] or fx <= 0 or fy <= 0:
         return 6

@@ -46,7 +46,7 @@ def matches(fields, n, fields_c, n_c, K, height, width, thresholds):
 
 @part
 def _limit(eta):
-    """Of the squared distance from which on the overlap is certainly below eta, with room for rounding."""
+    """The squared distance from which on the overlap is certainly below eta, with room for rounding."""
     return -8 * math.log(eta) * (1 + 1e-9) + 1e-9
 
 

@@ -221,7 +221,7 @@ def _speed(x, y, z, b, rho):
 
 @reordered_leaf
 def _inverse_depth(x, y, z, b, u, v):
-    """Of a position near the line, by the axis along which the line moves faster."""
+    """The inverse depth of a position near the line, by the axis along which the line moves faster."""
     du, dv = b[0] - u * b[2], b[1] - v * b[2]
     return (u * z - x) / du if abs(du) > abs(dv) else (v * z - y) / dv
 
@@ -338,7 +338,7 @@ def _search(patch, key, width, height, x, y, z, b, low, high, rows, scores, plac
 
 @reordered_leaf
 def zncc(patch, window):
-    """Of a normalised patch and a window; -1 where the window has no contrast."""
+    """The correlation of a normalised patch and a window; -1 where the window has no contrast."""
     total = squares = cross = np.float32(0)
     for k in range(COUNT):
         value = np.float32(window[k])

@@ -116,7 +116,7 @@ def _invert(A):
 
 @fast
 def _back(covariance, right_side, solved, coefficients, offset):
-    """What the observations add to the coefficients, and the mean of the field."""
+    """Add the observations' part to the coefficients, and write the mean of the field."""
     F = len(right_side)
     b = np.zeros(F)
     for f in range(F):

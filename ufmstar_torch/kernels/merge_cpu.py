@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, part, zeros
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, part
+from ufmstar_torch.kernels.fuse_cpu import cholesky3
+from ufmstar_torch.kernels.regress_cull_cpu import HALF_LOG_TWO_PI_CUBED
 from ufmstar_torch.mixture import GaussianMixture
 
-_HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
-_NEGLIGIBLE = 16 * np.finfo(np.float64).eps
 # What a component adds at a point is left out below this share of the point's own density: K of them change a share
 # by less than K times this.
 _LEAST_SHARE = 1e-15
@@ -147,31 +147,19 @@ def _own_shares(mean, covariance, weight, prior_weight):
     """s_k of occupied components."""
     n = weight.size
     L, W, log_peak, half = (
-        zeros((n, 3, 3), np.float64),
+        empty((n, 3, 3), np.float64),
         empty((n, 6), np.float64),
         empty(n, np.float64),
         empty((n, 3), np.float64),
     )
     for k in range(n):
         S = covariance[k]
-        negligible = _NEGLIGIBLE * max(S[0, 0], S[1, 1], S[2, 2])
-        for j in range(3):
-            pivot = S[j, j]
-            for i in range(j):
-                pivot -= L[k, j, i] * L[k, j, i]
-            if pivot <= negligible:
-                continue
-            L[k, j, j] = math.sqrt(pivot)
-            for r in range(j + 1, 3):
-                value = S[r, j]
-                for i in range(j):
-                    value -= L[k, r, i] * L[k, j, i]
-                L[k, r, j] = value / L[k, j, j]
+        cholesky3(S, L[k])
         i00, i11, i22 = 1 / L[k, 0, 0], 1 / L[k, 1, 1], 1 / L[k, 2, 2]
         i10, i21 = -L[k, 1, 0] * i00 * i11, -L[k, 2, 1] * i11 * i22
         W[k, 0], W[k, 1], W[k, 2], W[k, 4], W[k, 5] = i00, i10, i11, i21, i22
         W[k, 3] = -(L[k, 2, 0] * i00 + L[k, 2, 1] * i10) * i22
-        log_peak[k] = math.log(weight[k]) - _HALF_LOG_TWO_PI_CUBED + math.log(i00) + math.log(i11) + math.log(i22)
+        log_peak[k] = math.log(weight[k]) - HALF_LOG_TWO_PI_CUBED + math.log(i00) + math.log(i11) + math.log(i22)
         for r in range(3):
             half[k, r] = math.sqrt(3 * S[r, r])
     shares, x, evidence = empty(n, np.float64), empty((6, 3), np.float64), empty(6, np.float64)

@@ -86,7 +86,7 @@ def _linearised(pixel, rho, along, slope, H, b, K, K_inverse, on_line, across):
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What V views show of N pixels.
+    """Positions of N pixels along and across their lines in V views.
 
     Attributes:
         change: [N, V, 10] of ``value``, by the errors.
@@ -218,7 +218,7 @@ def _equations(
 
 @reordered
 def _inverse(A, inverse):
-    """Of a symmetric positive definite matrix, whose lower triangle is given and changed, by L L^T."""
+    """The inverse of a symmetric positive definite matrix, whose lower triangle is read and changed, by L L^T."""
     size = len(A)
     for j in range(size):
         for i in range(j, size):

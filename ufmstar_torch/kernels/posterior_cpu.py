@@ -32,11 +32,11 @@ def update(
     maps = [x.detach().contiguous().numpy() for x in (packed.double(), frame.depth, frame.valid, claimed)]
     streams = zip(*maps, _anchors(anchors, len(packed)), strict=True)
     results = each(functools.partial(_of_stream, config), list(streams))
-    kept, depth, variance = (np.stack([result[i] for result in results]) for i in range(3))
+    kept, depth, variance, outlier = (np.stack([result[i] for result in results]) for i in range(4))
     sums = [_Running.of(row, config) for row in kept]
     calibration = [r.ratios["calibration"] if r.below[-1] > 0 else np.nan for r in sums]
     unseen = [r.ratios["unseen"] for r in sums]
-    outputs = [torch.from_numpy(x) for x in (depth, variance, np.array(calibration), np.array(unseen))]
+    outputs = [torch.from_numpy(x) for x in (depth, variance, np.array(calibration), np.array(unseen), outlier)]
     return torch.from_numpy(kept).to(packed.dtype), Posterior(*outputs)
 
 
@@ -90,6 +90,10 @@ class _Running(NamedTuple):
         n = memory * self.below + (1 - memory) * weight + below
         total = memory * self.above + (1 - memory) * weight * value + above
         return np.minimum(np.maximum(total, least * n), largest * n), n
+
+    def drifted(self, mean: float) -> Floats:
+        b, covariance = self.expected(mean)
+        return np.concatenate([[self.frames, mean], self.above, self.below, b, covariance.ravel()])
 
     def expected(self, mean: float) -> tuple[Floats, Floats]:
         T = np.eye(FEATURES)
@@ -153,12 +157,12 @@ class _LeftOut(NamedTuple):
 def _of_stream(
     config: PosteriorConfig, packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any],
     given_: _Anchors | None,
-) -> tuple[Floats, NDArray[Any], NDArray[Any]]:  # fmt: skip
-    """The memory after the frame; depth and variance."""
+) -> tuple[Floats, NDArray[Any], NDArray[Any], NDArray[Any]]:  # fmt: skip
+    """The memory after the frame; depth, variance and the probability of another surface."""
     running, anchors = _Running.of(packed, config), _NONE if given_ is None else given_
     some = len(anchors.depth) > 0
     if given_ is None and not running.frames:
-        return packed, np.where(valid, depth, np.nan).astype(depth.dtype), claimed
+        return packed, np.where(valid, depth, np.nan).astype(depth.dtype), claimed, np.full_like(depth, np.nan)
     with np.errstate(all="ignore"):  # what is not valid is not read
         logs = np.log(depth)
     rows, cols = (min(SIDE, n) for n in depth.shape)
@@ -166,17 +170,19 @@ def _of_stream(
     scene = _scene(grid, depth, valid, anchors, running)
     field, left_out, weight = _fitted(scene)
     away = _away(scene, weight * config.weak_sigma**2 >= 1)
-    kept = _learnt(scene, field, weight, left_out, _relative(claimed, anchors), running) if some else packed
+    if some:
+        kept = _learnt(scene, field, weight, left_out, _relative(claimed, anchors), running)
+    else:
+        kept = running.drifted(grid.mean) if running.frames and valid.any() else packed
     node = np.arange(rows * cols)
     x = features(grid.log_depth - grid.mean, (node % cols + 0.5) / cols, (node // cols + 0.5) / rows)
     mean, variance = at(field, node, x)
     b = field.coefficients
     share, offset = away / config.reach, mean - (x * b).sum(1)
     variance = variance + running.ratios["roughness"] + away * running.ratios["unseen"]
-    variance = variance + _tail(scene, share, offset, _spread(scene, np.ones(len(scene.noise), np.bool_), b[0]))
+    variance = _total(scene, variance, share, offset, _spread(scene, np.ones(len(scene.noise), np.bool_), b[0]))
     nodes = np.stack([grid.log_depth, offset, variance, share], 1)
-    limits = config.edge_contrast, LARGEST
-    return kept, *read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), limits)
+    return kept, *read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
 
 
 def _scene(
@@ -187,6 +193,7 @@ def _scene(
     x = features(log_depth - grid.mean, u, v)
     observed = Observed(row * grid.cols + column, x, np.log(anchors.depth) - log_depth)
     stated = running.ratios["noise"] * anchors.variance / anchors.depth**2
+    stated = stated + running.config.alone / max(len(stated), 1)
     noise = stated + running.ratios["roughness"] + (ranges(depth, valid, anchors.at_pixel) / 2) ** 2
     return _Scene(running.config, grid, _prior(grid, running), observed, stated, noise)
 
@@ -201,9 +208,9 @@ def _prior(grid: _Grid, running: _Running) -> Prior:
 
 
 def _fitted(scene: _Scene) -> tuple[Field, _LeftOut, Floats]:
-    nu = scene.config.degrees_of_freedom
     _, left_out = _with_weights(scene, 1 / scene.noise)
-    weight = (nu + 1) / (nu + left_out.residual**2 / left_out.total) / scene.noise
+    excess = np.maximum(left_out.residual**2 - left_out.total, 0) / (scene.config.degrees_of_freedom + 1)
+    weight = 1 / (scene.noise + excess)
     return *_with_weights(scene, weight), weight
 
 
@@ -232,9 +239,12 @@ def _window(count: int, width: float) -> Floats:
     return np.exp(-(((at_[:, None] - at_) / width) ** 2) / 2)
 
 
-def _tail(scene: _Scene, share: Floats, offset: Floats, spread: Floats) -> Floats:
-    v, q = scene.config.spread * spread, np.exp(np.minimum(-offset, LARGEST))
-    return scene.config.wrong * (1 + 2 * share) * (q * q * np.exp(2 * v) - 2 * q * np.exp(v / 2) + 1)
+def _total(scene: _Scene, variance: Floats, share: Floats, offset: Floats, spread: Floats) -> Floats:
+    config, q = scene.config, np.exp(np.minimum(-offset, LARGEST))
+    own, wide = (np.minimum(v, config.widest) for v in (variance, config.spread * spread))
+    tail = q * q * np.exp(2 * wide) - 2 * q * np.exp(wide / 2) + 1
+    p = config.wrong + config.other * share
+    return (1 - p) * (np.exp(2 * own) - 2 * np.exp(own / 2) + 1) + p * tail
 
 
 def _away(scene: _Scene, evidence: NDArray[np.bool_]) -> Floats:
@@ -283,8 +293,8 @@ def _of_discs(scene: _Scene, weight: Floats, claimed: Floats, running: _Running)
     believed = np.where(held, scene.believed(), 0.0)
     area = (believed / np.maximum(scene.counted(believed), 1e-12))[held]
     share, b = away / scene.config.reach, field.coefficients
-    tail = _tail(scene, share, mean - (x * b).sum(1), _spread(scene, rest, b[0])[node])
-    stated = variance + away * running.ratios["unseen"] + share * claimed[held] + tail
+    stated, spread = variance + away * running.ratios["unseen"], _spread(scene, rest, b[0])[node]
+    stated = _total(scene, stated, share, mean - (x * b).sum(1), spread) + share * claimed[held]
     sums = {
         "amplitude": (
             area * (square - noise) / variance,

@@ -1,7 +1,7 @@
 """Gaussian mixture regression on the CPU (numba): the entry points.
 
-The exact sum at every pixel is in ``regress_tiles_cpu``, at points of any kind in ``regress_points_cpu``; both leave
-out components that cannot matter, and state the error. The paper's neighbourhood is in ``regress_near_cpu``.
+The exact sum is in ``regress_tiles_cpu``: it leaves out components that cannot matter, and states the error. The
+paper's neighbourhood is in ``regress_near_cpu``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.regress_cull_cpu import in_view
 from ufmstar_torch.kernels.regress_near_cpu import near_image, near_points
-from ufmstar_torch.kernels.regress_points_cpu import at_points
 from ufmstar_torch.kernels.regress_tiles_cpu import exact, exact_at
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, padded
 from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
@@ -30,13 +29,13 @@ from ufmstar_torch.regress import Regression, regress_pixels
 # coarser than the arithmetic itself.
 EPSILON = {torch.float32: 1e-6, torch.float64: 1e-14}
 
-
 View = tuple[Any, ...]  # what `in_view` returns
 
 
 class Seen(NamedTuple):
-    """What of a stream's mixture can matter in an image: n components by field [13, n and more] in the camera's frame
-    (``rigid_cpu``), their disagreement [n] and features [n, F], and how many components the mixture has."""
+    """The part of a stream's mixture that can matter in an image: n components by field [13, n and more] in the
+    camera's frame (``rigid_cpu``), their disagreement [n] and features [n, F], and how many components the mixture
+    has."""
 
     components: NDArray[np.float64]
     disagreement: NDArray[np.float64]
@@ -74,23 +73,10 @@ def all_seen(mixture_cam: GaussianMixture, features: int | None = None) -> tuple
     return seen, slots
 
 
-def regress_image(
-    mixture_cam: GaussianMixture,
-    depth: Tensor,
-    intrinsics: Tensor,
-    valid: Tensor,
-    config: UfMStarConfig,
-    pixels: Tensor | None = None,
-) -> Regression:
-    """As :func:`ufmstar_torch.regress.regress_image`, for CPU tensors; every feature is a contiguous map."""
-    depth = torch.where(valid, depth.detach(), 0)
-    return regress_maps(all_seen(mixture_cam)[0], depth, intrinsics, config, pixels)
-
-
 def look(
     seen: Sequence[Seen], depth: Tensor, intrinsics: Tensor, config: UfMStarConfig, *others: torch.dtype
 ) -> list[View]:
-    """What each stream's mixture has in view, as the exact sum takes it, with the error of the depth's dtype or of a
+    """The part of each stream's mixture in view, as the exact sum takes it, with the error of the depth's dtype or of a
     more precise one of the ``others``."""
     epsilon = min(EPSILON[dtype] for dtype in (depth.dtype, *others))
     streams = zip(seen, _doubles(intrinsics)[0], array(depth), strict=True)
@@ -106,8 +92,8 @@ def regress_maps(
     views: Sequence[View] | None = None,
     shift: NDArray[np.float64] | None = None,
 ) -> Regression:
-    """:func:`regress_image` of a depth that is positive where it is valid, and only there, and of what each stream's
-    mixture has in view.
+    """As :func:`ufmstar_torch.regress.regress_image`, of what each stream's mixture has in view, for a depth that is
+    positive where it is valid, and only there; every feature is a contiguous map.
 
     With the exact sum, ``views`` are those of :func:`look`, which None makes, and ``shift`` [B, 2] is added to the two
     features before the last, of three or more; None = nothing.
@@ -115,12 +101,12 @@ def regress_maps(
     if pixels is not None and config.regression != "exact":
         most = max(len(one.disagreement) for one in seen)
         mixture = in_slots(seen, [np.arange(len(one.disagreement)) for one in seen], most)
-        return regress_pixels(mixture, depth, intrinsics, depth > 0, config, pixels, regress)
+        return regress_pixels(mixture, depth, intrinsics, depth > 0, config, pixels, _regress_near)
     z, K = array(depth), _doubles(intrinsics)[0]
     shape, features = z.shape if pixels is None else tuple(pixels.shape), seen[0].features.shape[1]
     out, out_f = np.empty(shape, z.dtype), np.empty((len(z), features, *shape[1:]), z.dtype)
     shares = 1 if pixels is not None else shares_of_stream(len(z), z[0].size)
-    settings, moved = _settings(config, depth.dtype), np.zeros((len(z), 2)) if shift is None else shift
+    moved = np.zeros((len(z), 2)) if shift is None else shift
     kernel = near_image if config.regression != "exact" else exact if pixels is None else exact_at
     if views is None and kernel is not near_image:
         views = look(seen, depth, intrinsics, config)
@@ -128,7 +114,7 @@ def regress_maps(
     for b, one in enumerate(seen):
         into = out[b], out_f[b]
         if views is None:
-            given = (z[b], K[b], *one.moments(), one.disagreement, one.features, *settings, *into)
+            given = (z[b], K[b], *one.moments(), one.disagreement, one.features, *_neighbourhood(config), *into)
             calls += [(*given, i, shares) for i in range(shares)]
             continue
         view = views[b]
@@ -140,17 +126,12 @@ def regress_maps(
     return _regression(out, out_f)
 
 
-def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> Regression:
-    """As :func:`ufmstar_torch.regress.regress`, for CPU tensors; with the exact sum components are left out where they
-    add less than eps pi_0 / K to the denominator, so that the error is at most eps max(m_k, mu_0)."""
+def _regress_near(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> Regression:
+    """As :func:`ufmstar_torch.regress.regress` with the neighbourhood, for CPU tensors."""
     x = points.detach().contiguous().numpy()
     out, features = np.empty(x.shape[:2], x.dtype), np.empty((len(x), mixture.features.shape[2], x.shape[1]), x.dtype)
-    settings = _settings(config, points.dtype)
     streams = zip(x, *_fields(mixture), out, features, strict=True)
-    each(
-        at_points if config.regression == "exact" else near_points,
-        [(*given[:6], *settings, *given[6:]) for given in streams],
-    )
+    each(near_points, [(*given[:6], *_neighbourhood(config), *given[6:]) for given in streams])
     return _regression(out, features)
 
 
@@ -170,12 +151,11 @@ def _smooth(previous, current, alpha, memory, shown):
         shown[i] = now if now != now else memory[i]
 
 
-def _settings(config: UfMStarConfig, dtype: torch.dtype) -> tuple[float, ...]:
-    """What the kernel of the configured sum needs to know."""
-    prior = (config.prior_weight, config.prior_mean)
-    if config.regression == "exact":
-        return (*prior, EPSILON[dtype])
-    return (*prior, config.neighbourhood_sigmas, config.near_radius, config.far_radius)
+def _neighbourhood(config: UfMStarConfig) -> tuple[float, ...]:
+    """The settings of the paper's neighbourhood, as compiled code takes them."""
+    return (
+        config.prior_weight, config.prior_mean, config.neighbourhood_sigmas, config.near_radius, config.far_radius,
+    )  # fmt: skip
 
 
 def _doubles(*values: Tensor) -> list[NDArray[np.float64]]:

@@ -27,12 +27,12 @@ import math
 import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
-from ufmstar_torch.kernels.regress_points_cpu import HALF_LOG_TWO_PI_CUBED
 from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, bounds, largest
 from ufmstar_torch.kernels.rigid_cpu import padded
 from ufmstar_torch.kernels.vectors_cpu import LANES
 from ufmstar_torch.kernels.whiten_cpu import PEAK, SQUARE, WHITENED, meets, whiten
 
+HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 _PRIOR = 1e-3  # share of the prior in a threshold
 FIELDS = 10  # of a component: mean (3), whitening (6), log2 of the peak
 _LOG2_E = math.log2(math.e)

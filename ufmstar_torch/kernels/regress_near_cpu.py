@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, part
-from ufmstar_torch.kernels.regress_points_cpu import prepare, slots_in_use
+from ufmstar_torch.kernels.regress_cull_cpu import HALF_LOG_TWO_PI_CUBED
 
 
 @kernel
@@ -53,7 +53,7 @@ def near_points(points, mean, covariance, weight, m, features, prior_weight, pri
 @part
 def _components(mean, covariance, weight, sigmas):
     """Occupied components: index, log peak density, mean and whitening [K, 9], and half the sides of their boxes."""
-    index, whitening, log_peak = prepare(slots_in_use(weight), mean, covariance, weight)
+    index, whitening, log_peak = _prepare(_slots_in_use(weight), mean, covariance, weight)
     local, extent = empty((index.size, 9), np.float64), empty((index.size, 3), np.float64)
     for k in range(index.size):
         for i in range(3):
@@ -62,6 +62,37 @@ def _components(mean, covariance, weight, sigmas):
         for i in range(6):
             local[k, 3 + i] = whitening[k, i]
     return index, log_peak, local, extent
+
+
+@part
+def _prepare(index, mean, covariance, weight):
+    """Index, inverse Cholesky factor (row by row, 6 numbers) and log peak density of some occupied components [n]."""
+    whitening = empty((index.size, 6), np.float64)
+    log_peak = empty(index.size, np.float64)
+    for i in range(index.size):
+        S = covariance[index[i]]
+        least = 1e-14 * max(S[0, 0], S[1, 1], S[2, 2])  # fusion keeps pivots far above it
+        l00 = math.sqrt(max(S[0, 0], least))
+        l10, l20 = S[1, 0] / l00, S[2, 0] / l00
+        l11 = math.sqrt(max(S[1, 1] - l10 * l10, least))
+        l21 = (S[2, 1] - l20 * l10) / l11
+        l22 = math.sqrt(max(S[2, 2] - l20 * l20 - l21 * l21, least))
+        whitening[i, 0] = 1 / l00
+        whitening[i, 1], whitening[i, 2] = -l10 / (l00 * l11), 1 / l11
+        whitening[i, 4], whitening[i, 5] = -l21 / (l11 * l22), 1 / l22
+        whitening[i, 3] = -(l20 * whitening[i, 0] + l21 * whitening[i, 1]) / l22
+        log_peak[i] = math.log(weight[index[i]] / (l00 * l11 * l22)) - HALF_LOG_TWO_PI_CUBED
+    return index, whitening, log_peak
+
+
+@part
+def _slots_in_use(weight):
+    """Indices of positive weights; ``np.flatnonzero`` takes longer to compile."""
+    index, n = empty(weight.size, np.int64), 0
+    for k in range(weight.size):
+        index[n] = k
+        n += weight[k] > 0
+    return index[:n]
 
 
 @part

@@ -188,7 +188,7 @@ def largest(code, values, n, most):
 
 @vectors
 def square_distances(code, u, v, more, first, n, point, out, at):
-    """Of n points (u, v) from ``first`` on the squared distances from ``point`` [2], plus ``more``; to ``out`` from
+    """The squared distances of n points (u, v), from ``first`` on, from ``point`` [2], plus ``more``; to ``out`` from
     ``at`` on. Up to a vector's length more is read and written."""
     x, y = point.one(0), point.one(1)
     with code.loop(n, code.lanes) as j:

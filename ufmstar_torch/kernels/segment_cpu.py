@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.compile_cpu import kernel, zeros
+from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.segment_image_cpu import join_rows, write_gaussians, write_labels
 from ufmstar_torch.kernels.segment_rows_cpu import SEGMENT, SEGMENT_INT, scan_rows
 from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
@@ -73,9 +73,14 @@ def most_gaussians(fits: Sequence[Fit]) -> int:
 
 
 def feature_means(features: np.ndarray, labels: Callable[[], Tensor], weight: np.ndarray) -> np.ndarray:
-    """Means [B, K, F] of the features [B, F, H, W] over the pixels of each Gaussian, in the dtype of ``weight``
-    [B, K]."""
-    return _feature_means(features, labels().numpy(), weight)
+    """Means [B, K, F] of the features [B, F, H, W] over the pixels of each Gaussian, summed in raster order, in the
+    dtype of ``weight`` [B, K]."""
+    out = np.empty((*weight.shape, features.shape[1]), weight.dtype)
+    for b, place in enumerate(labels().numpy() + 1):  # 0: of no Gaussian
+        for f, values in enumerate(features[b]):
+            sums = np.bincount(place.ravel(), values.ravel(), weight.shape[1] + 1)
+            out[b, :, f] = sums[1:] / np.maximum(weight[b], 1)
+    return out
 
 
 def fit(given: SegmentInput, *, before_pruning: bool = False) -> tuple[list[Fit], Callable[[], Tensor]]:
@@ -149,23 +154,3 @@ def _depth_bins(s: float, limits: _Limits) -> tuple[np.ndarray, np.ndarray]:
 @kernel
 def _write(kept, gaussians, whole, mean, covariance, weight, count):
     write_gaussians(kept, gaussians, whole, mean, covariance, weight, count)
-
-
-@kernel
-def _feature_means(features, labels, weight):
-    """Mean of the features [B, F, H, W] over the pixels of each Gaussian, in raster order."""
-    streams, channels, height, width = features.shape
-    sums = zeros((streams, weight.shape[1], channels), np.float64)
-    for b in range(streams):
-        for f in range(channels):
-            for v in range(height):
-                for u in range(width):
-                    if labels[b, v, u] >= 0:
-                        sums[b, labels[b, v, u], f] += features[b, f, v, u]
-    out = zeros(sums.shape, weight.dtype)
-    for b in range(streams):
-        for k in range(weight.shape[1]):
-            for f in range(channels):
-                if weight[b, k] > 0:
-                    out[b, k, f] = sums[b, k, f] / weight[b, k]
-    return out

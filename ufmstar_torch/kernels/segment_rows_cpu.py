@@ -95,7 +95,7 @@ def _usable(z, use, spread, v, max_depth, depth, s2):
 
 @leaf
 def _thresholds(depth, rx, slope, limits, x, tau_z):
-    """Of a row: x, and tau_z (-1 for a pixel that takes no part)."""
+    """Write x and tau_z of a row (-1 for a pixel that takes no part)."""
     for u in range(depth.size):
         x[u] = rx[u] * depth[u]
     low, high = limits.noise_floor, limits.noise_thresh

@@ -139,17 +139,12 @@ def select_posterior(name: str, device_type: str) -> PosteriorUpdate:
 
 @functools.cache
 def _triton() -> Kernels:
-    from ufmstar_torch.kernels.triton import correspond, distribute, fuse, regress, segment
+    from ufmstar_torch.kernels.triton import correspond, fuse, regress, segment
 
-    return Kernels(
-        spgf=segment.segment,
-        floor_covariance=fuse.floor_covariance,
-        correspond=correspond.correspond,
-        fuse=fuse.fuse,
-        regress_image=regress.regress_image,
-        smooth=regress.smooth,
-        distribute=distribute.distribute,
-    )
+    return replace(
+        REFERENCE, spgf=segment.segment, floor_covariance=fuse.floor_covariance, correspond=correspond.correspond,
+        fuse=fuse.fuse, regress_image=regress.regress_image,
+    )  # fmt: skip
 
 
 @functools.cache

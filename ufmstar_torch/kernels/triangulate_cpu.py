@@ -171,7 +171,7 @@ def _linearised(given, into, centre, work):
 
 @part
 def _inverse(work, lane, damping, out):
-    """Of a normal matrix, symmetric and positive definite, damped, by cofactors."""
+    """The inverse of a damped normal matrix, symmetric and positive definite, by cofactors."""
     n00, n11, n22 = work[_N00 + lane], work[_N11 + lane], work[_N22 + lane]
     more = damping * max(n00 + n11 + n22, 2.2250738585072014e-308)
     a, b, c = n00 + more, work[_N01 + lane], work[_N02 + lane]

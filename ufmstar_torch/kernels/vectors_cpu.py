@@ -53,7 +53,7 @@ class Lanes:
         return self._new(self._builder.fcmp_ordered(">", self.value, self._other(other)))
 
     def select(self, yes: Lanes, no: Lanes | float) -> Lanes:
-        """Of truth values: ``yes`` where True."""
+        """``yes`` where these truth values are True, else ``no``."""
         return self._new(self._builder.select(self.value, yes.value, yes._other(no)))
 
     def at_least(self, other: Lanes | float) -> Lanes:
@@ -80,8 +80,8 @@ class Lanes:
         return self._new(self._builder.call(sqrt, [self.value]))
 
     def log2_above(self) -> Lanes:
-        """Of positive doubles an upper bound of the logarithm, at most .0862 above it: their bits, read as an integer,
-        are a straight line between powers of two."""
+        """An upper bound of log2 of positive doubles, at most .0862 above it: their bits, read as an integer, are a
+        straight line between powers of two."""
         b, count = self._builder, self.value.type.count
         bits = b.bitcast(self.value, ir.VectorType(ir.IntType(64), count))
         return self._new(b.sitofp(bits, self.value.type)) * 2.0**-52 + (0.0861 - 1023)
@@ -189,7 +189,7 @@ class Memory:
 
 
 class Code:
-    """What a function of vectors is written with.
+    """The instructions with which a function of vectors is written.
 
     Attributes:
         lanes: numbers of a vector.

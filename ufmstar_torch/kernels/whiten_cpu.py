@@ -1,7 +1,7 @@
 """Which components an image can show: whitening and silhouettes, several at a time, as vector instructions.
 
 Components are in the camera's frame by field [13, stride] (``rigid_cpu``). Each number has the bits that scalar code
-gives it: ``regress_points_cpu.prepare`` whitens by the same sums.
+gives it: ``regress_near_cpu`` whitens by the same sums.
 """
 
 from __future__ import annotations

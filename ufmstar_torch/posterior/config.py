@@ -21,7 +21,8 @@ class PosteriorConfig(Checked):
         prior_sigma: standard deviation of b's constant and of its slope in log d before the first anchor
         tilt_sigma: the same of its slopes in u and v
         drift: standard deviation of b's change from frame to frame
-        degrees_of_freedom: of the Student-t weights that take outliers out
+        degrees_of_freedom: of the Student-t distribution of an anchor about the others' prediction
+        alone: variance of y of an anchor without others; 1/N of it, of each among N
         roughness: standard deviation of y from one pixel to the next, before it is learnt
         unseen: variance of y a width of the image from evidence, before it is learnt
         prior_weight: anchors for which these values count
@@ -31,8 +32,10 @@ class PosteriorConfig(Checked):
         reach: distance from the evidence from which on a node has none
         discs: discs of anchors that are held out in a frame
         radius: of a disc; standard deviation of the Gaussian that weighs the anchors around a node
-        wrong: probability that the local correction does not hold, at evidence; three times as much beyond ``reach``
+        wrong: probability that the local correction does not hold, at evidence
+        other: what is added to it from ``reach`` on, since another surface may begin
         spread: variance of y where it does not hold, over that of the anchors' y around
+        widest: variance of y from which on the variance of the depth grows no more
         edge_contrast: difference of log d at which a node counts half at a pixel
     """
 
@@ -42,7 +45,8 @@ class PosteriorConfig(Checked):
     prior_sigma: float = number(0.5, "sigma_b", "1", 0.0, open_low=True)
     tilt_sigma: float = number(0.2, "sigma_t", "1", 0.0, open_low=True)
     drift: float = number(0.05, "tau", "1/frame^.5", 0.0)
-    degrees_of_freedom: float = number(4.0, "nu", "1", 0.0, open_low=True)
+    degrees_of_freedom: float = number(19.0, "nu", "1", 0.0, open_low=True)
+    alone: float = number(1.0, "sigma_1^2", "1", 0.0)
     roughness: float = number(0.05, "sigma_0", "1", 0.0, open_low=True)
     unseen: float = number(0.1, "g", "1/width", 0.0)
     prior_weight: float = number(20.0, "n_0", "anchors", 0.0, open_low=True)
@@ -52,11 +56,13 @@ class PosteriorConfig(Checked):
     reach: float = number(1.0, "l", "width", 0.0, open_low=True)
     discs: int = number(3, "", "1", 0, 16)
     radius: float = number(5 / 28, "r", "width", 0.0, open_low=True)
-    wrong: float = number(0.03, "p", "1", 0.0, 1 / 3)
+    wrong: float = number(0.03, "p_0", "1", 0.0, 0.5)
+    other: float = number(0.06, "p_1", "1", 0.0, 0.5)
     spread: float = number(2.0, "a", "1", 0.0, 4.0)
+    widest: float = number(2.0, "v_2", "1", 0.0, 4.0, open_low=True)
     edge_contrast: float = number(0.1, "delta", "1", 0.0, open_low=True)
 
     @property
     def prior_variance(self) -> tuple[float, float, float, float]:
-        """Of the coefficients b before the first anchor."""
+        """The variances of the coefficients b before the first anchor."""
         return (self.prior_sigma**2, self.prior_sigma**2, self.tilt_sigma**2, self.tilt_sigma**2)

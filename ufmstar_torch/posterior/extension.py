@@ -44,9 +44,10 @@ class PosteriorFrame(FrameExtension):
         return state.with_tensors({"posterior": learnt}), replace(out, statistics=statistics)
 
     def outputs(self) -> dict[str, Tensor]:
-        """The corrected depth and its variance."""
+        """The corrected depth, its variance, and the probability of another surface."""
         assert self._posterior is not None
-        return {"posterior_depth": self._posterior.depth, "posterior_variance": self._posterior.variance}
+        names = ("depth", "variance", "outlier")
+        return {f"posterior_{name}": getattr(self._posterior, name) for name in names}
 
 
 class PosteriorExtension(Extension):

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import FARTHEST_OFF
+from ufmstar_torch.posterior.config import PosteriorConfig
 
 # No correction by more than this log factor: anchors that are off by more are not valid.
 LARGEST = math.log(FARTHEST_OFF)
@@ -15,25 +16,26 @@ LARGEST = math.log(FARTHEST_OFF)
 
 def read(
     depth: Tensor, valid: Tensor, claimed: Tensor, nodes: Tensor, coefficients: Tensor, mean: Tensor,
-    size: tuple[int, int], contrast: float,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Depth and variance at every pixel.
+    size: tuple[int, int], config: PosteriorConfig,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Depth, variance and the probability of another surface at every pixel.
 
-    The four nodes around it count by their bilinear weights and by 1/(1 + (D/contrast)^2); D is the difference between
-    the pixel's log d and the node's.
+    The four nodes around it count by their bilinear weights and by 1/(1 + (D/edge_contrast)^2); D is the difference
+    between the pixel's log d and the node's.
 
     Args:
         depth, valid: [B, H, W].
         claimed: [B, H, W] UfM*'s variance [m^2]; counts where a pixel has no evidence.
-        nodes: [B, n, 4] log d, y less the coefficients' part, variance of y, and share without evidence.
+        nodes: [B, n, 4] log d, y less the coefficients' part, variance over the squared depth, and share without
+            evidence.
         coefficients: [B, 4] of 1, log d - m_0, u, v.
         mean: [B] m_0.
         size: R and C of the nodes.
-        contrast: difference of log d at which a node counts half.
+        config: of the posterior.
 
     Returns:
-        Depth d e^y [m] and variance (d e^y)^2 (v + share claimed/d^2) [m^2], [B, H, W] in depth's dtype, NaN where not
-        valid.
+        Depth d e^y [m], variance (d e^y)^2 (v + share claimed/d^2) [m^2] and probability wrong + other share, [B, H, W]
+        in depth's dtype, NaN where not valid.
     """
     rows, cols = size
     b, height, width = depth.shape
@@ -46,7 +48,7 @@ def read(
     for row, by_row in ((top, 1 - below), ((top + 1).clamp_max(rows - 1), below)):
         for column, by_column in ((left, 1 - beside), ((left + 1).clamp_max(cols - 1), beside)):
             at = nodes[:, (row[:, None] * cols + column).flatten()].view(b, height, width, 4)
-            alike = 1 / (1 + ((logs - at[..., 0]) / contrast).square())
+            alike = 1 / (1 + ((logs - at[..., 0]) / config.edge_contrast).square())
             weight = by_row[:, None] * by_column * alike
             total = total + weight
             sums = sums + weight * at[..., 1:].permute(3, 0, 1, 2)
@@ -55,8 +57,9 @@ def read(
     y = c[0] + c[1] * (logs - mean[:, None, None]) + c[2] * (2 * u - 1) + c[3] * (2 * v - 1)[:, None] + offset
     corrected = d * y.clamp(-LARGEST, LARGEST).exp()
     spread = corrected.square() * (variance + unseen * claimed.double() / d.square())
-    corrected, spread = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in (corrected, spread))
-    return corrected, spread
+    maps = corrected, spread, config.wrong + config.other * unseen
+    corrected, spread, outlier = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in maps)
+    return corrected, spread, outlier
 
 
 def _between(x: Tensor, count: int) -> tuple[Tensor, Tensor]:

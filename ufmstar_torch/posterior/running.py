@@ -9,7 +9,7 @@ not decide.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -56,9 +56,9 @@ class Running:
     Attributes:
         config: of the posterior.
         frames: [B] that had anchors.
-        mean: [B] m_0 of the last of them.
+        mean: [B] m_0 of the last frame.
         above, below: by name of :func:`ratios`, [B] sums whose quotient is the ratio.
-        coefficients: [B, 4] of the features in the last of them.
+        coefficients: [B, 4] of the features in the last frame.
         covariance: [B, 4, 4] of these.
     """
 
@@ -89,6 +89,12 @@ class Running:
         """[B, SIZE], for :meth:`of`."""
         scalars = [self.frames, self.mean, *self.above.values(), *self.below.values()]
         return torch.cat([torch.stack(scalars, 1), self.coefficients, self.covariance.flatten(1)], 1)
+
+    def drifted(self, mean: Tensor) -> Tensor:
+        """[B, SIZE] after a frame without anchors whose m_0 is ``mean`` [B]; zeros before the first anchor."""
+        coefficients, covariance = self.expected(mean)
+        packed = replace(self, mean=mean, coefficients=coefficients, covariance=covariance).packed()
+        return torch.where(self.frames[:, None] > 0, packed, torch.zeros_like(packed))
 
     def require(self) -> None:
         """Raise a ValueError unless anchors can have taught these numbers."""

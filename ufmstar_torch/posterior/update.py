@@ -10,11 +10,17 @@ the predicted depth (``grid``, ``field``). An anchor observes y with the varianc
     n = roughness + blur^2 + noise s^2/g^2,
 
 where blur is half the range of log d among the pixel's neighbours, and ``noise`` the factor by which anchors state
-their variances too small. Student-t weights (nu + 1)/(nu + z^2), z from the leave-one-out residual, take outliers out.
+their variances too small, and ``alone`` over the number of anchors is added: few anchors do not confirm each other. An
+anchor is distributed about the prediction of the others as Student's t. What (nu + z^2)/(nu + 1) adds to that
+prediction's variance, with z from the leave-one-out residual, is counted as its noise: this takes outliers out.
 
-Variance of y at a node, with share = min(1, distance/reach):
+Variance over the squared depth at a node, with v the field's variance + roughness + unseen distance, and
+share = min(1, distance/reach):
 
-    the field's + roughness + unseen distance + share V/d^2 + p (1 + 2 share) tail.
+    (1 - p) m(v) + p tail + share V/d^2,      p = wrong + other share,      m(v) = E[(e^n - 1)^2],      n ~ N(0, v).
+
+The error of the depth is log-normal, so m exceeds v where v is large. p is the probability that the depth is of another
+surface than its evidence: ``outlier``.
 
 The distance from evidence is geodesic, in widths of the image, and differences of log d lengthen it: on tours the
 variance of the error grows in proportion to it. ``unseen``, and the amplitude of f, are learnt (``running``) from
@@ -27,7 +33,8 @@ wrong or lies on another surface. Then y - b . x is normal with the variance v, 
 
     tail = E[(e^(n - f) - 1)^2] = q^2 e^(2 v) - 2 q e^(v/2) + 1,      q = e^-f <= 100,      n ~ N(0, v).
 
-v is ``spread`` times the variance of the anchors' y around, of a Gaussian window. So no pixel is more certain than
+v is ``spread`` times the variance of the anchors' y around, of a Gaussian window, and neither v exceeds ``widest``. So
+no pixel is more certain than
 contradictory evidence allows, and a depth that was pulled far below the global correction is less certain than one
 above it.
 
@@ -63,19 +70,22 @@ STEPS = (0.7548776662466927, 0.5698402909980532)
 
 @dataclass(frozen=True)
 class Posterior:
-    """Of B streams.
+    """The posterior of B streams.
 
     Attributes:
         depth: [B, H, W] [m]; as predicted before the first anchor. NaN where not valid.
         variance: [B, H, W] [m^2]; UfM*'s where no anchors were ever given.
         calibration: [B] mean z^2 of held-out anchors lately: 1 = as predicted, more = too certain; NaN before any.
         unseen: [B] variance of y a width of the image from evidence.
+        outlier: [B, H, W] probability in [0, 1] that a pixel lies on another surface than its evidence; NaN where not
+            valid or no anchors were ever given.
     """
 
     depth: Tensor
     variance: Tensor
     calibration: Tensor
     unseen: Tensor
+    outlier: Tensor
 
 
 # As :func:`update`; ``kernels/posterior_cpu`` has the compiled one.
@@ -113,6 +123,7 @@ class _Scene:
             torch.where(anchors.valid, anchors.depth.log() - log_depth, torch.zeros_like(log_depth)),
         )  # fmt: skip
         stated = running.ratio("noise")[:, None] * anchors.variance / anchors.depth.square()
+        stated = stated + running.config.alone / anchors.valid.sum(1, keepdim=True).clamp_min(1).to(stated)
         noise = stated + running.ratio("roughness")[:, None] + (_range(frame, anchors) / 2).square()
         return cls(running.config, grid, _prior(grid, running), observed, stated, noise, anchors.valid)
 
@@ -157,7 +168,8 @@ def update(
         config: the constants.
 
     Returns:
-        What was learnt up to this frame, and the posterior. A stream without a usable anchor keeps its state.
+        What was learnt up to this frame, and the posterior. A stream without a usable anchor learns nothing; its
+        coefficients drift.
     """
     given = anchors is not None
     anchors = anchors if anchors is not None and anchors.valid.shape[1] else _none(frame)
@@ -170,19 +182,21 @@ def update(
     mean, variance = field.at(torch.arange(features.shape[1], device=b.device).expand_as(away), features)
     offset, share = mean - (features * b[:, None]).sum(-1), away / config.reach
     variance = variance + running.ratio("roughness")[:, None] + away * running.ratio("unseen")[:, None]
-    variance = variance + _tail(scene, share, offset, _spread(scene, anchors.valid, b[:, 0]))
+    variance = _total(scene, variance, share, offset, _spread(scene, anchors.valid, b[:, 0]))
     nodes = torch.stack([grid.log_depth, offset, variance, share], -1)
     maps = frame.depth, frame.valid, known_claim
-    depth, spread = read(*maps, nodes, b, grid.mean, grid.size, config.edge_contrast)
+    depth, spread, outlier = read(*maps, nodes, b, grid.mean, grid.size, config)
     some = anchors.valid.any(1)
     known = (some | (running.frames > 0) | given)[:, None, None]
     plain = torch.where(frame.valid, frame.depth, torch.nan)
-    kept = torch.where(some[:, None], after.packed().to(packed.dtype), packed)
+    drifted = torch.where(frame.valid.flatten(1).any(1)[:, None], running.drifted(grid.mean), packed)
+    kept = torch.where(some[:, None], after.packed(), drifted).to(packed.dtype)
     now = Running.of(kept, config)
     calibration = torch.where(now.below["calibration"] > 0, now.ratio("calibration"), torch.nan)
     return kept, Posterior(
-        torch.where(known, depth, plain), torch.where(known, spread, claimed), calibration, now.ratio("unseen")
-    )
+        torch.where(known, depth, plain), torch.where(known, spread, claimed), calibration, now.ratio("unseen"),
+        torch.where(known, outlier, torch.nan),
+    )  # fmt: skip
 
 
 def _none(frame: FrameInput) -> AnchorInput:
@@ -219,11 +233,10 @@ def _range(frame: FrameInput, anchors: AnchorInput) -> Tensor:
 
 def _fitted(scene: _Scene) -> tuple[Field, _LeftOut, Tensor]:
     """The field, how well it predicts each anchor from the others, and the anchors' weights in it."""
-    zero, nu = torch.zeros_like(scene.noise), scene.config.degrees_of_freedom
-    weight = torch.where(scene.valid, 1 / scene.noise, zero)
-    _, left_out = _with_weights(scene, weight)
-    student = (nu + 1) / (nu + left_out.residual.square() / left_out.total)
-    weight = torch.where(scene.valid, student / scene.noise, zero)
+    zero = torch.zeros_like(scene.noise)
+    _, left_out = _with_weights(scene, torch.where(scene.valid, 1 / scene.noise, zero))
+    excess = (left_out.residual.square() - left_out.total).clamp_min(0) / (scene.config.degrees_of_freedom + 1)
+    weight = torch.where(scene.valid, 1 / (scene.noise + excess), zero)
     return *_with_weights(scene, weight), weight
 
 
@@ -255,11 +268,13 @@ def _window(count: int, width: float, like: Tensor) -> Tensor:
     return (-((at[:, None] - at) / width).square() / 2).exp()
 
 
-def _tail(scene: _Scene, share: Tensor, offset: Tensor, spread: Tensor) -> Tensor:
-    """Variance over the squared depth by what the local correction ``offset`` may have wrong."""
-    v, q = scene.config.spread * spread, (-offset).clamp_max(LARGEST).exp()
-    second = q.square() * (2 * v).exp() - 2 * q * (v / 2).exp() + 1
-    return scene.config.wrong * (1 + 2 * share) * second
+def _total(scene: _Scene, variance: Tensor, share: Tensor, offset: Tensor, spread: Tensor) -> Tensor:
+    """Variance over the squared depth: of y's ``variance``, and where the local correction ``offset`` does not hold."""
+    config, q = scene.config, (-offset).clamp_max(LARGEST).exp()
+    own, wide = (v.clamp_max(config.widest) for v in (variance, config.spread * spread))
+    tail = q.square() * (2 * wide).exp() - 2 * q * (wide / 2).exp() + 1
+    p = config.wrong + config.other * share
+    return (1 - p) * ((2 * own).exp() - 2 * (own / 2).exp() + 1) + p * tail
 
 
 def _away(scene: _Scene, evidence: Tensor) -> Tensor:
@@ -315,8 +330,8 @@ def _of_discs(scene: _Scene, weight: Tensor, claimed: Tensor, running: Running) 
     share, b = away / scene.config.reach, field.coefficients
     offset = mean - (scene.observed.features * b[:, None]).sum(-1)
     spread = torch.gather(_spread(scene, rest, b[:, 0]), 1, scene.observed.node)
-    stated = variance + away * running.ratio("unseen")[:, None] + share * claimed
-    stated = stated + _tail(scene, share, offset, spread)
+    stated = variance + away * running.ratio("unseen")[:, None]
+    stated = _total(scene, stated, share, offset, spread) + share * claimed
     return {
         "amplitude": (
             total(area * (square - scene.noise) / variance, 1),

@@ -26,7 +26,7 @@ COUNTS = 8
 
 @dataclass(frozen=True)
 class Cameras:
-    """Of B streams.
+    """Cameras and counters of B streams after a frame.
 
     Attributes:
         first: [B, 4, 4] float64 pose of the first camera.

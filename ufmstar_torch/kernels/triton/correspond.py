@@ -85,7 +85,7 @@ def candidates(
     size: tuple[int, int],
     config: UfMStarConfig,
 ) -> tuple[Candidates, Candidates]:
-    """What is in view of the mixture, and of the image's own Gaussians.
+    """The components in view of the mixture, and of the image's own Gaussians.
 
     Args:
         previous: M_(i-1), [B, K].

@@ -128,28 +128,11 @@ def _launch(
     )  # fmt: skip
 
 
-def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
-    """As :func:`ufmstar_torch.regress.smooth`, in one launch."""
-    before, now = previous.contiguous(), current.contiguous()
-    memory, shown = torch.empty_like(before), torch.empty_like(now)
-    launch(_smooth, (triton.cdiv(now.numel(), 1024),), before, now, memory, shown, now.numel(), alpha=alpha, chunk=1024)
-    return memory, shown
-
-
 @triton.jit
 def mixed(before, now, alpha: tl.constexpr):
     """The new memory of the moving average; NaN is no value."""
     both = (1 - alpha) * before + alpha * now
     return tl.where(now != now, before, tl.where(before != before, now, both))
-
-
-@triton.jit
-def _smooth(previous, current, memory, shown, count, alpha: tl.constexpr, chunk: tl.constexpr):
-    i = tl.program_id(0) * chunk + tl.arange(0, chunk)
-    now = tl.load(current + i, mask=i < count, other=0.0).to(memory.dtype.element_ty)
-    kept = mixed(tl.load(previous + i, mask=i < count, other=0.0), now, alpha)
-    tl.store(memory + i, kept, mask=i < count)
-    tl.store(shown + i, tl.where(now != now, now, kept).to(shown.dtype.element_ty), mask=i < count)
 
 
 @triton.jit

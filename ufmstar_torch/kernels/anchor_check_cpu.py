@@ -23,7 +23,7 @@ _APART, _FAR = 0.25, 1.0
 _HALF, _CELLS = 2, 2
 
 
-def beside(
+def check_anchors(
     image: NDArray[np.uint8],
     pixel: NDArray[np.float64],
     rho: NDArray[np.float64],
@@ -45,12 +45,12 @@ def beside(
     """
     shape = (image.shape[0] // cell + 1, image.shape[1] // cell + 1)
     moved, alone, lies_in = pixel.copy(), np.zeros(len(pixel)), np.full(shape, -1, np.int64)
-    _beside(image, pixel, rho, variance, cell, lies_in, moved, alone)
+    _check_anchors(image, pixel, rho, variance, cell, lies_in, moved, alone)
     return moved, alone
 
 
 @reordered
-def _beside(image, pixel, rho, variance, cell, lies_in, moved, alone):
+def _check_anchors(image, pixel, rho, variance, cell, lies_in, moved, alone):
     differs = np.zeros(len(pixel))
     for n in range(len(pixel)):
         lies_in[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n

@@ -1,20 +1,24 @@
-"""The compiled step and the compiled check of a frame against the reference, as wholes."""
+"""The whole step of every backend: against the oracle, against the reference, alone and together to the last bit."""
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from parts import compiled
+from backends import compiled
 from random_gaussians import mixture
+from walks import HEIGHT, SPGF, WIDTH, oracle_settings
 
+import oracle
 import scenes
 from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.frame import FrameMaps, check_values
-from ufmstar_torch.kernels import check_cpu, rigid_cpu, step_cpu, threads_cpu, visibility_cpu
+from ufmstar_torch.kernels import rigid_cpu, step_cpu, threads_cpu, visibility_cpu
 from ufmstar_torch.kernels.regress_cull_cpu import in_view
 
 pytestmark = pytest.mark.numerics
@@ -22,6 +26,101 @@ pytestmark = pytest.mark.numerics
 SIZE = (48, 64)
 K = torch.tensor(scenes.intrinsics(*SIZE))
 SMALL = SPGFConfig(min_pixels=100, min_rows=8)
+ON_CPU = pytest.mark.parametrize("backend", ["torch", "numba"], indirect=True)
+
+# Settings of UfM*, and the oracle's words for them.
+VARIANTS = {
+    "default": (UfMStarConfig(segment=SPGF, unmeasured="paper", features=2, initial_capacity=8), {}),
+    "overlap": (UfMStarConfig(segment=SPGF, unmeasured="paper", disagreement="overlap"), {"disagreement": "overlap"}),
+    "relative": (
+        UfMStarConfig(segment=SPGF, unmeasured="relative", unmeasured_relative=0.2),
+        {"unmeasured": "relative", "unmeasured_relative": 0.2},
+    ),
+    "nan": (UfMStarConfig(segment=SPGF, unmeasured="nan"), {"unmeasured": "nan"}),
+    "paper": (UfMStarConfig.paper(), {"neighbourhood": (2.0, 0.1, 0.5)}),
+}
+
+
+@functools.cache
+def oracle_walk(variant: str, count: int):
+    """Depths, poses, K and A of a rendered walk, the oracle's maps and matches of its frames, and its mixture."""
+    config, words = VARIANTS[variant]
+    depths, poses, camera = scenes.sequence(count, HEIGHT, WIDTH, 0.04)
+    rng = np.random.default_rng(1)
+    aleatoric = [0.01 + 0.02 * rng.random(d.shape) for d in depths]
+    judge = oracle.Oracle(oracle_settings(config.segment.scaled_to(HEIGHT, WIDTH)), **words)
+    maps, matches = [], []
+    for depth, T, a in zip(depths, poses, aleatoric, strict=True):
+        V, M = judge.step(depth, T, camera, aleatoric=a, features=np.stack([a, np.nan_to_num(depth)]))
+        maps.append(SimpleNamespace(V=V, M=M, share=judge.share(), weights=[g["weight"] for g in judge.mixture]))
+        matches.append(judge.matches)
+    return depths, poses, camera, aleatoric, maps, matches, judge.mixture
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_walk_agrees_with_the_oracle(backend, variant):
+    if backend.slow and variant != "default":
+        pytest.skip("the reference is compared with in every variant")
+    count = 2 if backend.slow else 20 if variant == "default" else 4
+    depths, poses, camera, aleatoric, maps, matches, expected = oracle_walk(variant, count)
+    config = VARIANTS[variant][0]
+    if backend.name == "triton":  # what finds no slot is in the next frame's map (test_triton.py)
+        config = config.replace(initial_capacity=256)
+    ufm = backend.module(config, torch.float64)
+
+    def batch(x):
+        return torch.tensor(np.asarray(x)).expand(2, *np.shape(x)).contiguous()
+
+    for i, (depth, T, a) in enumerate(zip(depths, poses, aleatoric, strict=True)):
+        features = {"features": batch(np.stack([a, np.nan_to_num(depth)]))} if variant == "default" else {}
+        out = ufm(batch(depth), batch(T), batch(camera), aleatoric=batch(a), **features)
+        assert out.statistics.components.tolist() == [len(maps[i].weights)] * 2
+        assert out.statistics.pairs.tolist() == [sum(map(len, matches[i]))] * 2
+        assert out.statistics.unmeasured.tolist() == [int((maps[i].share < 0.5).sum())] * 2
+        for b in range(2):
+            np.testing.assert_allclose(out.disagreement[b].numpy(), maps[i].M, rtol=1e-8, atol=1e-10)
+            np.testing.assert_allclose(out.variance[b].numpy(), maps[i].V, rtol=1e-8, atol=1e-10)
+            np.testing.assert_allclose(out.measured[b].numpy(), maps[i].share, rtol=1e-7, atol=1e-9)
+    assert len(expected) > 1
+    assert max(g["m"] for g in expected) > 0
+    found = ufm.ufm.mixture.to("cpu")
+    for b in range(2):
+        for k, g in enumerate(expected):
+            for name, key in (("mean", "mean"), ("covariance", "cov"), ("disagreement", "m"), ("features", "features")):
+                if name != "features" or variant == "default":
+                    np.testing.assert_allclose(getattr(found, name)[b, k].numpy(), g[key], rtol=1e-9, atol=1e-10)
+            assert found.weight[b, k].item() == g["weight"]
+            assert found.count[b, k].item() == g["count"]
+
+
+def test_the_rendered_sequence_has_what_it_is_meant_to_test():
+    depths, poses, K, _, maps, matches, mixture = oracle_walk("default", 20)
+    sizes = [len(frame.weights) for frame in maps]
+    per_c = [len(ks) for frame in matches for ks in frame]
+    per_k = [sum(k in ks for ks in frame) for frame in matches for k in range(100)]
+    assert max(per_c) > 1, "one current component must match many"
+    assert max(per_k) > 1, "many must match one"
+    assert min(per_c) == 0
+    assert sizes[-1] > sizes[0] + 5, "new places must be seen"
+    assert max(g["count"] for g in mixture) > 8, "places must be revisited"
+    # The occlusion filter must have had work to do: without it, other matches follow.
+    judge = oracle.Oracle(oracle_settings(SPGF), eta_occl=1.0)
+    hidden = 0
+    for i in range(12):
+        valid = np.isfinite(depths[i])
+        current = oracle.segment(np.where(valid, depths[i], 0), K, judge.spgf, valid=valid)
+        if judge.T_first is None:
+            judge.T_first = poses[i]
+        to_cam = oracle.relative(judge.T_first, poses[i])
+        previous = [oracle.transform(g, *to_cam) for g in judge.mixture]
+        loose, overlaps = oracle.correspond(previous, current, K, depths[i].shape, 0.5, 1.0, 0.05)
+        strict, _ = oracle.correspond(previous, current, K, depths[i].shape, 0.5, 0.7, 0.05)
+        hidden += sum(len(a) - len(b) for a, b in zip(loose, strict, strict=True))
+        to_first = oracle.relative(poses[i], judge.T_first)
+        judge.mixture = oracle.fuse(judge.mixture, [oracle.transform(g, *to_first) for g in current], strict, overlaps)
+    assert hidden > 0
+
+
 CONFIGS = {
     "default": UfMStarConfig(segment=SMALL),
     "paper": UfMStarConfig.paper().replace(segment=SMALL),
@@ -33,29 +132,29 @@ CONFIGS = {
 }
 
 
-def frames(count: int, config: UfMStarConfig, dtype: torch.dtype, streams: int = 1):
+def frames(count: int, config: UfMStarConfig, dtype: torch.dtype, streams: int = 1, size: tuple[int, int] = SIZE):
     """Arguments of ``UfMStar.forward``: streams that start at different places of one tour, with holes and faults."""
-    depths, poses, _ = scenes.sequence(count + streams, *SIZE, 0.05)
+    depths, poses, camera = scenes.sequence(max(12, count + streams), *size, 0.05)
     generator = torch.Generator().manual_seed(0)
     for i in range(count):
         depth = torch.stack([torch.tensor(depths[i + s]) for s in range(streams)]).to(dtype)
         pose = torch.stack([torch.tensor(poses[i + s]) for s in range(streams)]).double()
         depth[:, 5, 7], depth[:, 9], depth[:, 10, :30] = torch.nan, 30.0, 1e-9
-        if i == 2:
+        if i == 1:
             pose[-1, 0, 0] += 0.5
         more: dict = {}
         if config.features:
-            more["features"] = torch.rand(streams, 2, *SIZE, generator=generator, dtype=dtype)
+            more["features"] = torch.rand(streams, 2, *size, generator=generator, dtype=dtype)
             more["features"][:, 1, 20, 20] = torch.inf
         if config.aleatoric_in_moments:
             more["aleatoric"] = 0.01 * torch.rand(depth.shape, generator=generator, dtype=dtype)
             more["aleatoric"][:, 3, 3], more["epistemic"] = -1.0, torch.full_like(depth, 0.1)
             more["valid"] = torch.rand(depth.shape, generator=generator) > 0.1
         if config.anchors is not None:
-            at = torch.randint(0, 48, (streams, 20, 2), generator=generator)
+            at = torch.randint(0, size[0], (streams, 20, 2), generator=generator)
             present = torch.stack([depth[s, at[s, :, 1], at[s, :, 0]] for s in range(streams)]).double()
             more["anchors"] = Anchors(at.double(), 1.1 * present, 1e-4 * present.square())
-        yield (depth, pose, K), more
+        yield (depth, pose, torch.tensor(camera)), more
 
 
 def tensors(out) -> dict[str, torch.Tensor]:
@@ -77,40 +176,53 @@ def assert_same(one, other, rows=slice(None)) -> None:
 
 @pytest.mark.parametrize("name", CONFIGS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 3e-5)])
-def test_agrees_with_the_reference(name, dtype, tolerance):
-    config = CONFIGS[name].replace(on_bad_frame="skip")
-    fast, slow = (UfMStar(config.replace(backend=backend), dtype=dtype) for backend in ("numba", "torch"))
-    for arguments, more in frames(4, config, dtype):
-        a, b = tensors(fast(*arguments, **more)), tensors(slow(*arguments, **more))
+def test_agrees_with_the_reference(compiled_backend, name, dtype, tolerance):
+    slow, config = compiled_backend.slow, CONFIGS[name].replace(on_bad_frame="skip")
+    if slow and (dtype == torch.float64) != (name in ("full", "anchored")):
+        pytest.skip("in one precision")
+    if compiled_backend.name == "triton":  # as above
+        config = config.replace(initial_capacity=config.max_components or 64)
+    fast, reference = compiled_backend.module(config, dtype), UfMStar(config.replace(backend="torch"), dtype=dtype)
+    few = {"count": 2, "streams": 2, "size": (24, 32)} if slow else {"count": 4}
+    for arguments, more in frames(config=config, dtype=dtype, **few):
+        a, b = tensors(fast(*arguments, **more)), tensors(reference(*arguments, **more))
         assert a.keys() == b.keys()
         for key, value in b.items():
+            found = a[key].cpu()
+            if key.startswith("current_cam"):
+                found = found[:, : value.shape[1]]
             if value.is_floating_point():
                 scale = value.nan_to_num(0).abs().max().item() if value.numel() else 0.0
-                torch.testing.assert_close(a[key], value, rtol=tolerance, atol=tolerance * scale, equal_nan=True)
+                torch.testing.assert_close(found, value, rtol=tolerance, atol=tolerance * scale, equal_nan=True)
             else:
-                assert torch.equal(a[key], value), key
-    assert fast.skipped.item() == 1
-    assert fast.mixture.components.item() > 3
-    for key, value in slow.state.tensors().items():
-        same = getattr(fast, key)
-        assert same.shape == value.shape
-        assert same.dtype == value.dtype
-        torch.testing.assert_close(same, value, rtol=10 * tolerance, atol=10 * tolerance, equal_nan=True)
+                assert torch.equal(found, value), key
+    assert int(fast.ufm.skipped.sum()) == 1
+    assert int(fast.ufm.mixture.components.max()) > 3
+    for key, value in reference.state.tensors().items():
+        found = getattr(fast.ufm, key).cpu()
+        assert found.dtype == value.dtype
+        if key in reference.mixture.tensors() or key in reference.state.by_component:
+            slots = min(found.shape[1], value.shape[1])  # a GPU's mixture grows ahead
+            assert not found[:, slots:].any()
+            found, value = found[:, :slots], value[:, :slots]
+        torch.testing.assert_close(found, value, rtol=10 * tolerance, atol=10 * tolerance, equal_nan=True)
 
 
-@pytest.mark.parametrize("name", ["default", "full", "anchored"])
-def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(name, monkeypatch):
+@ON_CPU
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(backend, name, monkeypatch):
     monkeypatch.setattr(threads_cpu, "_SHARE", 4 * 64)  # pixels; up to three parts of a stream
-    config = CONFIGS[name].replace(on_bad_frame="skip")
-    together = [UfMStar(config) for _ in range(3)]
-    alone = [UfMStar(config) for _ in range(3)]
+    config = CONFIGS[name].replace(on_bad_frame="skip", backend=backend.name)
+    counts = (1, 2, 3) if backend.name == "numba" else (1,)  # torch's own sums are not ours to answer for
+    together, alone = [UfMStar(config) for _ in counts], [UfMStar(config) for _ in range(3)]
     before = torch.get_num_threads()
     try:
         for arguments, more in frames(4, config, torch.float32, streams=3):
             outs = []
-            for threads, ufm in enumerate(together, start=1):
+            for threads, ufm in zip(counts, together, strict=True):
                 torch.set_num_threads(threads)
                 outs.append(ufm(*arguments, **more))
+                assert torch.get_num_threads() == threads
             for other in outs[1:]:
                 assert_same(outs[0], other)
             for s, ufm in enumerate(alone):
@@ -121,6 +233,10 @@ def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(name, m
                 assert_same(ufm(depth[s : s + 1], pose[s : s + 1], K, **one), outs[0], slice(s, s + 1))
     finally:
         torch.set_num_threads(before)
+    for s, ufm in enumerate(alone):
+        n = int(ufm.mixture.components)
+        for key, value in ufm.mixture.tensors().items():
+            assert torch.equal(getattr(together[0].mixture, key)[s, :n], value[0, :n]), key
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -169,10 +285,11 @@ def test_what_is_out_of_reach_neither_matches_nor_is_summed(dtype):
     assert np.array_equal(near[again], summed)
 
 
-def test_the_state_before_is_not_modified():
-    config = CONFIGS["full"]
+@ON_CPU
+def test_the_state_before_is_not_modified(backend):
+    config = CONFIGS["full"].replace(backend=backend.name)
     ufm = UfMStar(config)
-    given = list(frames(2, config, torch.float32))
+    given = list(frames(3, config, torch.float32))[::2]  # the frame between is at fault
     ufm(*given[0][0], **given[0][1])
     before = ufm.state
     kept = {name: value.clone() for name, value in before.tensors().items()}
@@ -201,27 +318,13 @@ def hostile_cameras():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_check_agrees_with_the_reference(dtype):
+def test_the_check_agrees_with_the_reference(compiled_backend, dtype):
     poses, cameras = hostile_cameras()
     b, generator = len(poses), torch.Generator().manual_seed(1)
 
     def hostile(*shape: int) -> torch.Tensor:
-        special = [
-            torch.nan,
-            torch.inf,
-            -torch.inf,
-            0.0,
-            -1.0,
-            1e-7,
-            1e-6,
-            1e6,
-            2e6,
-            1e12,
-            1.1e12,
-            3e38,
-            20.3,
-            20.300001,
-        ]
+        special = [torch.nan, torch.inf, -torch.inf, 0.0, -1.0, 1e-7, 1e-6, 1e6, 2e6, 1e12, 1.1e12, 3e38]
+        special += [20.3, 20.300001]
         values = torch.rand(shape, generator=generator, dtype=torch.float64) * 30
         pick = torch.randint(0, 3 * len(special), shape, generator=generator)
         return torch.where(pick < len(special), torch.tensor(special).double()[pick % len(special)], values).to(dtype)
@@ -233,14 +336,14 @@ def test_the_check_agrees_with_the_reference(dtype):
     for maps in (full, plain, replace(plain, epistemic=full.epistemic, mask=full.mask)):
         given = (maps, poses, cameras)
         slow = check_values(*given, rotation_tolerance=0.01, max_depth=20.3)
-        fast = check_cpu.check_values(*given, rotation_tolerance=0.01, max_depth=20.3)
+        fast = compiled_backend.check(*given, rotation_tolerance=0.01, max_depth=20.3)
         for name, value in vars(slow).items():
-            same = getattr(fast, name)
+            found = getattr(fast, name)
             if value is None:
-                assert same is None
-            else:
-                assert same.dtype == value.dtype, name
-                torch.testing.assert_close(same, value, rtol=1e-15, atol=1e-15, equal_nan=True)
+                assert found is None
+            elif found is not None or name != "known_fault":  # the GPU's is on the host alone where cameras are there
+                assert found.dtype == value.dtype, name
+                torch.testing.assert_close(found, value, rtol=1e-14, atol=1e-14, equal_nan=True)
         assert set(range(10)) == set(slow.fault.tolist())
         assert slow.beyond.sum() > 0
         assert slow.out_of_range.sum() > 0
@@ -262,8 +365,6 @@ def test_warming_up_compiles_all_that_a_frame_needs_and_touches_no_state():
             ufm(*arguments, **more)
             ufm.mean_uncertainty(*arguments, **more)
     assert not compiled.buffer
-    with pytest.raises(ValueError, match="size and streams must be positive"):
-        ufm.warm_up((0, 4))
 
 
 def test_warming_up_with_the_reference():

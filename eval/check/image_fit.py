@@ -1,0 +1,247 @@
+"""Do poses, intrinsics and depth fit the images? Corners are tracked over a few frames and compared with them.
+
+A corner x of one image lies, in another one, on the half line from its point at infinity, K R K^-1 x, towards the
+epipole: every positive depth is there. Its distance from where the corner was tracked to is noise, or a mistake in
+poses or intrinsics; where it lies on the line is its depth in the unit of the poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from ufmstar_torch.anchors.corners import find, follow
+from ufmstar_torch.anchors.tracker import checked
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
+
+# Places of the sequence, frames over which corners are followed there at most, and their median motions as shares of
+# the image's width at which they are compared: near, where recordings are within a pixel, and far, where a trajectory
+# that is late by a frame of a smooth motion shows.
+_PLACES, _FRAMES, _NEAR, _FAR = 6, 12, 0.02, 0.08
+_CORNERS, _SPACING, _BACK = 200, 14 / 640, 0.5  # as the tracker of anchors has them
+_FEWEST, _STILL = 20, 2.0  # corners of a pair, and their median motion [px], without which it shows nothing
+# Other readings: frames by which the trajectory is late, and factors of the intrinsics. Nearer to 1 is calibration.
+_LATE, _FACTORS = (-3, -2, -1, 1, 2, 3), 2.0 ** np.arange(-2, 2.01, 0.125)
+_FACTORS = _FACTORS[np.abs(np.log2(_FACTORS)) > 0.3]
+# Another reading is better that halves the distance, by so many pixels at least. On eight rendered tours right input is
+# at .2 to .4 px and no reading halves it; one frame late is at 1.1 px or more and four times as far as the right one.
+_HALVES, _APART = 2.0, 0.2
+_FINE = 1.0  # [px] as messages state it
+_LARGEST = 0.005  # share of the width: a distance that contradicts the poses under whatever reading
+# Depth against that of the corners: pairs and corners of each, their least shift along the line [px], the factor from
+# which units differ (networks err by less than 2 on average), and the rank correlation of depth that is inverse.
+_PAIRS, _POINTS, _SHIFT, _UNITS, _INVERSE = 2, 10, 2.0, 4.0, -0.3
+
+
+class FollowedCorners(NamedTuple):
+    """Corners [N, 2] (u, v) [px] of frame ``first``, and where they are in frame ``last``."""
+
+    first: int
+    last: int
+    start: np.ndarray
+    end: np.ndarray
+
+    @property
+    def motion(self) -> float:
+        """Median motion [px]."""
+        return float(np.median(np.linalg.norm(self.end - self.start, axis=1)))
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How poses and intrinsics may be meant: by name of a convention, late by frames, intrinsics times a factor."""
+
+    poses: str = OURS
+    late: int = 0
+    factor: float = 1.0
+
+    def __str__(self) -> str:
+        if self.poses != OURS:
+            return f"the poses look {CONVENTIONS[self.poses].description}"
+        if self.late:
+            frames = f"{abs(self.late)} frame{'s' if abs(self.late) > 1 else ''}"
+            return f"the trajectory looks {frames} {'late' if self.late > 0 else 'early'}"
+        return f"the intrinsics look as if given for images {1 / self.factor:.2g} times as large"
+
+
+GIVEN = Reading()
+
+
+@dataclass(frozen=True)
+class ImageFit:
+    """How far tracked corners lie from where poses and intrinsics allow them to be."""
+
+    pairs: int  # of frames
+    motion: float  # median motion of a corner between them [px]
+    error: float  # median distance from the half lines [px]
+    reading: Reading  # the one that fits best; as given where no other is much better
+    best_error: float  # with it
+    problem: str  # "" = none
+
+    @property
+    def words(self) -> str:
+        """The outcome in a line."""
+        return f"poses disagree with the images by {self.error:.1f} px (fine: below {_FINE:.0f})"
+
+
+@dataclass(frozen=True)
+class DepthFit:
+    """Depth maps beside the depths of tracked corners."""
+
+    pairs: int  # compared
+    ratio: float  # median of the maps' depth over the corners'
+    order: float  # median rank correlation of the two
+    problem: str  # "" = none
+
+
+def track_corners(sequence: FrameSequence, indices: range | None = None) -> list[FollowedCorners]:
+    """Corners over some frames at evenly spaced places of a sequence, or of its part between the first and the last of
+    ``indices``. Frames without an image or that cannot be read end a track; corners that hardly move are left out."""
+    first, last = (0, len(sequence) - 1) if not indices else (min(indices), max(indices))
+    starts = np.unique(np.linspace(first, max(first, last - _FRAMES // 2), _PLACES).astype(int)).tolist()
+    tracked = (one for start in starts for one in _followed(sequence, start, min(start + _FRAMES, last)))
+    return [one for one in tracked if one.motion >= _STILL]
+
+
+def _followed(sequence: FrameSequence, first: int, last: int) -> list[FollowedCorners]:
+    """The first frame with the first one at which corners moved near, and with that at which they moved far or were
+    followed last."""
+    image = _gray(sequence, first)
+    if image is None:
+        return []
+    width, result = image.shape[1], list[FollowedCorners]()
+    start = find(image, _CORNERS, _SPACING * width, np.zeros((0, 2)))
+    position = start
+    for index in range(first + 1, last + 1):
+        following = _gray(sequence, index)
+        if following is None or following.shape != image.shape or len(start) < _FEWEST:
+            break
+        position, alive = follow(image, following, position, _BACK)
+        start, position, image = start[alive], position[alive], following
+        if len(start) < _FEWEST:
+            break
+        one = FollowedCorners(first, index, start, position)
+        result = [*result[: bool(result) and result[0].motion >= _NEAR * width], one]
+        if one.motion >= _FAR * width:
+            break
+    return result
+
+
+def _gray(sequence: FrameSequence, index: int) -> np.ndarray | None:
+    entry = sequence.entries[index]
+    try:
+        image = None if entry.load_image is None else entry.load_image()
+    except FrameError:
+        return None
+    if image is None or (entry.image_size or sequence.image_size) not in (None, image.shape[:2]):
+        return None
+    return checked(image, entry.T_world_cam, sequence.intrinsics_of(entry))[0]
+
+
+def image_fit(sequence: FrameSequence, corners: Sequence[FollowedCorners]) -> ImageFit | None:
+    """The fit of a sequence's poses and intrinsics to corners in its images; None where no corner moves, or without
+    poses."""
+    if not corners or not sequence.posed:
+        return None
+    others = [Reading(poses=name) for name in CONVENTIONS if name != OURS] + [Reading(late=n) for n in _LATE]
+    others += [Reading(factor=float(factor)) for factor in _FACTORS]
+    near = list({one.first: one for one in reversed(corners)}.values())
+    far = list({one.first: one for one in corners}.values())
+    reading = GIVEN
+    best = error = _error(sequence, near, GIVEN)
+    for pairs in (near, far):
+        given = _error(sequence, pairs, GIVEN)
+        errors = [_error(sequence, pairs, other) for other in others]
+        least = min(errors)
+        if reading == GIVEN and given > _HALVES * least and given - least > _APART:
+            reading, error, best = others[errors.index(least)], given, least
+    motion = float(np.median([one.motion for one in near]))
+    width = 2 * sequence.intrinsics[0, 2] if sequence.image_size is None else sequence.image_size[1]
+    fit = ImageFit(len(near), motion, error, reading, best, "")
+    if reading != GIVEN:
+        return _with_problem(fit, f"{reading}: corners fit to {best:.1f} px then")
+    if error > max(_FINE, _LARGEST * width):
+        return _with_problem(fit, "poses, intrinsics and images belong together under no reading tried")
+    return fit
+
+
+def _with_problem(fit: ImageFit, text: str) -> ImageFit:
+    return ImageFit(fit.pairs, fit.motion, fit.error, fit.reading, fit.best_error, f"{fit.words}: {text}")
+
+
+def _error(sequence: FrameSequence, corners: Iterable[FollowedCorners], reading: Reading) -> float:
+    """Median over pairs of the median distance [px]; inf where no pair has poses."""
+    last = len(sequence) - 1
+    inside = (one for one in corners if one.first + reading.late >= 0 and one.last + reading.late <= last)
+    distances = [np.median(_beside(sequence, one, reading)[0]) for one in inside]
+    return float(np.median(distances)) if distances else float("inf")
+
+
+def _beside(sequence: FrameSequence, corners: FollowedCorners, reading: Reading = GIVEN) -> tuple[np.ndarray, ...]:
+    """[N] distance of corners from their half lines [px], how far along these they lie [px], and the inverse depth
+    [1/unit of the poses] in the first image that this means."""
+    convert, entries, late = CONVENTIONS[reading.poses].convert, sequence.entries, reading.late
+    T_a, T_b = (convert(entries[at + late].T_world_cam) for at in (corners.first, corners.last))
+    K_a, K_b = (
+        sequence.intrinsics_of(entries[at]) * np.array([[reading.factor], [reading.factor], [1.0]])
+        for at in (corners.first, corners.last)
+    )
+    T_b_a = np.linalg.inv(T_b) @ T_a
+    rays = np.column_stack([corners.start, np.ones(len(corners.start))]) @ np.linalg.inv(K_a).T
+    infinite, shift = rays @ (K_b @ T_b_a[:3, :3]).T, K_b @ T_b_a[:3, 3]
+    ahead = infinite[:, 2] > 1e-3
+    z = np.where(ahead, infinite[:, 2], 1.0)
+    origin = infinite[:, :2] / z[:, None]
+    speed = (shift[:2] - origin * shift[2]) / z[:, None]  # d x / d rho at rho = 0
+    length = np.maximum(np.linalg.norm(speed, axis=1), 1e-12)
+    offset = corners.end - origin
+    along = (offset * speed).sum(1) / length
+    across = np.abs(offset[:, 0] * speed[:, 1] - offset[:, 1] * speed[:, 0]) / length
+    distance = np.where(along > 0, across, np.linalg.norm(offset, axis=1))
+    # x(rho) = (infinite + rho shift) / (z + rho shift_z), so along = rho length z / (z + rho shift_z).
+    rho = along / (length - along * shift[2] / z)
+    return np.where(ahead, distance, np.inf), along, np.where(ahead, rho, np.nan)
+
+
+def depth_fit(
+    sequence: FrameSequence,
+    corners: Iterable[FollowedCorners],
+    depth_at: Callable[[int, np.ndarray], np.ndarray | None],
+) -> DepthFit | None:
+    """Compare depth with that of corners by parallax, in the unit of the poses.
+
+    Args:
+        sequence, corners: as :func:`image_fit`, whose outcome is without a problem.
+        depth_at: of a frame's index and pixels [N, 2] of its image: depth [N], not positive = none; or None.
+
+    Returns:
+        The comparison, None with too little parallax or depth.
+    """
+    ratios, orders = [], []
+    for one in corners:
+        distance, along, rho = _beside(sequence, one)
+        depth = depth_at(one.first, one.start)
+        if depth is None:
+            continue
+        good = (distance < _SHIFT) & (along > _SHIFT) & (rho > 0) & np.isfinite(depth) & (depth > 0)
+        if good.sum() >= _POINTS:
+            ratios.append(float(np.median(np.log(depth[good] * rho[good]))))
+            orders.append(float(spearmanr(depth[good], -rho[good])[0]) if np.ptp(depth[good]) > 0 else 0.0)
+    if len(ratios) < _PAIRS:
+        return None
+    ratio, order, problem = float(np.exp(np.median(ratios))), float(np.median(orders)), ""
+    if order < _INVERSE:
+        problem = f"far is near in the depth (rank correlation {order:.2f} with tracked corners): is it inverse depth?"
+    elif not 1 / _UNITS < ratio < _UNITS:
+        factor = f"{_digits(ratio)} times" if ratio > 1 else f"1/{_digits(1 / ratio)} of"
+        problem = f"depth is {factor} that of tracked corners by parallax: one of depth and poses is not in metres"
+    return DepthFit(len(ratios), ratio, order, problem)
+
+
+def _digits(factor: float) -> str:
+    return f"{factor:.0f}" if factor >= 10 else f"{factor:.1f}"

@@ -1,0 +1,159 @@
+"""The implementations of the steps behind one set of signatures: the torch reference, numba, Triton.
+
+Arguments and results lie on the CPU, wherever a backend computes; ``conftest.backend`` is each of them in turn.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from ufmstar_torch import UfMStar, UfMStarConfig, gaussian
+from ufmstar_torch.correspond import Correspondence
+from ufmstar_torch.frame import CheckKernel
+from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, regress_cpu, rigid_cpu, segment_cpu
+from ufmstar_torch.kernels.select import select_check, select_kernels
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.segment_input import SegmentInput
+from ufmstar_torch.step_parts import REFERENCE, Kernels
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"  # must be set before triton is imported
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One implementation.
+
+    Attributes:
+        device: of a module's tensors.
+        kernels: its parts.
+        check: of a frame's values.
+        slow: it runs in Triton's interpreter: few frames, few examples.
+    """
+
+    name: str
+    device: str
+    kernels: Kernels
+    check: CheckKernel
+    slow: bool = False
+
+    def spgf(self, depth, intrinsics, config=None, *, variance=None, valid=None, features=None, before_pruning=False):
+        """Step 2 with the arguments of ``ufmstar_torch.segment.spgf``."""
+        given = SegmentInput.checked(depth, intrinsics, config, variance, valid, features)
+        kernel: Any = self.kernels.spgf
+        return kernel(given, before_pruning=before_pruning)
+
+    def module(self, config: UfMStarConfig, dtype: torch.dtype = torch.float32) -> Callable[..., Any]:
+        """A UfM* of this backend that takes and returns CPU tensors; the module itself is its ``ufm``."""
+        ufm = UfMStar(config.replace(backend=self.name), dtype=dtype, device=self.device)
+        call = ufm if self.device == "cpu" else _on(self.device, ufm)
+        wrapped: Any = functools.partial(call)
+        wrapped.ufm = ufm
+        return wrapped
+
+
+@functools.cache
+def make_backend(name: str) -> Backend:
+    """The backend of a name; skips where this machine cannot run it."""
+    if name == "torch":
+        return Backend(name, "cpu", REFERENCE, select_check(name, "cpu"))
+    if name == "numba":
+        numba_kernels = replace(
+            REFERENCE, spgf=segment_cpu.segment, floor_covariance=_floored, correspond=_corresponding, fuse=_fused,
+            regress_image=_regressed, smooth=regress_cpu.smooth,
+        )  # fmt: skip
+        return Backend(name, "cpu", numba_kernels, select_check(name, "cpu"))
+    if not INTERPRETED and not torch.cuda.is_available():
+        pytest.skip("needs TRITON_INTERPRET=1 or a CUDA device")
+    device = "cpu" if INTERPRETED else "cuda"
+    kernels, check = select_kernels(name, device), select_check(name, device)
+    if device != "cpu":
+        kernels = Kernels(**{f.name: _on(device, getattr(kernels, f.name)) for f in fields(kernels)})
+        check = _on(device, check)
+    return Backend(name, device, kernels, check, slow=INTERPRETED)
+
+
+@functools.cache
+def compiled(part: Callable[..., Any]) -> Callable[..., Any]:
+    """A part of compiled kernels as a function that Python calls."""
+    return numba.njit(lambda *arguments: part(*arguments))
+
+
+def moved(value: Any, device: str) -> Any:
+    """Tensors, and dataclasses and tuples of them, on a device."""
+    if isinstance(value, torch.Tensor):
+        return value.to(device)
+    if isinstance(value, tuple):
+        return tuple(moved(part, device) for part in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{f.name: moved(getattr(value, f.name), device) for f in fields(value)})
+    return value
+
+
+def _on(device: str, kernel: Callable[..., Any]) -> Any:
+    """The same function for CPU tensors, computed on a device."""
+
+    def call(*arguments: Any, **options: Any) -> Any:
+        given = moved(arguments, device), {name: moved(value, device) for name, value in options.items()}
+        return moved(kernel(*given[0], **given[1]), "cpu")
+
+    return call
+
+
+def _by_field(m: GaussianMixture, stream: int):
+    """All slots of a stream by field (``rigid_cpu``)."""
+    table = np.empty((rigid_cpu.FIELDS, rigid_cpu.padded(m.capacity)))
+    moments = (v[stream].numpy() for v in (m.mean, m.covariance, m.weight))
+    rigid_cpu.gather(np.arange(m.capacity), 0, m.capacity, *moments, table)
+    return table
+
+
+def _corresponding(previous, current, intrinsics, size, config):
+    """The compiled lists of pairs, in increasing c and then k, as matrices; the overlap of other pairs stays 0."""
+    match = torch.zeros(previous.streams, current.capacity, previous.capacity, dtype=torch.bool)
+    overlap = torch.zeros(match.shape, dtype=torch.float64)
+    thresholds = (config.eta, config.eta_occlusion, config.near_plane, gaussian.PIXEL_VARIANCE)
+    for b in range(previous.streams):
+        given = [value for m in (previous, current) for value in (_by_field(m, b), m.capacity)]
+        c, k, beta = compiled(correspond_cpu.matches)(*given, intrinsics[b].double().numpy(), *size, thresholds)
+        match[b, c, k], overlap[b, c, k] = True, torch.from_numpy(beta)
+        assert np.array_equal(np.stack([c, k], 1), match[b].nonzero().numpy())
+    return Correspondence(match, overlap)
+
+
+def _fused(previous, current, pairs, config, *, rounds=None):
+    """The compiled fusion of a mixture, stream by stream."""
+    out = GaussianMixture(*(value.clone() for value in previous.tensors().values()))
+    epsilon = torch.finfo(previous.covariance.dtype).eps
+    for b in range(previous.streams):
+        c, k = pairs.match[b].nonzero(as_tuple=True)
+        distance = torch.empty(0).double() if pairs.distance is None else pairs.distance[b, c, k]
+        new = (v[b].numpy() for v in (current.mean, current.covariance, current.weight, current.features))
+        compiled(fuse_cpu.fuse_pairs)(
+            *(value[b].numpy() for value in out.tensors().values()), *new,
+            c.numpy(), k.numpy(), np.arange(previous.capacity), pairs.overlap[b, c, k].numpy(), distance.numpy(),
+            config.overlap_weighted, epsilon, np.empty(fuse_cpu.WORK),
+        )  # fmt: skip
+    return out
+
+
+def _floored(cov, floor):
+    out, mean = torch.zeros_like(cov), torch.zeros(*cov.shape[:-2], 3, dtype=cov.dtype)
+    mean[..., 2] = floor.sqrt()  # a camera whose pixel is 1 wide at depth 1
+    given = mean.view(-1, 3).numpy(), cov.reshape(-1, 3, 3).numpy()
+    work = np.empty(fuse_cpu.WORK)
+    compiled(fuse_cpu.floored)(len(given[0]), *given, 0.0, 1.0, 1.0, 0.0, out.view(-1, 3, 3).numpy(), work)
+    return out
+
+
+def _regressed(m, depth, intrinsics, valid, config, pixels=None):
+    positive = torch.where(valid, depth, 0)
+    return regress_cpu.regress_maps(regress_cpu.all_seen(m)[0], positive, intrinsics, config, pixels)
