@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from ufmstar_torch.eval.commands.opening import SequenceOptions
 from ufmstar_torch.eval.commands.options import UsageError, option, parse, positional
@@ -80,5 +80,5 @@ def _sequence(out: Path) -> FrameSequence:
 
     settings = run_settings(out)
     names = [f.name for f in fields(SequenceOptions) if f.name in settings]
-    values = {name: tuple(v) if isinstance(v := settings[name], list) else v for name in names}
+    values: dict[str, Any] = {name: tuple(v) if isinstance(v := settings[name], list) else v for name in names}
     return open_sequence(settings["sequence"], **SequenceOptions(**values).given())

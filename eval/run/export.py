@@ -7,10 +7,11 @@ whose sigma is beyond a limit, is left out.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +78,7 @@ def export_depth(frames: Iterator[Gated], out: Path) -> str:
     """NAME.npy [h, w] float32 [m], NaN where left out."""
     folder, count = _folder(out, "depth"), 0
     for count, frame in enumerate(frames, start=1):  # noqa: B007
-        depth = frame.depth
-        write_atomic(folder / f"{frame.name}.npy", lambda file, depth=depth: np.save(file, depth))
+        write_atomic(folder / f"{frame.name}.npy", partial(_save, frame.depth))
     return f"{folder}: {count} maps"
 
 
@@ -154,8 +154,8 @@ def export_transforms(frames: Iterator[Gated], out: Path, sequence: FrameSequenc
             "h": size[0],
         }
         listed.append(entry | camera | {"transform_matrix": CONVENTIONS["opengl"].convert(frame.T_world_cam)})
-    content = {"camera_model": "OPENCV", "depth_unit_scale_factor": unit, "frames": listed}
-    write_json_atomic(folder / "transforms.json", content)
+    plain = {"camera_model": "OPENCV", "depth_unit_scale_factor": unit, "frames": listed}
+    write_json_atomic(folder / "transforms.json", plain)
     return f"{folder / 'transforms.json'}: {len(listed)} frames"
 
 
@@ -217,5 +217,8 @@ def _png(image: NDArray[np.uint8]) -> bytes:
 
 
 def _write(path: Path, content: bytes) -> None:
-    write: Callable[[Any], object] = lambda file: file.write(content)  # noqa: E731
-    write_atomic(path, write)
+    write_atomic(path, lambda file: file.write(content))
+
+
+def _save(depth: NDArray[np.float32], file: BinaryIO) -> None:
+    np.save(file, depth)
