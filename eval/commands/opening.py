@@ -66,7 +66,7 @@ class SequenceOptions(OpeningOptions):
         depth_intrinsics: of the sequence's own depth maps: a file, or fx fy cx cy [px]
         images: of a generic sequence: folder, or video file
         truth: folder of the ground-truth depth maps of a generic sequence
-        max_time_difference: largest difference between the times of a colour image and its depth map [s]
+        max_time_difference: between a colour image and its depth map [s]
         register: leave 7-Scenes' depth in its own camera
         T_color_depth: 7-Scenes: file, 4x4 from depth to colour camera [m]
         drive: KITTI-360: name or number of a drive below the root
