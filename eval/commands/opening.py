@@ -22,7 +22,7 @@ class OpeningOptions:
     """How sequences are opened.
 
     Attributes:
-        layout: of the sequence's folder; auto: by the files in it
+        layout: of the folder; auto: by its files
         intrinsics: of the images: a file, or fx fy cx cy [px]
         distortion: to undo: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or own (TUM RGB-D's)
         truth_scale: metres per unit of the sequence's own depth
@@ -31,7 +31,7 @@ class OpeningOptions:
         poses: ned: x forward, z down; opengl: y up, z back
         pose_scale: metres per unit of poses, landmarks
         fps: frames per second of images without timestamps
-        time_offset: added to the images' times [s]
+        time_offset: added to image times [s]
         max_pose_gap: poses are interpolated over at most so long [s]
         scans: KITTI-360: also scans of so many frames around
     """
@@ -66,7 +66,7 @@ class SequenceOptions(OpeningOptions):
         depth_intrinsics: of the sequence's own depth maps: a file, or fx fy cx cy [px]
         images: of a generic sequence: folder, or video file
         truth: folder of the ground-truth depth maps of a generic sequence
-        max_time_difference: between a colour image and its depth map [s]
+        max_time_difference: largest, between a colour image and its depth map [s]
         register: leave 7-Scenes' depth in its own camera
         T_color_depth: 7-Scenes: file, 4x4 from depth to colour camera [m]
         drive: KITTI-360: name or number of a drive below the root
