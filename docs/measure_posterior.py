@@ -1,13 +1,14 @@
-"""Measures the effect of each constant of the posterior on rendered tours with networks that are wrong in three ways.
+"""Measures the effect of each constant of the posterior on rendered tours with networks that are wrong in four ways.
 
     python docs/measure_posterior.py --weights fastdepth_nyu.onnx
 
 prints the posterior's figures as means over tours (± 95 % of their mean), networks and evidence, and by how much each
 changes where one constant of ``PosteriorConfig`` is halved and doubled (``--change NAME=VALUE ...``: other values; *:
-beyond the 95 % interval of the paired difference). The networks are FastDepth, the demo's first one, and one that is
-made of the truth, off by a factor of its own in every cube of space; the evidence is dense, tracked corners, and of the
-dense evidence only what is nearer than 40 % of the image. Frames are predicted once, so a change costs some seconds.
-``--clips`` names recordings: FastDepth, from the first anchor on.
+beyond the 95 % interval of the paired difference). The tours are two homes, a hall, two plain homes, and a plain one
+in which the camera turns in place. The networks are FastDepth, the demo's first one, and two that are made of the
+truth: one off by a factor of its own in every cube of space, and one that sees no edges. The evidence is dense, tracked
+corners, and of the dense evidence only what is nearer than 40 % of the image. Frames are predicted once, so a change
+costs some seconds. ``--clips`` names recordings: FastDepth, from the first anchor on.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from ufmstar_torch import PosteriorConfig, UfMStar
 from ufmstar_torch.anchors import landmark_source
@@ -40,12 +42,16 @@ from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained
 from ufmstar_torch.posterior.running import SIZE
 
-TOURS = [f"tour:{seed}?style={style}&frames=40&size=240x320" for style in ("home", "hall") for seed in (711, 712, 713)]
-FIGURES = ("delta1", "rmse", "ece_delta", "ece_q", "nll", "spearman")
+KINDS_OF_TOURS = ("711?style=home", "713?style=home", "712?style=hall", "721?style=blank", "723?style=blank",
+                  "732?style=blank&pan=1")  # fmt: skip
+TOURS = [f"tour:{kind}&frames=40&size=240x320" for kind in KINDS_OF_TOURS]
+# The last two are no metrics: shares of pixels beyond 3 sigma, and of frames whose RMSE is above 1.1 of the network's.
+FIGURES = ("delta1", "rmse", "ece_delta", "ece_q", "nll", "spearman", "beyond_3_sigma", "worse_frames")
 KINDS = DENSE, CORNERS, NEAR = "dense", "corners", "near"
 NEAREST = 0.4  # share of the image that evidence of NEAR covers
 STRIDE = 4  # judged are every fourth pixel of every fourth row
-CUBE, FACTOR = 1.7, 0.35  # of the network made of the truth [m], and the standard deviation of its log factors
+CUBE, FACTOR = 1.7, 0.35  # of a network made of the truth [m], and the standard deviation of its log factors
+BLUR = 4, 5  # rows and columns of depth that a network without edges sees
 STUDENT = 2.571  # 97.5 % quantile for six tours
 
 
@@ -59,13 +65,13 @@ class Prepared:
     truth: Tensor
 
 
-def prepare(source: str, network: DepthNetwork | None, frames: int | None = None) -> list[Prepared]:
-    """The frames of a sequence; None is the network that is made of the truth."""
+def prepare(source: str, network: DepthNetwork | bool, frames: int | None = None) -> list[Prepared]:
+    """The frames of a sequence; a network that is made of the truth is told by whether it sees edges."""
     sources, ufm, prepared = {kind: landmark_source(kind) for kind in (DENSE, CORNERS)}, UfMStar(), []
     for frame in islice(open_sequence(source).readable(print), frames):
         if frame.image is None or frame.depth is None or not np.isfinite(frame.T_world_cam).all():
             continue
-        depth, K = made(frame) if network is None else predicted(frame, network)
+        depth, K = made(frame, network) if isinstance(network, bool) else predicted(frame, network)
         truth = truth_at(frame, K[0].numpy(), (depth.shape[1], depth.shape[2]))
         assert truth is not None
         pose, options = torch.from_numpy(frame.T_world_cam)[None], {"feature_count": 0, "rotation_tolerance": 0.01}
@@ -88,13 +94,16 @@ def predicted(frame: Frame, network: DepthNetwork) -> tuple[Tensor, Tensor]:
         return network(x).depth.float(), K.double()
 
 
-def made(frame: Frame) -> tuple[Tensor, Tensor]:
-    """The truth over a factor of e^.4, and of its own in every cube of space; likewise."""
+def made(frame: Frame, edges: bool) -> tuple[Tensor, Tensor]:
+    """The truth over a factor of e^.4, and of its own in every cube of space or without edges; likewise."""
     assert frame.depth is not None
     size = (frame.depth.shape[0] * 7 // 10, frame.depth.shape[1] * 7 // 10)
     K = resize_intrinsics(torch.from_numpy(frame.intrinsics)[None], frame.depth.shape, size)
     z = truth_at(frame, K[0].numpy(), size)
     assert z is not None
+    if not edges:
+        coarse = adaptive_avg_pool2d(torch.from_numpy(z)[None, None].clamp_min(0.1).log(), BLUR)
+        return (interpolate(coarse, size, mode="bilinear")[0] - 0.4).exp().float(), K
     v, u = np.mgrid[: size[0], : size[1]]
     rays = np.stack([u, v, np.ones(size)], -1) @ np.linalg.inv(K[0].numpy()).T
     point = (rays * z[..., None]) @ frame.T_world_cam[:3, :3].T + frame.T_world_cam[:3, 3]
@@ -106,10 +115,19 @@ def made(frame: Frame) -> tuple[Tensor, Tensor]:
 def figures(prepared: list[Prepared], kind: str, config: PosteriorConfig) -> list[float]:
     """``FIGURES`` of the posterior with one kind of evidence."""
     metrics, packed = SequenceMetrics(), torch.zeros(1, SIZE, dtype=torch.float64)
+    beyond, worse = [], []
     for one in prepared:
         packed, out = update(packed, one.frame, one.anchors[kind], one.claimed, config)
-        metrics.update(*(x[..., ::STRIDE, ::STRIDE] for x in (out.depth[0], out.variance[0], one.truth)))
-    row = metrics.compute()
+        maps = out.depth[0], out.variance[0], one.truth, one.frame.depth[0]
+        depth, variance, truth, network = (x[..., ::STRIDE, ::STRIDE] for x in maps)
+        metrics.update(depth, variance, truth)
+        known = (truth > 0) & (network > 0)
+        error, before = (truth - depth)[known], (truth - network)[known]
+        beyond.append((error.square() > 9 * variance[known]).double().mean())
+        worse.append((error.square().mean() > 1.21 * before.square().mean()).double())
+    row = metrics.compute() | dict(
+        zip(FIGURES[-2:], (float(torch.stack(x).nanmean()) for x in (beyond, worse)), strict=True)
+    )
     return [row[name] for name in FIGURES]
 
 
@@ -141,7 +159,7 @@ def main() -> None:
     if arguments.clips:
         return
     with as_file(files("ufmstar_torch.models") / "weights" / "demo.safetensors") as weights:
-        networks = [fastdepth, load_trained([weights])[0].eval(), None]
+        networks = [fastdepth, load_trained([weights])[0].eval(), True, False]
     tours = [[prepare(tour, network, arguments.frames) for network in networks] for tour in TOURS]
     start = by_tour(tours, config)
     means = zip(start.mean(0), interval(start), strict=True)
@@ -152,7 +170,7 @@ def main() -> None:
         name, _, value = change.partition("=")
         difference = by_tour(tours, replace(config, **{name: type(values[name])(value)})) - start
         means = zip(difference.mean(0), interval(difference), strict=True)
-        print(f"| {change} | " + " | ".join(f"{m:+.3f}{'*' * (abs(m) > h)}" for m, h in means) + " |", flush=True)
+        print(f"| {change} | " + " | ".join(f"{m:+.3f}{'*' * bool(abs(m) > h)}" for m, h in means) + " |", flush=True)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_networks import Linear, constant_head
 
-from ufmstar_torch import UfMStar
+from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.tour import export_tour, tour_sequence
 from ufmstar_torch.models import AleatoricNetwork, BatchEnsemble, NetworkSpec, Preprocess, build_network, save_trained
 from ufmstar_torch.train.losses import loss_of
@@ -115,7 +115,9 @@ def test_a_score_over_all_pixels_is_the_mean_of_the_dense_map(place):
     members = networks(1)
     (score,) = example.score_pool(members, place[0][:1], pixels=64 * 96)["ufmstar"]
     p, v = example.predict(members, place[0][0], 0), place[0][0]
-    dense = UfMStar()(p.depth, v.T_world_cam[None], v.intrinsics[None], p.aleatoric_variance)
+    dense = UfMStar(UfMStarConfig(unmeasured="paper"))(
+        p.depth, v.T_world_cam[None], v.intrinsics[None], p.aleatoric_variance
+    )
     assert score == pytest.approx(float(dense.variance.mean()), rel=1e-5)
 
 

@@ -18,7 +18,7 @@ from ufmstar_torch.anchors.evidence import Evidence, inliers, means, observe
 from ufmstar_torch.anchors.extension import anchored_term
 
 HEIGHT, WIDTH = 48, 64
-ON = UfMStarConfig(anchors=AnchorConfig(), unmeasured="paper")
+ON = UfMStarConfig(anchors=AnchorConfig(), unmeasured="paper")  # evidence alone
 
 
 def anchors_of(truth, count, rng, *, noise=0.0, variance=None, outliers=0.0):
@@ -48,7 +48,7 @@ def walk(predict, frames=24, config=ON, **options):
 
 def test_anchored_without_anchors_is_plain():
     depths, poses, K = scenes.sequence(6, HEIGHT, WIDTH, 0.05)
-    plain, anchored = (UfMStar(config, dtype=torch.float64) for config in (ON.replace(anchors=None), ON))
+    plain, anchored = UfMStar(ON.replace(anchors=None), dtype=torch.float64), UfMStar(ON, dtype=torch.float64)
     for depth, T in zip(depths, poses, strict=True):
         arguments = torch.tensor(depth)[None], torch.tensor(T), torch.tensor(K)
         a, b = plain(*arguments), anchored(*arguments)

@@ -13,7 +13,7 @@ from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.camera import resize_intrinsics
 
 H, W = 48, 64
-ON = UfMStarConfig(anchors=AnchorConfig(), unmeasured="paper")
+ON = UfMStarConfig(anchors=AnchorConfig(), unmeasured="paper")  # evidence alone
 K = torch.tensor([[60.0, 0.5, 31.5], [0, 58.0, 23.5], [0, 0, 1]], dtype=torch.float64)
 NAN, INF = float("nan"), float("inf")
 

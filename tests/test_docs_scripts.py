@@ -80,7 +80,7 @@ def test_the_tables_of_a_tour(script: Any, capsys: pytest.CaptureFixture[str]) -
 def test_a_constant_of_the_posterior_variance_leaves_the_depth(script: Any) -> None:
     """A tiny tour and the network that is made of the truth: the depth stays, the variance follows the constant."""
     posterior = script("measure_posterior")
-    prepared = posterior.prepare("tour:1?frames=6&size=96x128", None)
+    prepared = posterior.prepare("tour:1?frames=6&size=96x128", True)
     for kind in (posterior.DENSE, posterior.NEAR):
         configs = (PosteriorConfig(unseen=value, prior_weight=1e6) for value in (0.0, 1.0))
         rows = (posterior.figures(prepared, kind, config) for config in configs)

@@ -26,7 +26,8 @@ def means(**config):
 
 
 def test_a_mean_tells_how_much_of_it_was_measured():
-    plain, strict, dense = means(), means(unmeasured="nan"), UfMStar(UfMStarConfig(unmeasured="nan", ema_alpha=1.0))
+    plain, strict = means(unmeasured="paper"), means(unmeasured="nan")
+    dense = UfMStar(UfMStarConfig(unmeasured="nan", ema_alpha=1.0))
     assert [float(plain[0].measured), float(strict[0].measured)] == [0, 0]
     assert (float(plain[0].mean), int(plain[0].pixels)) == (0.0, 900)
     assert math.isnan(float(strict[0].mean))

@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "report": ("eval.commands.report", "tables, figures and a page from the results of eval"),
     "bench": ("eval.commands.bench", "time per stage and memory, beside the depth network's own"),
     "train": ("train.command", "a network with an uncertainty head, or an ensemble of them"),
+    "export": ("eval.commands.export", "a run's result as depth maps, a cloud, a trajectory or transforms.json"),
     "poses": ("eval.commands.poses", "poses and landmarks of a video that has none, by structure from motion"),
     "recalibrate": ("eval.commands.recalibrate", "fit a map of the variance to sequences with ground truth"),
     "data": ("eval.commands.data", "check: do a sequence's poses, depth and images fit together?"),

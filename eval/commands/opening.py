@@ -22,21 +22,18 @@ class OpeningOptions:
     """How sequences are opened.
 
     Attributes:
-        layout: of the sequence's folder; auto: by the files in it
-        intrinsics: of the images, instead of the layout's own: a file, or fx fy cx cy [px]
-        distortion: of the images' lens, which is undone: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or own:
-            TUM RGB-D's published one
-        truth_scale: metres per unit of the sequence's own depth maps, instead of the layout's
-        max_truth: depths beyond are no ground truth [m], such as what a window shows
-        trajectory: file with poses in TUM or KITTI format instead of the layout's own, in the sequence's folder or
-            else in the working folder
-        poses: how the poses are written; world-to-camera is inverted, ned has x forward, y right, z down, opengl
-            x right, y up, z backward
-        pose_scale: metres per unit of the poses, and of a file of landmarks
+        layout: of the folder; auto: by its files
+        intrinsics: of the images: a file, or fx fy cx cy [px]
+        distortion: to undo: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or own (TUM RGB-D's)
+        truth_scale: metres per unit of the sequence's own depth
+        max_truth: largest ground truth [m]
+        trajectory: poses (TUM or KITTI) for the layout's own
+        poses: ned: x forward, z down; opengl: y up, z back
+        pose_scale: metres per unit of poses, landmarks
         fps: frames per second of images without timestamps
-        time_offset: added to the images' times [s]
-        max_pose_gap: poses are interpolated between samples at most this far apart [s]
-        scans: KITTI-360: laser scans of so many frames before and after a frame that are added to its own
+        time_offset: added to image times [s]
+        max_pose_gap: poses are interpolated over at most so long [s]
+        scans: KITTI-360: also scans of so many frames around
     """
 
     layout: str = option("auto", choices=LAYOUTS)
@@ -67,11 +64,11 @@ class SequenceOptions(OpeningOptions):
 
     Attributes:
         depth_intrinsics: of the sequence's own depth maps: a file, or fx fy cx cy [px]
-        images: folder of images, or video file, of a generic sequence
+        images: of a generic sequence: folder, or video file
         truth: folder of the ground-truth depth maps of a generic sequence
-        max_time_difference: largest difference between the times of a colour image and its depth map [s]
+        max_time_difference: largest, between a colour image and its depth map [s]
         register: leave 7-Scenes' depth in its own camera
-        T_color_depth: 7-Scenes: file with the 4x4 matrix from the depth camera into the colour camera [m]
+        T_color_depth: 7-Scenes: file, 4x4 from depth to colour camera [m]
         drive: KITTI-360: name or number of a drive below the root
     """
 

@@ -81,8 +81,7 @@ class UfMOptions:
             landmarks, a line x y z sigma [m] each, in the world of the poses
         posterior: also a depth that anchors correct, with its variance (docs/results/posterior.md); --anchors chooses
             the anchors, default: dense
-        scale_from: network: the unit of a COLMAP model's poses, where it is not known, is the network's own scale;
-            anchors then show the shape of its error, not its scale
+        scale_from: network: its scale for COLMAP poses without one; anchors then show shape only
         recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
     """
 

@@ -63,7 +63,8 @@ class _Motion:
 
     def __init__(self) -> None:
         self._last: np.ndarray | None = None
-        self._start = self._now = np.zeros((0, 1, 2), np.float32)
+        self._start: np.ndarray = np.zeros((0, 1, 2), np.float32)  # of the corners in the last keyframe
+        self._now = self._start
         self._count = 0
 
     def is_keyframe(self, image: np.ndarray, required: bool) -> bool:
@@ -75,10 +76,10 @@ class _Motion:
             cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
         )
         if self._last is not None and self._last.shape == grey.shape and len(self._now):
-            moved, found, _ = cv2.calcOpticalFlowPyrLK(self._last, grey, self._now, None)
+            moved, found, _ = cv2.calcOpticalFlowPyrLK(self._last, grey, self._now, np.zeros_like(self._now))
             kept = found.ravel() == 1
-            self._start, self._now = self._start[kept], moved[kept]
-        self._last = grey
+            self._start, self._now = self._start[kept], np.asarray(moved, np.float32)[kept]
+        self._last = np.asarray(grey)
         left = len(self._now) >= max(_LEFT * self._count, 1)
         distance = np.linalg.norm(self._now - self._start, axis=-1)
         if left and not required and np.median(distance) < _MOTION * grey.shape[1]:
@@ -86,6 +87,6 @@ class _Motion:
         corners = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.01, 5)
         if (corners is None or len(corners) < _FEWEST) and not required:
             return False
-        self._start = self._now = np.zeros((0, 1, 2), np.float32) if corners is None else corners
+        self._start = self._now = np.asarray([] if corners is None else corners, np.float32).reshape(-1, 1, 2)
         self._count = len(self._start)
         return True

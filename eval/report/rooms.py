@@ -61,9 +61,9 @@ def find_rooms(folder: Path) -> dict[str, list[Snapshot]]:
         if row and frame:
             stored = load_arrays(file, _STORED)
             arrays = {name: stored[name].astype(np.float64) for name in (*_STORED, "path") if name in stored}
-            *gaussians, T = (arrays[name] for name in _STORED)
+            mean, covariance, disagreement, count, T = (arrays[name] for name in _STORED)
             path = arrays.get("path", T[None, :3, 3])
-            rooms.setdefault(row, []).append(Snapshot(frame, *gaussians, T, path))
+            rooms.setdefault(row, []).append(Snapshot(frame, mean, covariance, disagreement, count, T, path))
     return rooms
 
 

@@ -57,8 +57,8 @@ def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_fir
     columns = (parts.mean, parts.axes[:, :, 0], (parts.colour / 255 - 0.5) / SH_DC, opacity, np.log(parts.sigma))
     names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
     kinds = dict.fromkeys((*names.split(), "weight", "disagreement"), "<f4") | {"count": "<i4"}
-    table = _table(kinds, *columns, quaternion, parts.weight, parts.disagreement, parts.count)
-    _write_ply(Path(path), {"vertex": table}, [parts.legend])
+    table = vertex_table(kinds, *columns, quaternion, parts.weight, parts.disagreement, parts.count)
+    write_ply(Path(path), {"vertex": table}, [parts.legend])
     return len(table)
 
 
@@ -81,12 +81,14 @@ def write_ellipsoids_ply(path: str | Path, mixture: GaussianMixture, *, T_world_
     kinds = dict.fromkeys(("x", "y", "z", "nx", "ny", "nz"), "<f4")
     kinds |= dict.fromkeys(("red", "green", "blue"), "|u1") | {"disagreement": "<f4", "component": "<i4"}
     of_component = (parts.colour, parts.disagreement, np.arange(k))
-    vertices = _table(kinds, position, normal.reshape(-1, 3), *(values.repeat(n, axis=0) for values in of_component))
+    vertices = vertex_table(
+        kinds, position, normal.reshape(-1, 3), *(values.repeat(n, axis=0) for values in of_component)
+    )
     faces = np.zeros(k * len(triangles), dtype=[("sides", "|u1"), ("vertex_indices", "<i4", (3,))])
     faces["sides"] = 3
     faces["vertex_indices"] = (triangles + n * np.arange(k)[:, None, None]).reshape(-1, 3)
     legend = [parts.legend, f"ellipsoids of {RADIUS:g} standard deviations"]
-    _write_ply(Path(path), {"vertex": vertices, "face": faces}, legend)
+    write_ply(Path(path), {"vertex": vertices, "face": faces}, legend)
     return k
 
 
@@ -158,12 +160,12 @@ def _rotation_translation(T: Tensor | None) -> tuple[NDArray[np.float64], NDArra
     return matrix[:3, :3], matrix[:3, 3]
 
 
-def _table(kinds: Mapping[str, str], *columns: NDArray[Any]) -> NDArray[Any]:
+def vertex_table(kinds: Mapping[str, str], *columns: NDArray[Any]) -> NDArray[Any]:
     """A structured array of columns [N] or [N, c] side by side, with the types by name."""
     return unstructured_to_structured(np.column_stack(columns), np.dtype(list(kinds.items())))
 
 
-def _write_ply(path: Path, elements: Mapping[str, NDArray[Any]], comments: list[str]) -> None:
+def write_ply(path: Path, elements: Mapping[str, NDArray[Any]], comments: list[str]) -> None:
     """Binary little-endian PLY; a field of shape (3,) behind ``sides`` is a list property."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
     for element, table in elements.items():

@@ -54,7 +54,7 @@ def tour_path(tour: Tour, frames: int, seed: int | None = None, *, pan: bool = F
         s = _samples(way, frames, min(1.0, frames / _effort(way)[-1]))
     poses = _poses(tour, way, s, rng)
     if pan:
-        sway = np.stack([_waves(_STEP * np.arange(frames), rng, 0.35, 1.1) for _ in range(3)], 1)
+        sway = np.stack([_waves(_STEP * np.arange(frames, dtype=np.float64), rng, 0.35, 1.1) for _ in range(3)], 1)
         poses[:, :3, 3] = poses[0, :3, 3] + 0.7 * SWAY * sway
         poses[:, :3, :3] = np.stack([turn(i * _TURN / 2) @ poses[0, :3, :3] for i in range(frames)])
     return torch.from_numpy(poses)

@@ -1,0 +1,84 @@
+"""``ufmstar export``: its options, and what is printed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar
+
+from ufmstar_torch.eval.commands.opening import SequenceOptions
+from ufmstar_torch.eval.commands.options import UsageError, option, parse, positional
+from ufmstar_torch.eval.sequences.frame import FrameSequence
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """A run's result for other programs, in OUT/export.
+
+    Depth and sigma are the posterior's, where the run has one. Pixels beyond a limit are left out.
+
+    Attributes:
+        out: folder of `ufmstar run`
+        to: depth: maps [m] as .npy, NaN where left out; cloud: cloud.ply with sigma and colour; tum: trajectory.txt;
+            transforms: images, depth, sigma and poses for nerfstudio
+        max_sigma: largest standard deviation of a pixel [m]
+        max_relative_sigma: largest standard deviation of a pixel, as a share of its depth
+        voxel: side of the cloud's voxels [m], each of which has one point
+        debug: show tracebacks
+    """
+
+    USAGE: ClassVar[str] = "ufmstar export OUT --to depth|cloud|tum|transforms [options]"
+
+    out: Path = positional()
+    to: str = option(choices=("depth", "cloud", "tum", "transforms"))
+    max_sigma: float = float("inf")
+    max_relative_sigma: float = float("inf")
+    voxel: float = 0.02
+    debug: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("max_sigma", "max_relative_sigma", "voxel"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"--{name.replace('_', '-')} must be positive, got {getattr(self, name)}")
+
+
+def read(words: Sequence[str]) -> ExportOptions:
+    """The options of a command line; errors as :func:`parse`."""
+    return parse(ExportOptions, words, "ufmstar export")
+
+
+def main(options: ExportOptions) -> int:
+    """Export, and print what was written; the exit code."""
+    from ufmstar_torch.eval.run import export
+
+    out = options.out
+    try:
+        frames = export.gated_frames(out, options.max_sigma, options.max_relative_sigma)
+        if options.to == "depth":
+            print(export.export_depth(frames, out))
+        elif options.to == "tum":
+            print(export.export_trajectory(frames, out))
+        elif options.to == "transforms":
+            print(export.export_transforms(frames, out, _sequence(out)))
+        else:
+            try:
+                sequence: FrameSequence | None = _sequence(out)
+            except (OSError, ValueError) as error:
+                print(f"no colours: {error}")
+                sequence = None
+            print(export.export_cloud(frames, out, options.voxel, sequence))
+    except (FileNotFoundError, ValueError) as error:
+        raise UsageError(error) from error
+    return 0
+
+
+def _sequence(out: Path) -> FrameSequence:
+    """The recording of a run. Raises FileNotFoundError, ValueError: it is there no more, or the summary is damaged."""
+    from ufmstar_torch.eval.run.export import run_settings
+    from ufmstar_torch.eval.sequences.open import open_sequence
+
+    settings = run_settings(out)
+    names = [f.name for f in fields(SequenceOptions) if f.name in settings]
+    values: dict[str, Any] = {name: tuple(v) if isinstance(v := settings[name], list) else v for name in names}
+    return open_sequence(settings["sequence"], **SequenceOptions(**values).given())

@@ -1,0 +1,224 @@
+"""A run's result for other programs: gated depth, a cloud of points, the trajectory, or ``transforms.json``.
+
+All of it is below OUT/export. Depth and sigma are the posterior's where the run has one; a pixel that is not valid, or
+whose sigma is beyond a limit, is left out.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.gaussians import vertex_table, write_ply
+from ufmstar_torch.eval.run.writers import encode_length_png, fitting_unit, read_frame
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
+from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS
+
+# [m] A smaller sigma gives a point no more weight, as no depth is known better.
+_LEAST_SIGMA = 1e-3
+_HALF = 2**20  # a voxel's number on an axis is within +- this, so that three fit into 64 bits
+_FOLD = 4_000_000  # points that are held until they are merged
+
+
+@dataclass(frozen=True, eq=False)
+class Gated:
+    """A frame of a run: its name, time [s], camera and maps [h, w]; depth and sigma [m] are NaN where left out."""
+
+    name: str
+    index: int  # in the sequence
+    timestamp: float | None
+    T_world_cam: NDArray[np.float64]  # [4, 4] [m]
+    intrinsics: NDArray[np.float64]  # [3, 3] [px]
+    depth: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+
+
+def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
+    """The finished frames of a run.
+
+    Args:
+        out: its folder.
+        max_sigma: largest sigma of a pixel [m].
+        max_relative_sigma: largest sigma as a share of the depth.
+
+    Raises:
+        ValueError: no run's folder, or one of an earlier version, without poses.
+    """
+    if not (out / RECORDS).is_file():
+        raise ValueError(f"{out} is no output of `ufmstar run`: it has no {RECORDS}")
+    for record in read_records((out / RECORDS).read_bytes(), out / RECORDS):
+        if record["state"] != "done":
+            continue
+        maps = read_frame(out / "frames" / f"{record['name']}.npz")
+        if "T_world_cam" not in maps:
+            raise ValueError(f"{out}: the run is of an earlier version, whose frames have no poses; run it again")
+        prefix = "posterior_" if "posterior_depth" in maps else ""
+        depth, variance = maps[f"{prefix}depth"], maps[f"{prefix}variance"]
+        with np.errstate(invalid="ignore"):
+            sigma = np.sqrt(variance)
+            kept = maps["valid"] & (depth > 0) & np.isfinite(depth)
+            kept &= (sigma <= max_sigma) & (sigma <= max_relative_sigma * depth)
+        nothing = np.float32(np.nan)
+        depth, sigma = np.where(kept, depth, nothing), np.where(kept, sigma, nothing)
+        camera = (maps["T_world_cam"], maps["intrinsics"])
+        yield Gated(record["name"], record["index"], record.get("timestamp"), *camera, depth, sigma)
+
+
+def export_depth(frames: Iterator[Gated], out: Path) -> str:
+    """NAME.npy [h, w] float32 [m], NaN where left out."""
+    folder, count = _folder(out, "depth"), 0
+    for count, frame in enumerate(frames, start=1):  # noqa: B007
+        write_atomic(folder / f"{frame.name}.npy", partial(_save, frame.depth))
+    return f"{folder}: {count} maps"
+
+
+def export_trajectory(frames: Iterator[Gated], out: Path) -> str:
+    """Lines "time tx ty tz qx qy qz qw", the time [s] or, without one, the frame's number."""
+    from scipy.spatial.transform import Rotation
+
+    lines = ["# time tx ty tz qx qy qz qw, camera-to-world [m]"]
+    for frame in frames:
+        time = float(frame.index) if frame.timestamp is None else frame.timestamp
+        quaternion = Rotation.from_matrix(frame.T_world_cam[:3, :3]).as_quat()
+        lines.append(" ".join([f"{time:.9f}", *(f"{x:.9g}" for x in (*frame.T_world_cam[:3, 3], *quaternion))]))
+    file = _folder(out) / "trajectory.txt"
+    write_atomic(file, lambda opened: opened.write("\n".join([*lines, ""]).encode()))
+    return f"{file}: {len(lines) - 1} poses"
+
+
+def export_cloud(frames: Iterator[Gated], out: Path, voxel: float, sequence: FrameSequence | None) -> str:
+    """cloud.ply: x y z and sigma [m], and red green blue where the images can be read.
+
+    A point is the mean of a voxel's pixels, weighted by 1/sigma^2. Its sigma is sqrt(n / sum 1/sigma^2): a network's
+    views err alike, so that it does not shrink with their number n.
+
+    Args:
+        frames, out: of the run.
+        voxel: side [m].
+        sequence: the run's own, for the colours.
+    """
+    keys, sums = np.zeros(0, np.int64), np.zeros((0, 8))
+    waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+    for frame in frames:
+        waiting.append(_voxels(frame, voxel, _image(frame, sequence)))
+        if sum(len(part) for part, _ in waiting) > _FOLD:
+            keys, sums = _merged([(keys, sums), *waiting])
+            waiting = []
+    keys, sums = _merged([(keys, sums), *waiting])
+    weight, count = sums[:, :1], sums[:, 7:]
+    position, colour, sigma = sums[:, 1:4] / weight, sums[:, 4:7] / weight, np.sqrt(count / weight)
+    kinds, columns = dict.fromkeys(("x", "y", "z", "sigma"), "<f4"), [position, sigma]
+    if sequence is not None:
+        kinds |= dict.fromkeys(("red", "green", "blue"), "|u1")
+        columns.append(np.rint(colour))
+    file = _folder(out) / "cloud.ply"
+    write_ply(file, {"vertex": vertex_table(kinds, *columns)}, ["x y z sigma [m], world of the poses"])
+    return f"{file}: {len(keys)} points"
+
+
+def export_transforms(frames: Iterator[Gated], out: Path, sequence: FrameSequence) -> str:
+    """transforms.json with images as they are, and depth and sigma at their pixels (16 bits, 0 = left out)."""
+    folder, unit, listed = _folder(out, "transforms"), None, []
+    for name in ("images", "depth", "sigma"):
+        _folder(out, "transforms", name)
+    for frame in frames:
+        image = _image(frame, sequence)
+        if image is None or image.image is None:
+            continue
+        K, size = image.intrinsics, (image.image.shape[0], image.image.shape[1])
+        depth, sigma = (resample_nearest(values, frame.intrinsics, K, size) for values in (frame.depth, frame.sigma))
+        known = np.isfinite(depth) & (depth > 0)
+        unit = unit or fitting_unit(depth[known])
+        entry: dict[str, Any] = {"file_path": f"images/{frame.name}.png"}
+        for kind, values in (("depth", depth), ("sigma", sigma)):
+            content, _ = encode_length_png(values, known, unit, quantity=kind)
+            _write(folder / kind / f"{frame.name}.png", content)
+            entry[f"{kind}_file_path"] = f"{kind}/{frame.name}.png"
+        _write(folder / entry["file_path"], _png(image.image))
+        camera = {
+            "fl_x": K[0, 0],
+            "fl_y": K[1, 1],
+            "cx": K[0, 2] + 0.5,
+            "cy": K[1, 2] + 0.5,
+            "w": size[1],
+            "h": size[0],
+        }
+        listed.append(entry | camera | {"transform_matrix": CONVENTIONS["opengl"].convert(frame.T_world_cam)})
+    plain = {"camera_model": "OPENCV", "depth_unit_scale_factor": unit, "frames": listed}
+    write_json_atomic(folder / "transforms.json", plain)
+    return f"{folder / 'transforms.json'}: {len(listed)} frames"
+
+
+def run_settings(out: Path) -> dict[str, Any]:
+    """The options with which a run was started, by name. Raises ValueError: its summary cannot be read."""
+    try:
+        return dict(json.loads((out / "summary.json").read_text(encoding="utf-8"))["settings"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{out}/summary.json is not that of a run: {error}") from error
+
+
+def _voxels(frame: Gated, voxel: float, image: Frame | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """[P] the number of each pixel's voxel, and [P, 8] its weight w, w x, w y, w z, w r, w g, w b, and 1."""
+    v, u = np.nonzero(np.isfinite(frame.depth))
+    z, sigma = frame.depth[v, u].astype(np.float64), np.maximum(frame.sigma[v, u], _LEAST_SIGMA)
+    K, T = frame.intrinsics, frame.T_world_cam
+    y = (v - K[1, 2]) / K[1, 1]
+    in_camera = np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1)
+    points = in_camera @ T[:3, :3].T + T[:3, 3]
+    colour = np.zeros((len(z), 3))
+    if image is not None and image.image is not None:
+        colour = resample_nearest(image.image, image.intrinsics, K, frame.depth.shape)[v, u].astype(np.float64)
+    weight = 1 / np.square(sigma.astype(np.float64))[:, None]
+    number = np.floor(points / voxel)
+    near = (np.abs(number) < _HALF).all(axis=1)
+    x, y, z = (number[near].astype(np.int64) + _HALF).T
+    sums = np.hstack([weight, weight * points, weight * colour, np.ones_like(weight)])[near]
+    return (x << 42) | (y << 21) | z, sums
+
+
+def _merged(
+    parts: list[tuple[NDArray[np.int64], NDArray[np.float64]]],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    keys, index = np.unique(np.concatenate([part[0] for part in parts]), return_inverse=True)
+    columns = np.concatenate([part[1] for part in parts]).T
+    return keys, np.stack([np.bincount(index, column, len(keys)) for column in columns], axis=-1)
+
+
+def _image(frame: Gated, sequence: FrameSequence | None) -> Frame | None:
+    """The frame of the recording; None where it cannot be read."""
+    if sequence is None or frame.index >= len(sequence) or sequence.names[frame.index] != frame.name:
+        return None
+    try:
+        return sequence[frame.index]
+    except FrameError:
+        return None
+
+
+def _folder(out: Path, *names: str) -> Path:
+    folder = out.joinpath("export", *names)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _png(image: NDArray[np.uint8]) -> bytes:
+    import cv2
+
+    return bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+
+
+def _write(path: Path, content: bytes) -> None:
+    write_atomic(path, lambda file: file.write(content))
+
+
+def _save(depth: NDArray[np.float32], file: BinaryIO) -> None:
+    np.save(file, depth)

@@ -1,0 +1,119 @@
+"""``ufmstar export``: what other programs read equals what the run wrote, and pixels beyond the limits are left out."""
+
+from __future__ import annotations
+
+import json
+
+import layouts
+import numpy as np
+import pytest
+from runs import own_depth_job
+
+from ufmstar_torch import cli
+from ufmstar_torch.eval.run.run import run
+from ufmstar_torch.eval.run.writers import read_frame
+from ufmstar_torch.eval.sequences import open_sequence, read_trajectory
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run with perfect depth, whose variance is then set to (2 % of the depth)^2, and above the horizon to 1 m^2."""
+    path, truth = layouts.write_generic(tmp_path_factory.mktemp("data"))
+    out = tmp_path_factory.mktemp("run") / "out"
+    run(own_depth_job(path), out)
+    for file in (out / "frames").iterdir():
+        maps = read_frame(file)
+        maps["variance"] = np.square(0.02 * maps["depth"])
+        maps["variance"][:20] = 1
+        np.savez(file, **maps)
+    summary = json.loads((out / "summary.json").read_text())
+    (out / "summary.json").write_text(json.dumps({**summary, "settings": {"sequence": str(path), "layout": "auto"}}))
+    return out, path, truth
+
+
+def read_ply(path):
+    head, body = path.read_bytes().split(b"end_header\n")
+    kinds = {"float": "<f4", "uchar": "|u1"}
+    names = [line.split()[1:] for line in head.decode().splitlines() if line.startswith("property")]
+    return np.frombuffer(body, [(name, kinds[kind]) for kind, name in names])
+
+
+def test_depth_is_gated(finished):
+    out, _, truth = finished
+    assert cli.main(["export", str(out), "--to", "depth", "--max-sigma", "0.05"]) == 0
+    depth = np.load(out / "export" / "depth" / "9.npy")
+    assert depth.dtype == np.float32
+    assert np.isnan(depth[:20]).all()
+    kept = 0.02 * truth.depths[2][20:] <= 0.0499
+    assert 0 < kept.sum() < kept.size
+    np.testing.assert_allclose(depth[20:][kept], truth.depths[2][20:][kept], atol=1e-3)
+    assert np.isnan(depth[20:][0.02 * truth.depths[2][20:] > 0.0501]).all()
+    assert cli.main(["export", str(out), "--to", "depth", "--max-relative-sigma", "0.01"]) == 0
+    assert np.isnan(np.load(out / "export" / "depth" / "9.npy")).all()
+
+
+def test_the_trajectory(finished):
+    out, _, truth = finished
+    assert cli.main(["export", str(out), "--to", "tum"]) == 0
+    trajectory = read_trajectory(out / "export" / "trajectory.txt")
+    np.testing.assert_array_equal(trajectory.timestamps, range(7, 13))  # the numbers in the images' names
+    np.testing.assert_allclose(trajectory.T_world_cam, truth.T_world_cam, atol=1e-7)
+
+
+def test_the_cloud_lies_on_the_surfaces(finished):
+    out, _, truth = finished
+    words = ["export", str(out), "--to", "cloud", "--max-relative-sigma", "0.021", "--voxel", "0.05"]
+    assert cli.main(words) == 0
+    cloud = read_ply(out / "export" / "cloud.ply")
+    points = np.stack([cloud[name] for name in "xyz"], -1).astype(float)
+    assert 500 < len(points) < 6 * 28 * 64
+    assert len(np.unique(np.floor(points / 0.05 + 1e-4), axis=0)) > 0.98 * len(points), "one point a voxel"
+    # each point, seen from the frame in the middle, is no nearer than its surface, up to a voxel
+    T = np.linalg.inv(truth.T_world_cam[3])
+    x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
+    u, v = (truth.K @ np.stack([x, y, z]))[:2] / z
+    inside = (z > 0) & (u > 0) & (u < 63) & (v > 0) & (v < 47)
+    surface = truth.depths[3][np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)]
+    assert np.median(np.abs(surface - z[inside])) < 0.02
+    near = np.abs(surface / z[inside] - 1) < 0.01
+    assert near.mean() > 0.6
+    np.testing.assert_allclose(cloud["sigma"][inside][near], 0.02 * z[inside][near], rtol=0.3)
+    colours = np.stack([cloud[name] for name in ("red", "green", "blue")], -1)[inside][near].astype(int)
+    image = truth.images[3][np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)][near]
+    assert np.median(np.abs(colours - image)) < 12  # the paint darkens with the distance from each camera
+
+
+def test_merging_weighs_by_the_inverse_variance(tmp_path):
+    from ufmstar_torch.eval.run.export import Gated, export_cloud
+
+    def frame(depth, sigma):
+        maps = (np.float32([[depth]]), np.float32([[sigma]]))
+        return Gated("0", 0, None, np.eye(4), np.eye(3), *maps)
+
+    export_cloud(iter([frame(2.1, 0.1), frame(2.4, 0.2), frame(np.nan, np.nan)]), tmp_path, 1.0, None)
+    (point,) = read_ply(tmp_path / "export" / "cloud.ply")
+    w = np.array([100, 25])
+    np.testing.assert_allclose(point["z"], (w * [2.1, 2.4]).sum() / w.sum(), rtol=1e-6)
+    np.testing.assert_allclose(point["sigma"], np.sqrt(2 / w.sum()), rtol=1e-6)
+    assert "red" not in point.dtype.names
+
+
+def test_transforms_are_read_back(finished):
+    out, _, truth = finished
+    assert cli.main(["export", str(out), "--to", "transforms", "--max-sigma", "0.9"]) == 0
+    again = open_sequence(out / "export" / "transforms")
+    assert (again.layout, len(again), again.metric) == ("transforms", 6, True)
+    for i, frame in enumerate(again):
+        np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-9)
+        np.testing.assert_allclose(frame.intrinsics, truth.K, atol=1e-9)
+        np.testing.assert_array_equal(frame.image, truth.images[i])
+        np.testing.assert_allclose(frame.depth[20:], truth.depths[i][20:], atol=1.1e-3)
+        assert not frame.depth[:20].any()
+
+
+def test_what_is_no_run_is_named(finished, tmp_path, capfd):
+    assert cli.main(["export", str(tmp_path), "--to", "depth"]) == 2
+    assert "no output of `ufmstar run`" in capfd.readouterr().err
+    assert cli.main(["export", str(finished[0]), "--to", "cloud", "--voxel", "0"]) == 2
+    assert "--voxel must be positive" in capfd.readouterr().err
+    assert cli.main(["export", str(finished[0]), "--to", "mesh"]) == 2
