@@ -91,6 +91,17 @@ def test_images_that_contradict_the_poses_give_no_depth_and_a_warning(tour, kind
     assert streams.last[0].none.startswith("poses contradict the images")
 
 
+def test_one_blurred_image_is_no_contradiction_to_report(tour, kind, caplog):
+    streams, K = StreamLandmarks(kind), torch.from_numpy(tour[0].intrinsics)
+    contradicted = 0
+    for i, frame in enumerate(tour):
+        image = frame.image if i != 5 else np.roll(frame.image, 6, axis=0)
+        streams.update(torch.from_numpy(image).permute(2, 0, 1)[None], torch.from_numpy(frame.T_world_cam), K)
+        contradicted += streams.last[0].contradicted
+    assert contradicted > 0, "its depths are not used"
+    assert "contradict the images" not in caplog.text
+
+
 def test_right_poses_are_told_from_wrong_ones(tour, kind):
     right = run(landmark_source(kind), tour)[-1]
     wrong = run(landmark_source(kind), tour, _noisy([f.T_world_cam for f in tour], 0.2))[-1]

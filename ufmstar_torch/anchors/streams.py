@@ -23,6 +23,7 @@ _CAUSES = (
 )
 # A file may be named by a str too; type checkers then find no misspelt word.
 Given = Literal["corners", "dense"] | Path | LandmarkSource
+_IN_A_ROW = 5  # images that contradict their poses before the warning; what a blurred one shows lasts for some
 _PARTS = ("pixel", "depth", "variance", "valid", "pose_error", "shared")
 
 
@@ -46,7 +47,7 @@ class StreamLandmarks:
         self._before = self._states()
         self.needs_image = any(source.needs_image for source in self._sources)
         self.last: list[Landmarks] = []
-        self._warned = set[int]()
+        self._contradicted = [0] * len(self._sources)  # images in a row; -1 = the warning is out
 
     def update(
         self,
@@ -98,8 +99,11 @@ class StreamLandmarks:
             raise
         self._before, self.last = before, result
         for i, landmarks in enumerate(result):
-            if landmarks.contradicted and i not in self._warned:
-                self._warned.add(i)
+            if self._contradicted[i] < 0:
+                continue
+            self._contradicted[i] = self._contradicted[i] + 1 if landmarks.contradicted else 0
+            if self._contradicted[i] == _IN_A_ROW:
+                self._contradicted[i] = -1
                 _LOG.warning("stream %d: %s; no depth is used. %s", i, landmarks.none, _CAUSES)
         room = max(len(landmarks.depth) for landmarks in result)
         each = [landmarks.anchors(K[i].numpy(), K[i], room) for i, landmarks in enumerate(result)]
