@@ -114,7 +114,8 @@ class Anchors:
 
     def to(self, device: torch.device | str) -> Anchors:
         """The same on another device."""
-        return Anchors(*(value if value is None else value.to(device) for value in vars(self).values()))
+        moved = {name: value.to(device) for name, value in vars(self).items() if value is not None}
+        return replace(self, **moved)
 
 
 @dataclass(frozen=True)

@@ -221,9 +221,9 @@ class DenseEvidence(SavedState):
         depth = np.concatenate([1 / rho[kept], corners.depth[far]])
         spread = np.concatenate([(stated + alone) * depth[: len(kept)] ** 4, corners.variance[far]])
         position = (np.concatenate([surface, corners.pixel[far]]) - scale[:2, 2]) / scale.diagonal()[:2]
-        judged = {"pose_error": corners.pose_error, "shared": shared, "contradicted": corners.contradicted}
-        none = {"none": corners.none} if corners.contradicted else {}
-        return Landmarks(position, depth, spread, searched + known, **none, **judged)
+        none = corners.none if corners.contradicted else Landmarks.none
+        judged = corners.pose_error, shared, corners.contradicted
+        return Landmarks(position, depth, spread, searched + known, none, *judged)
 
     def _apart(self, corners: Landmarks, taken: NDArray[np.float64], width: int) -> NDArray[np.int64]:
         """Which corners are anchors: certain ones, away from positions [N, 2] that are taken."""

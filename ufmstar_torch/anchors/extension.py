@@ -165,11 +165,14 @@ class AnchorFrame(FrameExtension):
         """Count the anchors, those that were used and those that were rejected."""
         none, anchors = torch.zeros_like(self._used), self.anchors
         given, rejected = (none, none) if anchors is None else (anchors.valid.sum(1), anchors.rejected)
-        counts = {"anchors": given, "anchors_used": self._used, "anchors_rejected": rejected}
+        measured = out.statistics.pose_error
         if anchors is not None:
             self._warn(anchors)
-            counts["pose_error"] = anchors.pose_error
-        return state, replace(out, statistics=replace(out.statistics, **counts))
+            measured = anchors.pose_error
+        counts = replace(
+            out.statistics, anchors=given, anchors_used=self._used, anchors_rejected=rejected, pose_error=measured
+        )
+        return state, replace(out, statistics=counts)
 
     def disagreement(self, disagreement: Tensor, depth: Tensor) -> Tensor:
         """M + B [m^2]; where most anchors were rejected, at least d^2 times the mean of their r^2."""

@@ -85,7 +85,7 @@ class TrackerConfig(Checked):
     max_error: float = number(3.0, "", "px", 0, open_low=True)
     max_relative_sigma: float = number(0.4, "", "1", 0, open_low=True)
     min_share: float = number(0.2, "", "1", 0, 1)
-    max_pose_error: float = number(0.008, "", "width", 0, open_low=True)
+    max_pose_error: float = number(0.012, "", "width", 0, open_low=True)
     start_depth: float = number(2.0, "", "m", 0, open_low=True)
 
     def __post_init__(self) -> None:
@@ -352,12 +352,13 @@ class LandmarkTracker(SavedState):
         """Triangulate the newest image's corners from the views in the window."""
         config = self.config
         chosen, result = self._triangulated()
-        none, judged = _NO_DEPTH if tracked else _NO_TRACK, {"pose_error": self.pose_error}
+        none = _NO_DEPTH if tracked else _NO_TRACK
         if self.contradicted:
             none = contradiction(self.pose_error, config.max_pose_error * self._gray.shape[1])
         if result is None or self.contradicted:
-            nothing = np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked, none
-            return Landmarks(*nothing, **judged, shared=self.shared(self.baseline), contradicted=self.contradicted)
+            nothing, shared = np.zeros(0), self.shared(self.baseline)
+            pixel = np.zeros((0, 2))
+            return Landmarks(pixel, nothing, nothing, tracked, none, self.pose_error, shared, self.contradicted)
         T = self._poses[self._view]
         axis = T[:3, 2]
         depth = (result.point - T[:3, 3]) @ axis
@@ -378,7 +379,7 @@ class LandmarkTracker(SavedState):
         fine &= (variance >= 0) & (independent <= np.square(config.max_relative_sigma * safe))
         pixel, shared = self._pixel[chosen][fine, self._view], self.shared(self.baseline)
         variance = variance[fine] + shared * depth[fine] ** 4
-        return Landmarks(pixel, depth[fine], variance, tracked, none, **judged, shared=shared)
+        return Landmarks(pixel, depth[fine], variance, tracked, none, self.pose_error, shared)
 
     def shared(self, baseline: float) -> float:
         """Variance of inverse depths by errors of the poses over a baseline [m], alike for all points [1/m^2]; infinite
