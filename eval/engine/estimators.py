@@ -85,7 +85,7 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
         return Alone(uses_variances=method.uses_aleatoric)
     if method.fusion == UFM:
         points = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
-        return Pointwise(points, device, uses_variances=method.uses_aleatoric)
+        return Pointwise(points, uses_variances=method.uses_aleatoric)
     fitted = Recalibration.from_json(setting.recalibration) if setting.recalibration else None
     config = ufm_star_config(row).within(max_depth)
     return Gaussians(config, device, setting, uses_variances=method.uses_aleatoric, recalibration=fitted)
@@ -123,8 +123,8 @@ class Alone(Estimator):
 class Pointwise(Estimator):
     """UfM. Without ``uses_variances``, A and E are left aside."""
 
-    def __init__(self, config: UfMConfig, device: torch.device, *, uses_variances: bool = True) -> None:
-        self.module = self.ufm = UfM(config, device=device)
+    def __init__(self, config: UfMConfig, *, uses_variances: bool = True) -> None:
+        self.ufm = UfM(config)
         self._uses_variances = uses_variances
 
     def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
@@ -133,11 +133,15 @@ class Pointwise(Estimator):
         out = self.ufm(used.depth, T_world_cam, predicted.intrinsics, a, e)
         return {"depth": used.depth, "variance": out.variance, "valid": out.valid, "aleatoric": a, "epistemic": e}
 
+    def state(self) -> dict[str, Tensor]:
+        """None that could be saved: raises TypeError."""
+        raise TypeError("a row of UfM cannot be continued within a sequence: only UfM* has a state that can be saved")
+
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points."""
-        cloud = self.ufm.clouds()[0] if len(self.ufm.points) else None
-        count = 0 if cloud is None else len(cloud.count)
-        return {"bytes": count * (cloud.bytes_per_point if cloud else 0), "count": count, "smoothing_bytes": 0}
+        points = [(len(cloud.count), len(cloud.count) * cloud.bytes_per_point) for cloud in self.ufm.clouds]
+        count, size = points[0] if points else (0, 0)
+        return {"bytes": size, "count": count, "smoothing_bytes": 0}
 
 
 class Gaussians(Estimator):
