@@ -37,6 +37,12 @@ class Network(torch.nn.Module):
         return DepthPrediction(torch.full((len(x), 48, 64), 2.0))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def compiled():
+    """The first image need not wait for a compiler."""
+    UncertainDepth(Network())(PICTURE, np.eye(4), K)
+
+
 @pytest.fixture
 def network():
     return Network()
