@@ -355,7 +355,7 @@ def test_hostile_arkit_folders(tmp_path):
     ]
     assert [error.path.parent.name for error in errors] == ["depth", "confidence"]
     layouts.truncate(path / "rgb.mp4", 0.01)
-    with pytest.raises(ValueError, match="rgb.mp4"):
+    with pytest.raises(ValueError, match=r"rgb\.mp4"):
         open_sequence(path)
 
     path, truth = written.write_arkitscenes(tmp_path)

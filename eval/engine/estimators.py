@@ -147,14 +147,10 @@ class Pointwise(Estimator):
 class Gaussians(Estimator):
     """UfM*.
 
-    Where the row keeps the aleatoric variance in H, the config has two features: that variance, and 1. The value read
-    back replaces the pixel's own, A'(x) = sum_k w_k(x) a_k + (1 - sum_k w_k(x)) A: the pixel's own as far as no
-    component explains it, where the mixture alone would read as 0.
-
     Args:
         config: its settings.
         device: of the mixture.
-        setting: of the row: whether it answers with the corrected depth or the posterior, and keeps A in H.
+        setting: of the row: whether it answers with the corrected depth or the posterior.
         uses_variances: False leaves A and E aside.
         recalibration: of the variance; None = as it is.
     """
@@ -173,14 +169,8 @@ class Gaussians(Estimator):
         self._setting, self._uses_variances, self._anchors = setting, uses_variances, 0
 
     def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
-        """See :meth:`Estimator.update`. Raises ValueError: A is kept in H, and the network predicts none."""
-        used, features = _used(predicted, self._uses_variances), None
-        a = used.aleatoric_variance
-        if self._setting.aleatoric_in_h:
-            if a is None:
-                raise ValueError("aleatoric_in_h needs a network that predicts an aleatoric variance")
-            features = torch.stack([a, torch.ones_like(a)], dim=1)
-        out = self.model.update(used, T_world_cam, predicted.intrinsics, features=features, anchors=anchors)
+        used = _used(predicted, self._uses_variances)
+        out = self.model.update(used, T_world_cam, predicted.intrinsics, anchors=anchors)
         anchors_used = out.statistics.anchors_used
         self._anchors = 0 if anchors_used is None else int(anchors_used[0])
         answer = {name: getattr(out, name) for name in _OF_OUTPUT}
@@ -188,10 +178,6 @@ class Gaussians(Estimator):
             answer["depth"], answer["variance"] = out.posterior()
         elif self._setting.corrected:
             answer["depth"], answer["variance"] = out.corrected()
-        if features is not None and a is not None:
-            mixed, explained = out.features.unbind(-1)
-            a = mixed + (1 - explained) * a
-            answer |= {"aleatoric": a, "variance": answer["variance"] + a}
         return answer
 
     def mixture_world(self) -> GaussianMixture:

@@ -18,7 +18,8 @@ from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped
 from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, depth_loader, list_files, list_images, read_color
 from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import Trajectory, associate, read_matrix
+from ufmstar_torch.eval.sequences.poses import associate, read_matrix
+from ufmstar_torch.trajectory import Trajectory
 
 _IMAGES, _CAMERAS, _DEPTHS, _POSES = "lowres_wide", "lowres_wide_intrinsics", "lowres_depth", "lowres_wide.traj"
 LOOKED_FOR = f"{_IMAGES}/, {_CAMERAS}/ and {_POSES}, also in VIDEO_frames/"
