@@ -243,7 +243,7 @@ def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:
 
 
 def fit_scales(panels: Sequence[FramePanel]) -> dict[str, ColourScale]:
-    """The scales of ``MAPS`` over all panels: depths between their 1st and 99th percentile; every sigma and error on one
+    """The scales of ``MAPS`` over all panels: depths from their 1st to their 99th percentile; sigmas and errors on one
     logarithmic scale up to the largest of their 99th percentiles, so that a sigma as large as the error has its colour.
     """
     of = {name: [panel.maps[name] for panel in panels if name in panel.maps] for name in MAPS}
