@@ -24,7 +24,6 @@ from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import associate
 from ufmstar_torch.optional import optional
 from ufmstar_torch.trajectory import interpolate_pose
-from ufmstar_torch.trajectory import interpolate_pose
 
 LOOKED_FOR = "a .bag, .db3 or .mcap file, or a folder that holds one"
 _SUFFIXES = (".bag", ".db3", ".mcap")
