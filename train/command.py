@@ -147,7 +147,12 @@ class TrainOptions:
         from ufmstar_torch.train.own_network import own_job
 
         assert own.backbone is not None
-        how = {"fine_tune": own.fine_tune, "features": own.features, "spec": own.spec, "network": self.changes.network}
+        how: dict[str, Any] = {
+            "fine_tune": own.fine_tune,
+            "features": own.features,
+            "spec": own.spec,
+            "network": self.changes.network,
+        }
         return own_job(own.backbone, own.head, data, settings, members=self.members, **how, **self.changes.recipe)
 
 
