@@ -34,7 +34,6 @@ from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.tour import make_tour, tour_sequence
 from ufmstar_torch.models import DepthNetwork, Preprocess, load_trained, read_info
-from ufmstar_torch.regress import sample_pixels
 from ufmstar_torch.train.losses import loss_of
 
 # An image's score: none; mean A; mean V = M + A; mean M alone; the true mean squared error, which is unknown before
@@ -96,10 +95,10 @@ def predict(members: Sequence[DepthNetwork], view: View, index: int) -> DepthPre
 
 
 def score_pool(members: Sequence[DepthNetwork], pool: Sequence[View], pixels: int) -> dict[str, list[float]]:
-    """Stream the pool once and score every image, all scores over the same sample of pixels.
+    """Stream the pool once and score every image, by V, A and M over the same sample of pixels.
 
     Returns:
-        By strategy, [m^2]: "ufmstar" V, "aleatoric" A, "disagreement" M = V - A - E, "oracle" squared error.
+        By strategy, [m^2]: "ufmstar" V, "aleatoric" A, "disagreement" M, "oracle" squared error.
 
     Raises:
         ValueError: a network that predicts no aleatoric variance.
@@ -112,14 +111,12 @@ def score_pool(members: Sequence[DepthNetwork], pool: Sequence[View], pixels: in
             raise ValueError("the network must have an aleatoric or evidential head")
         valid = p.depth.isfinite() & (p.depth > 0) & p.variance.isfinite()
         stream = (p.depth, view.T_world_cam[None], view.intrinsics[None], p.aleatoric_variance, p.epistemic_variance)
-        total = float(ufm.mean_uncertainty(*stream, valid, pixels=pixels, seed=i).mean)
-        index, used = sample_pixels(valid, pixels, seed=i)  # the pixels that mean_uncertainty has taken
-        truth = view.depth[None]
-        labelled = used & torch.gather((truth > 0).flatten(1), 1, index)
-        scores["ufmstar"].append(total)
-        scores["aleatoric"].append(_mean_at(p.aleatoric_variance, index, used))
-        scores["disagreement"].append(total - _mean_at(p.variance, index, used))
-        scores["oracle"].append(_mean_at((p.depth - truth).square(), index, labelled))
+        result = ufm.mean_uncertainty(*stream, valid, pixels=pixels, seed=i)
+        for name, part in (("ufmstar", result.total), ("disagreement", result.disagreement)):
+            scores[name].append(float(part.mean))
+        scores["aleatoric"].append(float(result.aleatoric.mean) if result.aleatoric else math.nan)
+        labelled = valid & (view.depth > 0)
+        scores["oracle"].append(float((p.depth - view.depth)[labelled].square().mean()))
     return scores
 
 
@@ -223,11 +220,6 @@ def report(results: dict[str, Any]) -> str:
             less = gap([a - b for a, b in zip(after, chance, strict=True)])
             lines.append(f"| {strategy} | {fmean(after):.3f} | {'-' if strategy == 'random' else less} |")
     return "\n".join(lines)
-
-
-def _mean_at(values: Tensor, index: Tensor, used: Tensor) -> float:
-    """Mean of a map [1, H, W] over sampled pixels [1, n]; NaN without any."""
-    return float(torch.gather(values.flatten(1), 1, index)[used].mean())
 
 
 def parse(words: Sequence[str] | None = None) -> argparse.Namespace:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import time
@@ -18,12 +19,14 @@ def pool(folder, items, stop=lambda: False):
 
 
 def task(folder, item):
-    """Writes a file ITEM-PROCESS; then ends the process where the item is "kill", fails or waits."""
+    """Writes a file ITEM-PROCESS; then ends the process where the item is "kill", fails, waits or warns."""
     Path(folder, f"{item}-{os.getpid()}").touch()
     if item == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
     while item.startswith("wait"):
         time.sleep(0.02)
+    if item.startswith("warn"):
+        logging.getLogger("ufmstar_torch").warning("stream %s: hardly a segment matches", item[4:])
     if item == "fail":
         raise OSError("disk full")
     return f"{item} done"

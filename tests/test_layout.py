@@ -132,7 +132,6 @@ def test_kernels_import_back_only_plain_types():
         "distribute",
         "regress_pixels",
         "random_order",
-        "SampleMean",
         "Correspondence",
         "PIXEL_VARIANCE",
         "UfMStarConfig",

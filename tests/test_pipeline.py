@@ -138,21 +138,6 @@ def test_the_preprocessed_intrinsics_reach_the_networks_that_take_them(mode):
     torch.testing.assert_close(depth.reshape(H // 2, W // 2), ByFocal()(*half(picture[None], K[None].float())).depth[0])
 
 
-def test_the_aleatoric_variance_is_regressed_as_a_feature():
-    """A in H: as UfM* with that feature, and a constant A stays itself; others replace it; without A it is an error."""
-    config = CONFIG.replace(features=1)
-    model, ufm = UncertainDepth(Scaled(1.0, aleatoric=0.04), config), UfMStar(config)
-    for i in range(3):
-        a = torch.full((1, H, W), 0.04)
-        out, expected = model(image(i), POSES[i], K), ufm(image(i)[:, 0], POSES[i], K, a, features=a[:, None])
-        assert torch.equal(out.ufm.features, expected.features)
-    assert float(out.ufm.features[out.ufm.labels >= 0].median()) == pytest.approx(0.04, rel=0.02)
-    other = UncertainDepth(Scaled(1.0), config)(image(0), POSES[0], K, features=torch.full((1, 1, H, W), 7.0))
-    assert float(other.ufm.features[other.ufm.labels >= 0].median()) == pytest.approx(7, rel=0.02)
-    with pytest.raises(ValueError, match=r"features=1 regresses the aleatoric variance, but the network predicts none"):
-        UncertainDepth(Scaled(1.0), config)(image(0), POSES[0], K)
-
-
 def test_the_mean_uncertainty_of_images():
     """As UfM*'s own, with the members in turn; a call that fails does not advance the turn."""
     model, ufm = UncertainDepth([Scaled(1.0, 0.01), Scaled(1.2, 0.03)], CONFIG), UfMStar(CONFIG)

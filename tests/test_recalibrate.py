@@ -45,9 +45,8 @@ def test_the_map_is_linear_in_logarithms_between_its_knots():
     assert MAP(v.reshape(2, 4)).shape == (2, 4)
 
 
-def test_a_scalar_map_is_one_factor():
+def test_a_map_of_one_knot():
     v = torch.tensor([0.0, 0.3, 5.0])
-    torch.testing.assert_close(Recalibration((1.0,), (2.5,), "scalar")(v), 2.5 * v)
     single = Recalibration((0.5,), (1.0,))
     torch.testing.assert_close(single(v), torch.tensor([1.0, 1.0, 10.0]))
 
@@ -96,11 +95,6 @@ def test_a_file_comes_back(tmp_path):
 # ---- the fit ----
 
 
-def test_a_scalar_fit_recovers_the_factor():
-    v = torch.from_numpy(np.random.default_rng(1).uniform(0.05, 0.5, 200_000))
-    assert fit([drawn(v, 3.0 * v)], "scalar").recalibrated[0] == pytest.approx(3.0, rel=0.03)
-
-
 def test_an_isotonic_fit_recovers_a_monotone_law_and_gives_zero_a_value():
     v = torch.from_numpy(np.exp(np.random.default_rng(2).uniform(-6, 0, 400_000)))
     v[:20_000] = 0.0
@@ -124,9 +118,6 @@ def test_every_sequence_has_the_same_weight():
 
 
 def test_impossible_counts_are_refused():
-    v = torch.zeros(100, dtype=torch.float64)
-    with pytest.raises(ValueError, match="V = 0"):
-        fit([drawn(v, torch.ones(100))], "scalar")
     with pytest.raises(ValueError, match="pixels with ground truth"):
         fit([np.zeros((514, 514))])
 
@@ -227,7 +218,6 @@ def test_run_uses_the_map_beside_the_weights(evaluated, tmp_path, capsys):
 MISTAKES = {
     "no such row": (["--row", "UfM*-Ensemble"], "--row must be one of UfM*-DepthOnly"),
     "not UfM*": (["--row", "UfM-DepthOnly"], "--row must be one of UfM*-DepthOnly"),
-    "kind": (["--row", "UfM*-DepthOnly", "--kind", "cubic"], "invalid choice"),
 }
 
 

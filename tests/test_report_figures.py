@@ -15,7 +15,7 @@ from ufmstar_torch.eval.methods.method import BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Merged, Results
-from ufmstar_torch.eval.report.figures_cost import STAGES, draw_latency, draw_stages, draw_tradeoff
+from ufmstar_torch.eval.report.figures_cost import STAGES, draw_stages
 from ufmstar_torch.eval.report.figures_curves import (
     Histogram,
     chosen_sequences,
@@ -104,8 +104,8 @@ class TestError:
         figure = draw_error(results, "rooms")
         shown = [axes for axes in figure.axes if axes.get_visible()]
         assert [axes.get_title(loc="left") for axes in shown] == [
-            "Ensemble: where it is confident in each frame",
-            "Ensemble: where UfM-100K is confident in each frame",
+            "Ensemble: where it is confident",
+            "Ensemble: where UfM-100K is confident",
         ]
         for axes, reference in zip(shown, ("Ensemble", "UfM-Ensemble-100K"), strict=True):
             for row in (ALONE, UFM, UFM_STAR):
@@ -198,7 +198,7 @@ class TestSweeps:
 
     def test_lines_bands_and_the_base_alone(self, swept):
         figure = draw_sweep(swept, "ensemble", "rotation_noise")
-        above, below = figure.axes[0], figure.axes[3]
+        above = figure.axes[0]
         line, dashed = drawn(above)["UfM*"], drawn(above)["alone"]
         np.testing.assert_allclose(line.get_xdata(), [0, 2, 5])
         np.testing.assert_allclose(line.get_ydata(), [5.0, 5.2, 5.5])
@@ -206,27 +206,10 @@ class TestSweeps:
         half = mean_of(points_of(swept)[0].records, NLL).half
         band = above.collections[0].get_paths()[0].vertices
         assert band[:, 1].min() == pytest.approx(5.0 - half)
-        np.testing.assert_allclose(drawn(below)["UfM*"].get_ydata(), [0, 0.2, 0.5], atol=1e-12)
         assert figure.axes[-1].get_xlabel() == "rotation noise [°]"
-
-    def test_left_out_images_are_paired_with_the_base_on_the_same(self):
-        values = {0: (1.0, 3.0), 4: (2.0, 3.5), 16: (2.5, 2.6)}
-        figures = {}
-        for skip, (star, alone) in values.items():
-            figures[Row(UFM_STAR.method, Setting(skip=skip)), ("d", "s")] = {"nll": star}
-            figures[Row(ALONE.method, Setting(skip=skip)), ("d", "s")] = {"nll": alone}
-        figure = draw_sweep(in_memory(figures), "ensemble", "skip")
-        assert list(drawn(figure.axes[0])["alone"].get_ydata()) == [3.0, 3.5, 2.6]
-        np.testing.assert_allclose(drawn(figure.axes[3])["UfM*"].get_ydata(), [-2.0, -1.5, -0.1])
 
 
 class TestCost:
-    def test_bars_are_the_times(self, results):
-        axes = draw_latency(results).axes[0]
-        widths = [(bar.get_x(), bar.get_width()) for bar in axes.patches]
-        assert widths[:4] == [(0, 90.0), (90.0, pytest.approx(0.2)), (0, 9.0), (9.0, 14.0)]
-        assert [label.get_text() for label in axes.get_yticklabels()] == [row.method.name for row in ROWS]
-
     def test_shares_of_the_stages(self, results):
         times = dict(zip(STAGES, (0.5, 3.0, 1.0, 1.5, 0.5, 3.0, 0.5), strict=True))
         stages = {"stages": {name: {"median_ms": ms} for name, ms in times.items()}}
@@ -236,24 +219,11 @@ class TestCost:
         assert "10.0 ms" in words(axes)
         assert draw_stages(results) is None
 
-    def test_points_of_the_trade(self, results):
-        figure = draw_tradeoff(results)
-        by_memory = [(line.get_xdata()[0], line.get_ydata()[0]) for line in figure.axes[0].lines]
-        mean = np.mean([r.figures["ece_delta"] for r in results.of(UFM_STAR)])
-        assert by_memory[2] == pytest.approx((64 * 400 / 1e6, mean))
-        by_time = [line.get_xdata()[0] for line in figure.axes[1].lines]
-        # Without the network's time (its predictions came from the cache) there is no time per frame.
-        untimed = [replace(r, ms={"uncertainty": 1.0}) if r.method == "Ensemble" else r for r in results.records]
-        cached = replace(results, records=tuple(untimed))
-        assert [line.get_xdata()[0] for line in draw_tradeoff(cached).axes[1].lines] == pytest.approx([23, 19, 19])
-        assert "network not timed + 1.0 ms" in {text.strip() for text in words(draw_latency(cached).axes[0])}
-        assert by_time == pytest.approx([90.2, 23.0, 19.0, 19.0])
-
 
 def test_the_files_say_what_they_are(tmp_path):
     out = write_evaluation(tmp_path / "o", ROWS[:1] + ROWS[2:3], [("rooms", "one two")], suite="own")
     names = {path.relative_to(out).as_posix() for path in write_report(out, pictures="png").files}
-    kinds = {"calibration-rooms", "calibration-sequences-rooms-ensemble", "error-rooms", "entropy-ensemble", "latency"}
+    kinds = {"calibration-rooms", "calibration-sequences-rooms-ensemble", "error-rooms", "entropy-ensemble"}
     assert {f"figures/{kind}.png" for kind in kinds} <= names
     assert all((out / name).stat().st_size > 1000 for name in names if name.endswith(".png"))
     with pytest.raises(ValueError, match="figures must be svg or png, got 'jpg'"):

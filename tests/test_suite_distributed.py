@@ -19,6 +19,7 @@ from tiny_suite import NAMES, TRUTH, Stub, go, job_on, kept
 from trainings import SPEC
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
+from ufmstar_torch.eval.commands.terminal import warned_once
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.run import machine
 from ufmstar_torch.eval.run.folder import FolderError
@@ -83,6 +84,12 @@ def all_end(numbers):
             return True
         time.sleep(0.02)
     return False
+
+
+def test_the_parent_logs_what_its_processes_warn_of(tmp_path, caplog):
+    with warned_once():
+        assert pool(tmp_path, ["warn1", "warn2", "warn3"])[0]
+    assert [text[10:] for text in caplog.messages] == ["hardly a segment matches"], "once"
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from walks import SPGF, oracle_settings
 
 import oracle
 import scenes
-from ufmstar_torch import UfMStarConfig
+from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import Gaussians, ufm_star_config
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.predictions import Predicted
@@ -260,8 +260,8 @@ def test_files_that_are_not_there(tmp_path):
 
 
 def test_a_in_h_agrees_with_the_oracle():
-    config = UfMStarConfig(segment=SPGF, features=2, add_aleatoric=False, backend="torch", unmeasured="paper")
-    estimator = Gaussians(config, CPU, Setting(aleatoric_in_h=True))
+    config = UfMStarConfig(segment=SPGF, aleatoric_in_h=True, backend="torch", unmeasured="paper")
+    estimator, sampled = Gaussians(config, CPU), UfMStar(config.replace(features=1, backend="auto"))
     judge = oracle.Oracle(oracle_settings(SPGF))
     depths, poses, K = scenes.sequence(3, 30, 40, 0.05)
     for i, (depth, T) in enumerate(zip(depths[:2], poses[:2], strict=True)):
@@ -272,22 +272,28 @@ def test_a_in_h_agrees_with_the_oracle():
         A = oracle.aleatoric_in_h(judge.mixture_cam, depth, depth > 0, K, a, prior_weight=1.0)
         np.testing.assert_allclose(answer["aleatoric"][0].numpy(), A, rtol=1e-5)
         np.testing.assert_allclose(answer["variance"][0].numpy(), M + A, rtol=1e-3, atol=1e-5)
+        frame = maps.depth, torch.tensor(T), torch.tensor(K), maps.aleatoric_variance
+        mean = sampled.mean_uncertainty(*frame, features=torch.ones(1, 1, *depth.shape), fraction=1.0)
+        assert mean.aleatoric.mean.item() == pytest.approx(np.nanmean(A), rel=1e-4), "beside a feature, compiled"
+        assert mean.aleatoric.maximum.item() == pytest.approx(np.nanmax(A), rel=1e-4)
+    assert sampled.query(torch.zeros(1, 2, 3)).features.shape == (1, 2, 1)
     assert np.nanmax(np.abs(A - a)) > 0.01, "the mixture's average is not the pixel's own"
-    with pytest.raises(ValueError, match="needs a network that predicts an aleatoric variance"):
+    with pytest.raises(ValueError, match="aleatoric must be given with config"):
         estimator.update(Predicted(DepthPrediction(maps.depth), torch.tensor(K)[None]), torch.tensor(T))
 
 
 def test_a_in_h_is_a_row_of_its_own():
-    one = row("UfM*-Aleatoric", aleatoric_in_h=True)
+    one = row("UfM*-Aleatoric", overrides={"aleatoric_in_h": True})
     config = ufm_star_config(one)
-    assert (config.features, config.add_aleatoric) == (2, False)
+    assert (config.aleatoric_in_h, config.features, config.entries) == (True, 0, 2)
     assert one.label == "UfM*-Aleatoric (aleatoric_in_h True)"
-    with pytest.raises(ValueError, match="goes without anchors, features"):
-        Setting(aleatoric_in_h=True, anchors="tracked")
+    for off in ({"anchors": AnchorConfig()}, {"add_aleatoric": False}):
+        with pytest.raises(ValueError, match="goes with add_aleatoric=True and without anchors"):
+            config.replace(**off)
     with pytest.raises(ValueError, match=r"row Aleatoric: only UfM\* has aleatoric_in_h"):
-        row("Aleatoric", aleatoric_in_h=True)
+        row("Aleatoric", overrides={"aleatoric_in_h": True})
     with pytest.raises(ValueError, match="needs a network that predicts an aleatoric variance"):
-        row("UfM*-DepthOnly", aleatoric_in_h=True)
+        row("UfM*-DepthOnly", overrides={"aleatoric_in_h": True})
 
 
 # ---- how images come to the networks ----

@@ -139,7 +139,7 @@ def test_overwriting_removes_our_files_alone(tmp_path):
     for file in own:
         file.parent.mkdir(exist_ok=True)
         file.write_text("mine")
-    made = [out / "tables" / "main.md", out / "results.json", out / "cache" / "kept"]
+    made = [out / "tables" / "main.md", out / "results.csv", out / "cache" / "kept"]
     for file in made:
         file.write_text("made")
     EvalFolder.open(out, ABOUT, overwrite=True)

@@ -35,7 +35,7 @@ class Absent(MetaPathFinder):
 sys.meta_path.insert(0, Absent())
 import numpy as np, torch
 def trajectory():
-    from ufmstar_torch.eval.sequences import interpolate_pose
+    from ufmstar_torch.eval.sequences import read_trajectory
 def hugging_face():
     from ufmstar_torch.models import from_hugging_face
     from_hugging_face("a/b")
@@ -78,7 +78,7 @@ def test_what_is_missing_without_extras_is_named():
     assert done.returncode == 0, said
     assert "tensor(" in said, said
     for who, package, extra in (
-        ("trajectory ufmstar_torch.eval.sequences.interpolate_pose", "scipy", "eval"),
+        ("trajectory ufmstar_torch.eval.sequences.read_trajectory", "scipy", "eval"),
         ("hugging_face", "transformers", "models"),
         ("ufmstar run: failed: this command", "scipy", "eval"),
     ):

@@ -143,7 +143,7 @@ def _require_fixed(ufm: UfMStar) -> None:
             or config.merge is not None
         ),
         "disagreement='w2'": config.disagreement != "w2",
-        "no features": bool(config.features),
+        "no features": bool(config.entries),
     }
     if missing := [text for text, bad in wrong.items() if bad]:
         raise ValueError(f"a capture needs {'; '.join(missing)}")

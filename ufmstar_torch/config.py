@@ -206,6 +206,8 @@ class UfMStarConfig(Checked):
         variance_floor: smallest variance of a pixel
         add_aleatoric: add the network's aleatoric variance to the result
         add_epistemic: add the network's epistemic variance to the result
+        aleatoric_in_h: average the network's aleatoric variance over views in the Gaussians (the paper's H), and add
+            that average instead of the pixel's own
         features: additional regressed quantities per Gaussian
         initial_capacity: slots for Gaussians at the start; the number grows as needed
         max_components: largest number of Gaussians, beyond which the farthest are dropped, then the oldest; null = no
@@ -247,6 +249,7 @@ class UfMStarConfig(Checked):
     add_epistemic: bool = True
 
     # State
+    aleatoric_in_h: bool = False
     features: int = number(0, "dim H - 1", "1", 0)
     initial_capacity: int = number(256, "K_0", "components", 1)
     max_components: int | None = number(None, "K_max", "components", 1)
@@ -265,6 +268,10 @@ class UfMStarConfig(Checked):
         super().__post_init__()
         if self.posterior is not None and self.anchors is None:
             raise ValueError("UfMStarConfig.posterior needs anchors: set anchors=AnchorConfig() as well")
+        if self.aleatoric_in_h and (self.anchors is not None or not self.add_aleatoric):
+            raise ValueError(
+                "UfMStarConfig.aleatoric_in_h goes with add_aleatoric=True and without anchors, got another setting"
+            )
         if self.far_radius < self.near_radius:
             raise ValueError(
                 f"UfMStarConfig.far_radius must be at least near_radius = {self.near_radius}, got {self.far_radius}"
@@ -287,6 +294,11 @@ class UfMStarConfig(Checked):
         - ``unmeasured``: a surface that no two views compared reads as 0 here, as a share of its depth by default.
         """
         return cls().with_values(PAPER)
+
+    @property
+    def entries(self) -> int:
+        """Regressed quantities per Gaussian beside m: ``features``, and with ``aleatoric_in_h`` A and 1."""
+        return self.features + 2 * self.aleatoric_in_h
 
     def within(self, stated: float | None) -> UfMStarConfig:
         """The settings for a network that states its largest depth [m]: ``segment.max_depth``, where that is None."""

@@ -149,6 +149,7 @@ def check_frame(
     features: Array | None,
     *,
     feature_count: int,
+    aleatoric_in_h: bool = False,
     rotation_tolerance: float,
     max_depth: float = DEPTH_RANGE[1],
     kernel: CheckKernel = check_values,
@@ -157,13 +158,15 @@ def check_frame(
 
     Args:
         feature_count: F.
+        aleatoric_in_h: append A and 1 to the features.
         rotation_tolerance: largest deviation of a pose's rotation from an orthogonal matrix.
         max_depth: farther pixels are not valid [m].
         kernel: an implementation of :func:`check_values`.
 
     Raises:
         TypeError: an argument is no tensor or has the wrong kind of dtype.
-        ValueError: an argument has the wrong shape or lies on another device than ``depth``.
+        ValueError: an argument has the wrong shape or lies on another device than ``depth``; A is to be averaged, and
+            there is none.
     """
     depth = require_float("depth", as_tensor("depth", depth))
     shape = tuple(depth.shape)
@@ -180,7 +183,11 @@ def check_frame(
 
     a, e = own("aleatoric", aleatoric), own("epistemic", epistemic)
     extra = _features(features, feature_count, plain)
-
+    if aleatoric_in_h:
+        if a is None:
+            raise ValueError("aleatoric must be given with config.aleatoric_in_h, which averages it over views")
+        in_h = torch.stack([_constant(a), torch.ones_like(plain)], 1)
+        extra = in_h if extra is None else torch.cat([extra, in_h], 1)
     T, K = _of_depth("pose", as_pose(pose), plain), _of_depth("intrinsics", as_intrinsics(intrinsics), plain)
     mask = None
     if valid is not None:

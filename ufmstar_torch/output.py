@@ -113,7 +113,7 @@ class UfMStarOutput:
         variance: V, the total variance of the depth [m^2]: M, plus A and E where given (and not switched
             off in the config) and B with ``config.anchors``, at least ``config.variance_floor``. NaN where not valid.
         disagreement: M, the multiview disagreement [m^2]. NaN where not valid.
-        aleatoric, epistemic: A and E as given [m^2], or None.
+        aleatoric, epistemic: A and E as given [m^2], or None; with ``config.aleatoric_in_h`` A of the mixture.
         anchored: B, the mean square error that anchors found beyond M + A + E [m^2] (``evidence``); None unless
             ``config.anchors``.
         bias: the relative error r = g/d - 1 that anchors lead to expect; None unless ``config.anchors``.
@@ -188,26 +188,59 @@ class UfMStarOutput:
         return self.depth * (1 + self.bias), self.variance - self.anchored + remaining
 
 
-@dataclass(frozen=True, repr=False)
-class MeanUncertainty:
-    """An image average of the total variance from a sample of pixels, per stream [B].
+@dataclass(frozen=True)
+class SampleStatistics:
+    """Statistics of a map over the pixels of an image that have a value, per stream [B]; NaN without any.
 
     Attributes:
-        mean: average of V over the sampled pixels [m^2], with ``config.unmeasured="nan"`` over those that are measured;
-            NaN without any.
-        standard_error: of that average as an estimate of the mean over all valid pixels [m^2];
-            NaN with fewer than two pixels.
-        pixels: number of pixels averaged.
+        mean, median, maximum: in the unit of the map; of an even number of pixels, the lower of the two middle ones.
+        variance: between the pixels, in the unit squared; NaN with fewer than two.
+        pixels: number of pixels with a value.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    median: Tensor
+    maximum: Tensor
+    pixels: Tensor
+
+
+@dataclass(frozen=True, repr=False)
+class MeanUncertainty:
+    """Averages over a sample of an image's pixels, per stream [B]: of V, and of each of its parts.
+
+    Attributes:
+        total: V [m^2], with ``config.unmeasured="nan"`` over the pixels that are measured.
+        disagreement: M [m^2], likewise.
+        aleatoric, epistemic: A and E [m^2] as far as V counts them, or None.
+        anchored: B [m^2]; None unless ``config.anchors``.
+        depth: the predicted depth [m].
+        standard_error: of the mean of V as an estimate of that over all valid pixels [m^2]; NaN with fewer than two
+            pixels.
         measured: share in [0, 1] of the sampled pixels whose M rests on surfaces seen from two views or more; about 0
             in a first view, whose mean is that of ``config.unmeasured``. NaN without a valid pixel.
         statistics: per-stream counts of this frame; ``unmeasured`` are the other sampled pixels.
     """
 
-    mean: Tensor
+    total: SampleStatistics
+    disagreement: SampleStatistics
+    aleatoric: SampleStatistics | None
+    epistemic: SampleStatistics | None
+    anchored: SampleStatistics | None
+    depth: SampleStatistics
     standard_error: Tensor
-    pixels: Tensor
     measured: Tensor
     statistics: FrameStatistics
+
+    @property
+    def mean(self) -> Tensor:
+        """[B] mean of V [m^2]."""
+        return self.total.mean
+
+    @property
+    def pixels(self) -> Tensor:
+        """[B] number of pixels over which V is averaged."""
+        return self.total.pixels
 
     def __repr__(self) -> str:
         """Means, errors and counts in a line."""

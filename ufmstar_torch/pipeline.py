@@ -89,9 +89,7 @@ class UncertainDepth(NetworksInTurn):
             separate callables); None: predictions are given to :meth:`update`. Each maps an image [B, 3, H, W] to a
             :class:`DepthPrediction`; one with an attribute ``takes_intrinsics = True`` is called as
             ``network(x, K)`` with K [B, 3, 3] [px] of ``x``.
-        config: of UfM*; where ``segment.max_depth`` is None, it becomes the networks' (:attr:`max_depth`). With
-            ``features=1`` the network's aleatoric variance is averaged per Gaussian and regressed
-            as the second entry of H (``ufm.features``), unless other features are given.
+        config: of UfM*; where ``segment.max_depth`` is None, it becomes the networks' (:attr:`max_depth`).
         mode: "alternate" runs member n = i mod N (counted from 0) on image i; with one network this is the
             single-model mode, and with ``samples`` it is the sampling-based mode. "full" runs every member
             (or ``samples`` passes of a stochastic network) per image and takes the predictive mean, the mean
@@ -182,7 +180,7 @@ class UncertainDepth(NetworksInTurn):
             pose: [B, 4, 4] or [4, 4] camera-to-world [m], or without its last row; a tensor or a NumPy array.
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px], or fx, fy, cx, cy; likewise.
             valid: [B, h, w] bool at the depth map's size, True = use.
-            features: [B, F, h, w] likewise, F = ``config.features``; None with F = 1: the aleatoric variance [m^2].
+            features: [B, F, h, w] likewise, F = ``config.features``.
             anchors: sparse depths of this frame, [B, N] padded and masked, with ``config.anchors``; their pixels are
                 those of ``image`` and ``intrinsics``, whatever the preprocessing makes of them. None = those of the
                 constructor's source, or none.
@@ -340,12 +338,6 @@ class UncertainDepth(NetworksInTurn):
             self._warn_of_size(x)
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
         H = None if features is None else as_tensor("features", features)
-        if H is None and self.ufm.config.features == 1:
-            if prediction.aleatoric_variance is None:
-                raise ValueError(
-                    "config.features=1 regresses the aleatoric variance, but the network predicts none: give features"
-                )
-            H = prediction.aleatoric_variance[:, None]
         parts = (prediction.depth, prediction.aleatoric_variance, prediction.epistemic_variance, K, H)
         (depth, *variances, K_there, H), ready = _copied(parts, self.multiview_device)
         assert depth is not None

@@ -8,18 +8,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.checked import Checked, choice
+from ufmstar_torch.checked import Checked
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension
 from ufmstar_torch.stateful import flat, plain
 
-SCALAR: Final = "scalar"
-ISOTONIC: Final = "isotonic"
 # Settings of UfM* that do not change what V means.
 _HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
 
@@ -29,13 +27,11 @@ class Recalibration(Checked, Extension):
     """V -> V', the same at every pixel.
 
     Between two knots log V' is linear in log V. Above the last knot V' / V is that of the last knot. Below the first
-    one an isotonic map is constant, since no smaller variance was ever observed to hold: V = 0 gets the first knot's
-    V'. A scalar map is V' = s V everywhere.
+    one the map is constant, since no smaller variance was ever observed to hold: V = 0 gets the first knot's V'.
 
     Attributes:
         variance: V at the knots [m^2], positive and increasing.
         recalibrated: V' at the knots [m^2], positive and not decreasing.
-        kind: "isotonic", or "scalar" with a single knot.
         row: name of the method that it was fitted to, as "UfM*-Anchored-DepthOnly".
         ufm: settings of UfM* that it was fitted to (``UfMStarConfig.to_dict``); {} = unknown.
         network: names of the files of its network's weights, separated by commas; "" = unknown.
@@ -47,7 +43,6 @@ class Recalibration(Checked, Extension):
 
     variance: tuple[float, ...]
     recalibrated: tuple[float, ...]
-    kind: Literal["isotonic", "scalar"] = choice(ISOTONIC, SCALAR)
     row: str = ""
     ufm: Mapping[str, Any] = field(default_factory=dict)
     network: str = ""
@@ -56,8 +51,8 @@ class Recalibration(Checked, Extension):
     def __post_init__(self) -> None:
         super().__post_init__()
         v, r = self.variance, self.recalibrated
-        if not v or len(v) != len(r) or (self.kind == SCALAR and len(v) > 1):
-            raise ValueError(f"Recalibration needs knots, a single one if scalar, got {len(v)} and {len(r)} values")
+        if not v or len(v) != len(r):
+            raise ValueError(f"Recalibration needs knots, got {len(v)} and {len(r)} values")
         numbers = all(isinstance(x, float | int) and math.isfinite(x) and x > 0 for x in (*v, *r))
         if not numbers or any(b <= a for a, b in pairwise(v)):
             raise ValueError("Recalibration.variance must hold increasing positive numbers")
@@ -73,8 +68,6 @@ class Recalibration(Checked, Extension):
         Returns:
             [...] in the same dtype [m^2], NaN where ``variance`` is NaN.
         """
-        if self.kind == SCALAR:
-            return variance * (self.recalibrated[0] / self.variance[0])
         v, r = (torch.tensor(x, dtype=torch.float64, device=variance.device).log() for x in self._knots())
         position = variance.double().log()
         upper = torch.searchsorted(v, position.contiguous()).clamp(1, len(v) - 1)

@@ -19,6 +19,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import total
 from ufmstar_torch.gaussian import cholesky3, inverse_lower3
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.output import SampleStatistics
 
 # Points x components evaluated at a time: bounds the temporary memory to some 100 MB in float32. On CUDA as many as a
 # quarter of the free memory holds, if that is more, with _NUMBERS for each pair: 3 of the offset, its distance, density
@@ -296,41 +297,24 @@ def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]
     return index, torch.gather(flat, 1, index)
 
 
-@dataclass(frozen=True)
-class SampleMean:
-    """The average of each image's sample, [B].
-
-    Attributes:
-        mean: of the variance [m^2]; NaN without a pixel.
-        error: its standard error [m^2]; NaN with fewer than two pixels, 0 where all valid pixels were taken.
-        count: pixels averaged: those without a variance are not.
-        measured: share of the sample that was measured; NaN without a valid pixel.
-    """
-
-    mean: Tensor
-    error: Tensor
-    count: Tensor
-    measured: Tensor
-
-
-def sample_mean(variance: Tensor, measured: Tensor, used: Tensor, valid_pixels: Tensor) -> SampleMean:
-    """The average over a sample of pixels as an estimate of the mean over all valid ones.
+def sample_statistics(values: Tensor) -> SampleStatistics:
+    """Statistics of maps over a sample of pixels.
 
     Args:
-        variance: [B, n] [m^2], NaN where there is none.
-        measured: [B, n] whether a pixel counts as measured (``unmeasured``).
-        used: [B, n] from :func:`sample_pixels`.
-        valid_pixels: [B] in the whole image.
+        values: [..., B, n], NaN where a pixel has no value.
+
+    Returns:
+        [..., B] of each.
     """
-    sampled = used.sum(1)
-    share = (measured & used).sum(1) / sampled
-    used = used & ~variance.isnan()  # not measured, with config.unmeasured = "nan"
-    count = used.sum(1)
-    mean = total(torch.where(used, variance, 0), 1) / count  # 0/0 = NaN where no pixel is valid
-    squares = total(torch.where(used, (variance - mean[:, None]) ** 2, 0), 1)
-    left = 1 - sampled / valid_pixels.clamp_min(1)  # without replacement: all pixels, no error
-    error = (squares / (count - 1).clamp_min(0) / count * left).sqrt()
-    return SampleMean(mean, torch.where(count > 1, error, torch.nan), count, share)
+    known = ~values.isnan()
+    count = known.sum(-1)
+    mean = total(torch.where(known, values, 0), -1) / count  # 0/0 = NaN without a pixel
+    squares = total(torch.where(known, (values - mean[..., None]) ** 2, 0), -1)
+    variance = torch.where(count > 1, squares / (count - 1).clamp_min(1), torch.nan)
+    largest = torch.where(known, values, -torch.inf).amax(-1)
+    return SampleStatistics(
+        mean, variance, values.nanmedian(-1).values, torch.where(count > 0, largest, torch.nan), count
+    )
 
 
 @functools.lru_cache(maxsize=4)  # the draw costs more than a sample

@@ -56,7 +56,7 @@ class UfMStarState:
     ) -> UfMStarState:
         """The empty state of ``streams`` independent streams, without extensions."""
         capacity = min(config.initial_capacity, config.max_components or config.initial_capacity)
-        mixture = GaussianMixture.empty(streams, capacity, features=config.features, dtype=dtype, device=device)
+        mixture = GaussianMixture.empty(streams, capacity, features=config.entries, dtype=dtype, device=device)
         counter = torch.zeros(streams, dtype=torch.int64, device=device)
         components: dict[str, Any] = mixture.tensors()
         return cls(
@@ -90,7 +90,7 @@ class UfMStarState:
         image = tuple(self.smoothed.shape[1:]) if self.smoothed.dim() == 3 else ("H", "W")
         shapes = {
             "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": (b, k), "count": (b, k),
-            "features": (b, k, config.features), "T_world_first": (b, 4, 4), "started": (b,), "frames": (b,),
+            "features": (b, k, config.entries), "T_world_first": (b, 4, 4), "started": (b,), "frames": (b,),
             "skipped": (b,), "smoothed": (b, *image),
             **{name: (b, k, *value.shape[2:]) for name, value in like.by_component.items()},
             **{name: (b, *value.shape[1:]) for name, value in like.by_stream.items()},

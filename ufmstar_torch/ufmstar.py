@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -19,14 +20,17 @@ from ufmstar_torch.fixed_order import apply
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
 from ufmstar_torch.kernels.select import LateStep, select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.output import MeanUncertainty, StepOutput, UfMStarOutput
-from ufmstar_torch.regress import Regression, regress, sample_mean, sample_pixels, sample_size
+from ufmstar_torch.output import MeanUncertainty, SampleStatistics, StepOutput, UfMStarOutput
+from ufmstar_torch.regress import Regression, regress, sample_pixels, sample_size, sample_statistics
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
 from ufmstar_torch.step import Step
 from ufmstar_torch.step_parts import StepObserver
 from ufmstar_torch.stream_warnings import StreamWarnings
 from ufmstar_torch.warm_up import warm_up
+
+# Maps of which mean_uncertainty has statistics.
+_AVERAGED = ("variance", "disagreement", "aleatoric", "epistemic", "anchored", "depth")
 
 
 class UfMStar(StatefulModule):
@@ -122,24 +126,22 @@ class UfMStar(StatefulModule):
         depth = as_tensor("depth", depth)
         a, e = (None if v is None else as_tensor(n, v) for n, v in (("aleatoric", aleatoric), ("epistemic", epistemic)))
         frame = self._checked(depth, pose, intrinsics, a, e, valid, features)
-        out, variance, further = self._observe(frame, inputs)
+        out, maps = self._observe(frame, inputs)
+        as_given: dict[str, Any] = {"epistemic": e} if self.config.aleatoric_in_h else {"aleatoric": a, "epistemic": e}
 
         def shaped(value: Tensor) -> Tensor:
             return value if value.shape == depth.shape else value.reshape(depth.shape)
 
+        maps = {name: None if value is None else shaped(value) for name, value in maps.items()}
         return UfMStarOutput(
             depth=depth,
-            variance=shaped(variance),
-            disagreement=shaped(out.disagreement),
-            aleatoric=a,
-            epistemic=e,
-            features=out.features,
+            **maps | as_given,
+            features=out.features[..., : self.config.features],
             measured=shaped(out.measured),
             valid=shaped(frame.valid),
             read_labels=out.read_labels,
             current_cam=out.current_cam,
             statistics=out.statistics,
-            **{name: shaped(value) for name, value in further.items()},
         )
 
     if TYPE_CHECKING:
@@ -161,9 +163,9 @@ class UfMStar(StatefulModule):
         average: bool = False,
         **inputs: Any,
     ) -> MeanUncertainty:
-        """An average per image for active learning (section "Compute- and memory efficiency"): :meth:`forward`, but
-        only a sample of pixels is regressed. First views have nothing to be compared with (``measured`` near 0): their
-        mean is that of ``config.unmeasured``. Extensions that need whole maps do nothing here.
+        """Averages per image for active learning (section "Compute- and memory efficiency"), of V, M, A, E and B:
+        :meth:`forward`, but only a sample of pixels is regressed. First views have nothing to be compared with
+        (``measured`` near 0): their mean is that of ``config.unmeasured``. Extensions that need whole maps do nothing.
 
         Args:
             pixels: size of the sample per image; or
@@ -176,9 +178,21 @@ class UfMStar(StatefulModule):
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
-        out, variance, _ = self._observe(frame, inputs, index, average=average)
-        sample = sample_mean(variance, out.measured >= unmeasured.HALF, used, out.statistics.valid_pixels)
-        return MeanUncertainty(sample.mean, sample.error, sample.count, sample.measured, out.statistics)
+        out, maps = self._observe(frame, inputs, index, average=average)
+        maps["depth"] = torch.gather(frame.depth.flatten(1), 1, index)
+        of = {name: torch.where(used, maps[name], torch.nan) for name in _AVERAGED if maps.get(name) is not None}
+        each = sample_statistics(torch.stack(list(of.values())))
+        by_name: dict[str, Any] = dict.fromkeys(_AVERAGED)
+        by_name |= {name: SampleStatistics(*(x[i] for x in vars(each).values())) for i, name in enumerate(of)}
+        total, sampled = by_name.pop("variance"), used.sum(1)
+        left = 1 - sampled / out.statistics.valid_pixels.clamp_min(1)  # without replacement: all pixels, no error
+        return MeanUncertainty(
+            total=total,
+            **by_name,
+            standard_error=(total.variance / total.pixels * left).sqrt(),
+            measured=((out.measured >= unmeasured.HALF) & used).sum(1) / sampled,
+            statistics=out.statistics,
+        )
 
     def warm_up(
         self, size: tuple[int, int], *, streams: int = 1, progress: Callable[[int, int], object] | None = None
@@ -222,7 +236,8 @@ class UfMStar(StatefulModule):
             dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
             mixture = unmeasured.before_regression(self.mixture)
             result = regress(mixture, local.to(dtype), self.config)
-            return unmeasured.after_regression(result, None, self.config)[0]
+            result = unmeasured.after_regression(result, None, self.config)[0]
+            return replace(result, features=result.features[..., : self.config.features])
 
     @property
     def mixture(self) -> GaussianMixture:
@@ -268,26 +283,36 @@ class UfMStar(StatefulModule):
         depth = as_tensor("depth", depth)
         return check_frame(
             depth, pose, intrinsics, aleatoric, epistemic, valid, features,
-            feature_count=self.config.features, rotation_tolerance=self.config.rotation_tolerance,
-            max_depth=self.config.segment.depth_limit, kernel=select_check(self.config.backend, depth.device.type),
+            feature_count=self.config.features, aleatoric_in_h=self.config.aleatoric_in_h,
+            rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
+            kernel=select_check(self.config.backend, depth.device.type),
         )  # fmt: skip
 
     def _observe(
         self, frame: FrameInput, inputs: Mapping[str, Any], pixels: Tensor | None = None, *, average: bool = True
-    ) -> tuple[StepOutput, Tensor, dict[str, Tensor]]:
-        """Run the step, and keep its state. Returns its output, V [m^2], and maps of extensions by name, at every pixel
-        [B, H, W], or at ``pixels`` [B, n] of the flattened image. ``inputs``: what a frame brings for extensions."""
+    ) -> tuple[StepOutput, dict[str, Any]]:
+        """Run the step, and keep its state. Returns its output, and by name V, M, A and E as far as they count [m^2]
+        (None = not) and the maps of extensions, at every pixel [B, H, W], or at ``pixels`` [B, n] of the flattened
+        image. ``inputs``: what a frame brings for extensions."""
         parts = (frame.aleatoric, self.config.add_aleatoric), (frame.epistemic, self.config.add_epistemic)
         own = [value for value, counts in parts if value is not None and counts]
 
         def chosen(value: Tensor) -> Tensor:
             return value if pixels is None else torch.gather(value.flatten(1), 1, pixels)
 
-        def total(disagreement: Tensor) -> Tensor:
+        def counted(features: Tensor) -> tuple[Tensor | None, Tensor | None]:
+            """A and E as far as they count; A of the mixture is the pixel's own as far as no component explains it."""
+            a, e = (chosen(value) if value is not None and counts else None for value, counts in parts)
+            if a is not None and self.config.aleatoric_in_h:
+                mixed, explained = features[..., -2:].unbind(-1)
+                a = mixed + (1 - explained) * a
+            return a, e
+
+        def total(disagreement: Tensor, features: Tensor) -> Tensor:
             """V = M + A + E, at least the floor (section "Uncertainty Regression"); NaN stays NaN."""
             variance = disagreement
-            for value in own:
-                variance = variance + chosen(value)
+            for value in counted(features):
+                variance = variance if value is None else variance + value
             if self.config.variance_floor:
                 variance = variance.clamp_min(self.config.variance_floor)
             return self._extensions.map_variance(variance)
@@ -304,13 +329,20 @@ class UfMStar(StatefulModule):
             state, out = step(
                 state, frame, self.config, pixels=pixels, smooth=average, extensions=extensions, observer=self.observer
             )
-            state, out = extensions.after_frame(state, out, total)
+            state, out = extensions.after_frame(state, out, partial(total, features=out.features))
             disagreement = extensions.disagreement(out.disagreement, chosen(frame.depth))
             out = replace(out, statistics=replace(out.statistics, single_view=(state.count == 1).sum(1)))
-        variance, further = total(disagreement), extensions.outputs()
+        aleatoric, epistemic = counted(out.features)
+        maps = {
+            "disagreement": out.disagreement,
+            "aleatoric": aleatoric,
+            "epistemic": epistemic,
+            **extensions.outputs(),
+        }
+        maps["variance"] = total(disagreement, out.features)
         self._store(state.tensors())  # last, so that an error before it, or a warning that is one, changes nothing
         self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
-        return out, variance, further
+        return out, maps
 
     def _stored(self) -> UfMStarState:
         buffers = cast("dict[str, Tensor]", self._buffers)  # none is None; without the detour by ``__getattr__``

@@ -91,6 +91,7 @@ def warm_up(
     pose = torch.eye(4)
     K = _camera(height, width)
     features = depth.new_zeros(streams, config.features, height, width) if config.features else None
+    aleatoric = depth if config.aleatoric_in_h else None
     corner = depth[:, 0, :1]
     anchors = None
     if config.anchors is not None:
@@ -100,8 +101,8 @@ def warm_up(
         stages = _Stages(progress or _unseen, _TOTAL + len(also))
         module.observer = stages
         for _ in range(2):  # the fusion meets a mixture from the second on
-            module(depth, pose, K, features=features, **({} if anchors is None else {"anchors": anchors}))
-        module.mean_uncertainty(depth, pose, K, features=features, pixels=1)
+            module(depth, pose, K, aleatoric, features=features, **({} if anchors is None else {"anchors": anchors}))
+        module.mean_uncertainty(depth, pose, K, aleatoric, features=features, pixels=1)
         if config.anchors is not None:
             compile_triangulation()
         for function in also:

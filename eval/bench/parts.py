@@ -20,15 +20,13 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.timing import StagedStep
 from ufmstar_torch.eval.engine.clock import synchronize
-from ufmstar_torch.eval.engine.estimators import Answer, Gaussians, make_estimator
+from ufmstar_torch.eval.engine.estimators import Answer, Gaussians, Pointwise, make_estimator
 from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.prediction import DepthPrediction
-from ufmstar_torch.ufmstar import UfMStar
 
 MULTIVIEW = "multiview"
 # ``Setting.anchors`` that are measured: the name of their source of landmarks.
@@ -64,9 +62,8 @@ class MultiviewStep:
 
     def _start(self) -> None:
         """Forget all frames."""
-        module = self.estimator.module
-        assert isinstance(module, UfM | UfMStar)
-        module.reset()
+        assert isinstance(self.estimator, Pointwise | Gaussians)
+        self.estimator.ufm.reset()
         if self._landmarks is not None:
             self._landmarks.reset()
 

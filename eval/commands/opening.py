@@ -9,10 +9,6 @@ from ufmstar_torch.eval.commands.options import option
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
-LAYOUTS = (
-    *("auto", "tum", "7scenes", "scannet", "sens", "tartanair", "kitti360", "nyu", "colmap", "transforms", "euroc"),
-    "generic",
-)
 # Names in `open_sequence` of the options for ground truth.
 _TRUTH = {"truth": "depth", "truth_scale": "depth_scale"}
 
@@ -22,7 +18,7 @@ class OpeningOptions:
     """How sequences are opened.
 
     Attributes:
-        layout: of the folder; auto: by its files
+        layout: as docs/data.md names it; auto: by its files
         intrinsics: of the images: a file, or fx fy cx cy [px]
         distortion: to undo: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or own (TUM RGB-D's)
         truth_scale: metres per unit of the sequence's own depth
@@ -33,10 +29,11 @@ class OpeningOptions:
         fps: frames per second of images without timestamps
         time_offset: added to image times [s]
         max_pose_gap: poses are interpolated over at most so long [s]
+        topics: of a ROS bag; a pose's with =FRAME, the frame that it moves
         scans: KITTI-360: also scans of so many frames around
     """
 
-    layout: str = option("auto", choices=LAYOUTS)
+    layout: str = "auto"
     intrinsics: tuple[str, ...] = ()
     distortion: tuple[str, ...] = ()
     truth_scale: float | None = None
@@ -47,6 +44,7 @@ class OpeningOptions:
     fps: float | None = None
     time_offset: float = 0.0
     max_pose_gap: float = 0.1
+    topics: tuple[str, ...] = ()
     scans: int | None = None
 
     def given(self) -> dict[str, Any]:

@@ -135,11 +135,11 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
             super().__call__(parser, cfg, values, option_string)
 
     class Formatter(DefaultHelpFormatter):
-        """Leaves out the default of a flag, which would be the field's: --no-register has (default: True) otherwise."""
+        """Leaves out the default of a flag, which would be the field's (--no-register: True), and None."""
 
         def _get_help_string(self, action: Action) -> str:
             text: str = action.help or "" if isinstance(action.const, bool) else super()._get_help_string(action)
-            return text
+            return text.replace(", default: %(default)s", "") if action.default in (None, []) else text
 
     description, _ = _documentation(options)
     usage = getattr(options, "USAGE", None)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ufmstar_torch.eval.commands.options import UsageError, option, positional, reader
+from ufmstar_torch.eval.commands.options import UsageError, positional, reader
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.methods.row import Row
@@ -28,14 +28,12 @@ class RecalibrateOptions:
         out: folder of `ufmstar eval`
         row: the row, as the table names it: UfM*-DepthOnly, say
         to: file of the map; WEIGHTS.recalibration.json beside the weights is used without being named
-        kind: isotonic, monotone in the variance; or scalar, one factor
         debug: show tracebacks
     """
 
     out: Path = positional()
     row: str
     to: Path
-    kind: str = option("isotonic", choices=("isotonic", "scalar"))
     debug: bool = False
 
 
@@ -57,11 +55,11 @@ def main(options: RecalibrateOptions) -> int:
             labels = ", ".join(row.label for row in rows) or "(none: no row of UfM*)"
             raise ValueError(f"--row must be one of {labels}, got {options.row!r}")
         counts = _counts(results, row)
-        fitted = fit(list(counts.values()), options.kind)
+        fitted = fit(list(counts.values()))
         _about(fitted, results, row).save(options.to)
     except ValueError as error:
         raise UsageError(error) from error
-    print("\n".join(aligned(_table(counts, options.kind))))
+    print("\n".join(aligned(_table(counts))))
     if len(counts) == 1:
         print("fitted to a single sequence, on which it is not judged: evaluate more of them")
     print(f"{options.to}: {len(fitted.variance)} knots, fitted to {len(counts)} sequences")
@@ -82,7 +80,7 @@ def _counts(results: Results, row: Row) -> dict[str, Array]:
     return counts
 
 
-def _table(counts: Mapping[str, Array], kind: str) -> list[list[str]]:
+def _table(counts: Mapping[str, Array]) -> list[list[str]]:
     """Figures of every sequence as it is, and under the map that was fitted to the others."""
     from ufmstar_torch.eval.metrics.recalibration import figures, fit
     from ufmstar_torch.eval.report.text import number
@@ -91,7 +89,7 @@ def _table(counts: Mapping[str, Array], kind: str) -> list[list[str]]:
     for name, joint in counts.items():
         others = [other for label, other in counts.items() if label != name]
         before = figures(joint, None)
-        after = figures(joint, fit(others, kind)) if others else dict.fromkeys(before)
+        after = figures(joint, fit(others)) if others else dict.fromkeys(before)
         lines.append([name, *(number(of[key]) for key in ("coverage_error", "nll") for of in (before, after))])
     return lines
 

@@ -85,7 +85,7 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
         return Alone(uses_variances=method.uses_aleatoric)
     if method.fusion == UFM:
         points = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
-        return Pointwise(points, device, uses_variances=method.uses_aleatoric)
+        return Pointwise(points, uses_variances=method.uses_aleatoric)
     fitted = Recalibration.from_json(setting.recalibration) if setting.recalibration else None
     config = ufm_star_config(row).within(max_depth)
     return Gaussians(config, device, setting, uses_variances=method.uses_aleatoric, recalibration=fitted)
@@ -123,8 +123,8 @@ class Alone(Estimator):
 class Pointwise(Estimator):
     """UfM. Without ``uses_variances``, A and E are left aside."""
 
-    def __init__(self, config: UfMConfig, device: torch.device, *, uses_variances: bool = True) -> None:
-        self.module = self.ufm = UfM(config, device=device)
+    def __init__(self, config: UfMConfig, *, uses_variances: bool = True) -> None:
+        self.ufm = UfM(config)
         self._uses_variances = uses_variances
 
     def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
@@ -133,24 +133,24 @@ class Pointwise(Estimator):
         out = self.ufm(used.depth, T_world_cam, predicted.intrinsics, a, e)
         return {"depth": used.depth, "variance": out.variance, "valid": out.valid, "aleatoric": a, "epistemic": e}
 
+    def state(self) -> dict[str, Tensor]:
+        """None that could be saved: raises TypeError."""
+        raise TypeError("a row of UfM cannot be continued within a sequence: only UfM* has a state that can be saved")
+
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points."""
-        cloud = self.ufm.clouds()[0] if len(self.ufm.points) else None
-        count = 0 if cloud is None else len(cloud.count)
-        return {"bytes": count * (cloud.bytes_per_point if cloud else 0), "count": count, "smoothing_bytes": 0}
+        points = [(len(cloud.count), len(cloud.count) * cloud.bytes_per_point) for cloud in self.ufm.clouds]
+        count, size = points[0] if points else (0, 0)
+        return {"bytes": size, "count": count, "smoothing_bytes": 0}
 
 
 class Gaussians(Estimator):
     """UfM*.
 
-    Where the row keeps the aleatoric variance in H, the config has two features: that variance, and 1. The value read
-    back replaces the pixel's own, A'(x) = sum_k w_k(x) a_k + (1 - sum_k w_k(x)) A: the pixel's own as far as no
-    component explains it, where the mixture alone would read as 0.
-
     Args:
         config: its settings.
         device: of the mixture.
-        setting: of the row: whether it answers with the corrected depth or the posterior, and keeps A in H.
+        setting: of the row: whether it answers with the corrected depth or the posterior.
         uses_variances: False leaves A and E aside.
         recalibration: of the variance; None = as it is.
     """
@@ -169,14 +169,8 @@ class Gaussians(Estimator):
         self._setting, self._uses_variances, self._anchors = setting, uses_variances, 0
 
     def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
-        """See :meth:`Estimator.update`. Raises ValueError: A is kept in H, and the network predicts none."""
-        used, features = _used(predicted, self._uses_variances), None
-        a = used.aleatoric_variance
-        if self._setting.aleatoric_in_h:
-            if a is None:
-                raise ValueError("aleatoric_in_h needs a network that predicts an aleatoric variance")
-            features = torch.stack([a, torch.ones_like(a)], dim=1)
-        out = self.model.update(used, T_world_cam, predicted.intrinsics, features=features, anchors=anchors)
+        used = _used(predicted, self._uses_variances)
+        out = self.model.update(used, T_world_cam, predicted.intrinsics, anchors=anchors)
         anchors_used = out.statistics.anchors_used
         self._anchors = 0 if anchors_used is None else int(anchors_used[0])
         answer = {name: getattr(out, name) for name in _OF_OUTPUT}
@@ -184,10 +178,6 @@ class Gaussians(Estimator):
             answer["depth"], answer["variance"] = out.posterior()
         elif self._setting.corrected:
             answer["depth"], answer["variance"] = out.corrected()
-        if features is not None and a is not None:
-            mixed, explained = out.features.unbind(-1)
-            a = mixed + (1 - explained) * a
-            answer |= {"aleatoric": a, "variance": answer["variance"] + a}
         return answer
 
     def mixture_world(self) -> GaussianMixture:

@@ -24,7 +24,7 @@ class Row:
         method, setting = self.method, self.setting
         if setting.of_ufm_star and method.fusion != UFM_STAR:
             raise ValueError(f"row {method.name}: only UfM* has {', '.join(setting.of_ufm_star)}")
-        if setting.aleatoric_in_h and not method.uses_aleatoric:
+        if setting.overrides.get("aleatoric_in_h") and not method.uses_aleatoric:
             raise ValueError(f"row {method.name}: aleatoric_in_h needs a network that predicts an aleatoric variance")
         try:
             configured(setting)

@@ -34,8 +34,6 @@ class Setting(Checked):
         preprocess: how an image comes to the network's input: "network", as its weights declare; "resize", the whole
             frame, each axis by its own factor, as the paper's loader of ScanNet does; "crop", the centre as NYU's
             validation. The input's size, colours and range stay the network's.
-        aleatoric_in_h: UfM* keeps the aleatoric variance in its mixture (H of the section "Gaussian mixture model"),
-            and reads it back instead of the pixel's own; see ``engine.estimators``.
         overrides: of ``UfMStarConfig`` by dotted name, as {"ema_alpha": 1.0, "segment.min_pixels": 2000}.
         rotation_noise: standard deviation of each component of a rotation vector that is added to a pose [deg].
         translation_noise: the same of each component of the position [m].
@@ -60,7 +58,6 @@ class Setting(Checked):
     overrides: Mapping[str, Any] = field(default_factory=dict)
     ufm_preset: str = choice(DEFAULTS, PAPER)
     preprocess: str = choice(OF_NETWORK, RESIZE, CROP)
-    aleatoric_in_h: bool = False
     rotation_noise: float = number(0.0, "", "deg", 0.0, open_high=True)
     translation_noise: float = number(0.0, "", "m", 0.0, open_high=True)
     rotation_drift: float = number(0.0, "", "deg", 0.0, open_high=True)
@@ -91,8 +88,6 @@ class Setting(Checked):
         for group in ("anchors", "posterior"):
             if not getattr(self, group) and any(name.startswith(f"{group}.") for name in self.overrides):
                 raise ValueError(f"{group}. settings go with {group}: set {group} as well")
-        if self.aleatoric_in_h and (self.anchors or self.overrides.keys() & {"features", "add_aleatoric"}):
-            raise ValueError("aleatoric_in_h goes without anchors, features and add_aleatoric")
         object.__setattr__(self, "overrides", MappingProxyType(dict(sorted(self.overrides.items()))))
 
     def __hash__(self) -> int:
@@ -121,7 +116,7 @@ class Setting(Checked):
     @property
     def of_ufm_star(self) -> tuple[str, ...]:
         """Names of what is changed of UfM*, which other methods do without."""
-        names = ("ufm_preset", "aleatoric_in_h", "anchors", "recalibration")
+        names = ("ufm_preset", "anchors", "recalibration")
         return (*self.overrides, *(name for name in names if getattr(self, name) != getattr(DEFAULT, name)))
 
     @property
@@ -201,8 +196,6 @@ def configured(setting: Setting) -> UfMStarConfig:
         anchors=AnchorConfig() if setting.anchors else None,
         posterior=PosteriorConfig() if setting.posterior else None,
     )
-    if setting.aleatoric_in_h:
-        config = config.replace(features=2, add_aleatoric=False)
     for name in setting.overrides:
         default_of(name)
     return config.with_values(setting.overrides)

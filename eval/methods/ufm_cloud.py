@@ -28,6 +28,13 @@ class Cloud:
     moments: Tensor
     count: Tensor  # [N] int32 n, observations fused into the point
 
+    @classmethod
+    def empty(cls, dtype: torch.dtype, device: torch.device) -> Cloud:
+        """No points."""
+        return cls(
+            torch.zeros(0, MOMENTS, dtype=dtype, device=device), torch.zeros(0, dtype=torch.int32, device=device)
+        )
+
     @property
     def mean(self) -> Tensor:
         """[N, 3] [m]."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.metrics.pixel_sums import HIGH, LOW
-from ufmstar_torch.recalibrate import ISOTONIC, SCALAR, Recalibration
+from ufmstar_torch.recalibrate import Recalibration
 
 Array = NDArray[np.float64]
 # Levels of |z| of a standard normal variable at which errors are compared with it. The outer tenth is left out:
@@ -29,26 +29,22 @@ def centres(bins: int) -> Array:
     return np.concatenate([[0.0], inner, [HIGH]])
 
 
-def fit(joints: Sequence[Array], kind: str = ISOTONIC, groups: int = GROUPS) -> Recalibration:
+def fit(joints: Sequence[Array], groups: int = GROUPS) -> Recalibration:
     """The map that fits some sequences.
 
-    scalar: s such that the errors' quantiles at ``LEVELS`` agree best, in the logarithm, with those of N(0, s V).
-    isotonic: the pixels are divided by V into ``groups`` groups of one size; each group's V' is the scale at which
-    its errors' quantiles agree with a normal distribution, and an isotonic regression of log V' (Barlow and Brunk
-    1972) over the groups makes it monotone.
+    The pixels are divided by V into ``groups`` groups of one size; each group's V' is the scale at which its errors'
+    quantiles at ``LEVELS`` agree best, in the logarithm, with those of a normal distribution, and an isotonic
+    regression of log V' (Barlow and Brunk 1972) over the groups makes it monotone.
 
     Args:
         joints: of each sequence, [V, e] pixels by variance and squared error (``SpearmanCorrelation.joint``).
-        kind: "isotonic" or "scalar".
         groups: at most; fewer where many pixels have one variance.
 
     Raises:
-        ValueError: no pixel, or (scalar) more than a tenth of the pixels with V = 0, which no factor changes.
+        ValueError: no pixel.
     """
     joint = _weighted(joints)
     value = centres(joint.shape[0] - 2)
-    if kind == SCALAR:
-        return Recalibration((1.0,), (_scale_of_ratio(joint, value),), SCALAR)
     from scipy.optimize import isotonic_regression
 
     mass, knots, scales = [], [], []
@@ -129,15 +125,3 @@ def _scale(mass: Array, value: Array) -> float:
     at = np.searchsorted(np.cumsum(mass), LEVELS * mass.sum())
     quantiles = np.maximum(value[np.minimum(at, len(value) - 1)], value[value > 0].min())
     return float(np.exp(np.mean(np.log(quantiles) - 2 * np.log(_normal(LEVELS)))))
-
-
-def _scale_of_ratio(joint: Array, value: Array) -> float:
-    """The factor s of V: :func:`_scale` of e / V, whose bins are the diagonals of the joint counts."""
-    if joint[0].sum() > 1 - LEVELS[-1]:
-        raise ValueError(f"{100 * joint[0].sum():.0f} % of the pixels have V = 0, which no factor changes")
-    bins = len(value) - 2
-    offset = np.arange(-bins, bins + 1)
-    mass = np.array([np.trace(joint[1:-1, 1:-1], k) for k in offset])
-    mass[0] += joint[1:, 0].sum() + joint[-1, 1:-1].sum()  # no error, or V beyond the range
-    mass[-1] += joint[:-1, -1].sum() + joint[0, 1:-1].sum()  # an error beyond the range, or V = 0
-    return _scale(mass, (HIGH / LOW) ** (offset / bins))

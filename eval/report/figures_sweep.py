@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULTS, DENSE, TRACKED, TRUTH, default_of
 from ufmstar_torch.eval.report import names, style
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.means import Mean, difference, mean_of
+from ufmstar_torch.eval.report.means import Mean, mean_of
 from ufmstar_torch.eval.report.style import Look
 from ufmstar_torch.eval.run.colours import FAINT, INK, plain
 from ufmstar_torch.eval.suite.record import Record
@@ -53,12 +53,6 @@ class SweepLine:
         values = dict(self.rest)
         anchors = _ANCHORED.get(kind := values.pop("anchors", ""), kind)
         return ", ".join(filter(None, (anchors, names.setting_label(values))))
-
-    def at(self, value: float) -> Point | None:
-        """The point of a value; of a line with one point, which does not depend on it, that one."""
-        if len(self.points) == 1:
-            return self.points[0]
-        return next((point for point in self.points if point.value == value), None)
 
 
 def sweeps(results: Results) -> list[tuple[str, str]]:
@@ -134,13 +128,9 @@ _OTHERS = (("#117733", "h"), ("#88CCEE", "p"), ("#999933", "<"), ("#AA4499", ">"
 # Beyond this an axis of NLLs is logarithmic: pixels of nearly no variance take their mean to any height.
 _HIGH = 50.0
 
-# A line with, for each of its points, the point that it is compared with.
-_Pairs = list[tuple[SweepLine, list[tuple[Point, Point]]]]
-
 
 def draw_sweep(results: Results, base: str, name: str) -> Any:
-    """Above, the figures over the values with their confidence intervals; below, the change from the default, or where
-    lines differ in what else is fixed, from the method without that."""
+    """The figures over the values, with their confidence intervals."""
     lines = [line for line in sweep_lines(results, base, name) if len(line.points) > 1 or not line.rest]
     alone = [line for line in lines if line.method == Method(base)][:1]
     drawn = [line for line in lines if line.method.fusion != ALONE]
@@ -148,49 +138,18 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
     for line in drawn:
         if line.rest:
             looks[line] = Look(line.words or looks[line].name, *(_FIXED.get(line.rest) or next(others)))
-    to, below = _compared(drawn, alone[0] if alone else None, name)
     shown = (*SHOWN, names.SPEARMAN) if any("anchors" in dict(line.rest) for line in drawn) else SHOWN
     word, unit = names.SETTINGS.get(name, (names.setting_name(name), ""))
     title = f"{word[:1].upper()}{word[1:]}: {BASES[base][0]}, {names.count(len(results.sequences()), 'sequence')}"
-    figure = style.new_figure(4.0 * len(shown), 6.0 if below else 3.4, title)
-    axes = figure.subplots(1 + bool(below), len(shown), squeeze=False, sharex=True)
-    for column, quantity in enumerate(shown):
-        panel = axes[0][column]
+    figure = style.new_figure(4.0 * len(shown), 3.4, title)
+    for panel, quantity in zip(figure.subplots(1, len(shown)), shown, strict=True):
         means = {line: {p.value: mean_of(p.records, quantity) for p in line.points} for line in looks}
         reached = _draw(panel, means, looks)
         style.finish(panel, title=f"{quantity.heading}, mean over sequences")
         _scale(panel, [point.value for line in drawn if len(line.points) > 1 for point in line.points])
         _tame(panel, name, reached)
-        if below:
-            panel = axes[1][column]
-            panel.axhline(0, color=FAINT, linewidth=0.8)
-            means = {line: {a.value: difference(a.records, b.records, quantity) for a, b in ab} for line, ab in below}
-            reached = _draw(panel, means, looks)
-            style.finish(panel, title=f"difference to {to} in {quantity.name}, in pairs")
-            _tame(panel, name, reached)
         panel.set_xlabel(plain(f"{word} [{unit}]" if unit else word), size=style.LABEL, color=INK)
     return figure
-
-
-def _compared(drawn: Sequence[SweepLine], alone: SweepLine | None, name: str) -> tuple[str, _Pairs]:
-    """The reference of the differences, in words, and the pairs of points.
-
-    To the base alone on the same images where these change with the value; else of lines with something fixed to those
-    without it, at the same value where that matters; else to the default.
-    """
-    plain = {line.method: line for line in drawn if not line.rest}
-    swept = [line for line in drawn if len(line.points) > 1]
-    reference: Callable[[SweepLine, float], Point | None]
-    if alone is not None and len(alone.points) > 1:
-        to, reference = "alone", lambda line, value: alone.at(value)
-    elif fixed := [line for line in swept if line.rest and line.method in plain]:
-        methods, swept = {style.look_of(line.method).name for line in fixed}, fixed
-        words = methods.pop() if len(methods) == 1 else "the method as it is"
-        to, reference = words, lambda line, value: plain[line.method].at(value)
-    else:
-        to, reference = "the default", lambda line, value: line.at(default_value(name))
-    pairs = [(line, [(p, other) for p in line.points if (other := reference(line, p.value))]) for line in swept]
-    return to, [(line, points) for line, points in pairs if points]
 
 
 def _draw(axes: Any, curves: Mapping[SweepLine, Mapping[float, Mean]], looks: Mapping[SweepLine, Look]) -> list[float]:

@@ -25,7 +25,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 # WebP's; with less, letters in pictures get visible rings.
 QUALITY = 84
 # Kinds of figures, the first words of their files' names, by the part of the page in which they stand.
-CURVES, COST = ("calibration", "error", "entropy", "sweep"), ("latency", "tradeoff")
+CURVES, COST = ("calibration", "error", "entropy", "sweep"), ("latency",)
 _IDLE = ("data set", "row", "frames", "without a segment", "without a match")
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from ufmstar_torch.eval.methods.row import Row, plain_rows
-from ufmstar_torch.eval.report.data import FORMAT, Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.efficiency import efficiency_tables
 from ufmstar_torch.eval.report.means import (
     MIN_SEQUENCES,
@@ -28,15 +28,13 @@ from ufmstar_torch.eval.report.names import (
     EXTRA,
     MAIN,
     MEMORY,
-    NO_MATCH,
-    NO_SEGMENT,
     Quantity,
     row_labels,
     shared_words,
 )
 from ufmstar_torch.eval.report.paper import PaperTable, paper_table_of
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, csv_text, latex, mark_best, markdown, table_csv
-from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.eval.suite.record import Record
 
 METHOD = "Method"
@@ -110,7 +108,7 @@ def _means(
     alike = len({frozenset((r.dataset, r.sequence) for r in listed) for listed in records.values()}) == 1
     group = "Ours" if quoted else ""
     columns = _figures(records, quantities, group)
-    notes = [_network_note(results), _prepared_note(records), _interval_note(records), *_idle_notes(records)]
+    notes = [_network_note(results), _prepared_note(records), _interval_note(records)]
     costs = _costs(results.efficiency, records, group) if name == "main" and results.efficiency else []
     if any(cell.value for column in costs for cell in column.cells.values()):
         columns += costs
@@ -212,15 +210,6 @@ def _interval_note(records: Mapping[Row, Sequence[Record]]) -> str:
     )
 
 
-def _idle_notes(records: Mapping[Row, Sequence[Record]]) -> Iterator[str]:
-    """A note on every row of UfM* that compared no views in most frames."""
-    for row, label in row_labels(records).items():
-        segment, match = (mean_of(records[row], quantity).value for quantity in (NO_SEGMENT, NO_MATCH))
-        if match >= 50:
-            frames = f"{segment:.0f} % of its frames have no segment, {match:.0f} % no match"
-            yield f"{label} compared no views in most frames: {frames}."
-
-
 def _cost_note(efficiency: Mapping[str, Any]) -> str:
     used = set(efficiency["devices"]["units"].values())
     missing = "; ".join(dict.fromkeys(why for unit, why in efficiency["power"]["missing"].items() if unit in used))
@@ -269,8 +258,8 @@ def _table_files(results: Results) -> Iterator[tuple[str, list[Table]]]:
         yield "efficiency", efficiency_tables(results.efficiency)
 
 
-def write_tidy(results: Results) -> list[Path]:
-    """Write ``results.json`` and ``results.csv``, a line per row, sequence and figure; their paths."""
+def write_tidy(results: Results) -> Path:
+    """Write ``results.csv``, a line per row, sequence and figure; its path."""
     lines = [
         {
             "suite": record.suite, "dataset": record.dataset, "sequence": record.sequence, "network": record.network,
@@ -279,11 +268,7 @@ def write_tidy(results: Results) -> list[Path]:
         for record in results.records
         for key, value in _values(record)
     ]  # fmt: skip
-    missing = [{"dataset": d, "sequence": s, "row": row.slug} for d, s, row in results.missing]
-    about = {"format": FORMAT, "suite": results.suite, "title": results.title}
-    path = results.out / "results.json"
-    write_json_atomic(path, {**about, "lines": lines, "failed": list(results.failed), "missing": missing})
-    return [path, _write_text(results.out / "results.csv", _tidy_csv(lines))]
+    return _write_text(results.out / "results.csv", _tidy_csv(lines))
 
 
 def _values(record: Record) -> Iterator[tuple[str, float | None]]:

@@ -45,7 +45,7 @@ def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> R
     # Remains of a killed report; eval.json and the records belong to `ufmstar eval`.
     for pattern in ("tables/.*.tmp", "figures/.*.tmp", ".results.*.tmp", ".table.*.tmp", ".report.*.tmp"):
         remove_temporaries(out.glob(pattern))
-    files = [*write_tidy(results), *write_tables(results)]
+    files = [write_tidy(results), *write_tables(results)]
     undrawn: dict[str, str] = {}
     if figures:
         files += _draw(results, pictures, undrawn)
@@ -64,9 +64,7 @@ def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
         yield f"entropy {base}", partial(figures_curves.draw_entropy, results, base)
     for base, name in figures_sweep.sweeps(results):
         yield f"sweep {base} {name}", partial(figures_sweep.draw_sweep, results, base, name)
-    yield "latency", partial(figures_cost.draw_latency, results)
     yield "latency stages", partial(figures_cost.draw_stages, results)
-    yield "tradeoff", partial(figures_cost.draw_tradeoff, results)
 
 
 def _draw(results: Results, kind: str, undrawn: dict[str, str]) -> list[Path]:

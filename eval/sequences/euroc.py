@@ -19,7 +19,8 @@ from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipp
 from ufmstar_torch.eval.sequences.images import first_image_size, read_color
 from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens, sequence_of_lenses
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import Trajectory, numbered_lines, poses_from_quaternions
+from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_quaternions
+from ufmstar_torch.trajectory import Trajectory
 
 LOOKED_FOR = "mav0/cam0/data.csv and sensor.yaml (also in mav0, or in a camera's folder itself)"
 _TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "leica0")

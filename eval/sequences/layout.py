@@ -7,6 +7,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from ufmstar_torch.eval.sequences import (
+    bag,
     colmap,
     euroc,
     generic,
@@ -32,6 +33,7 @@ READERS: dict[str, ModuleType] = {
     "colmap": colmap,
     "transforms": transforms,
     "euroc": euroc,
+    "bag": bag,
     "generic": generic,
 }
 LAYOUTS = ("auto", *READERS)

@@ -30,6 +30,7 @@ _REFUSED = {
     "colmap": "depth_intrinsics T_color_depth distortion",
     "transforms": "images depth depth_intrinsics T_color_depth distortion",
     "euroc": "images depth depth_intrinsics T_color_depth distortion",
+    "bag": "images depth depth_intrinsics T_color_depth distortion",
     "generic": "T_color_depth",
 }
 
@@ -40,7 +41,7 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
     Args:
         path: the sequence's folder, a video file, or ``tour:SEED`` with the options of a rendered tour in its name.
         layout: ``auto``, ``tum``, ``7scenes``, ``scannet``, ``sens``, ``tartanair``, ``kitti360``, ``nyu``, ``colmap``,
-            ``transforms``, ``euroc`` or ``generic``.
+            ``transforms``, ``euroc``, ``bag`` or ``generic``.
         poses: how they are written: ``camera-to-world`` (x right, y down, z forward), ``world-to-camera``, ``ned``
             (camera-to-world, x forward, y right, z down) or ``opengl`` (x right, y up, z backward); what is
             customary for a layout (TartanAir's NED) is known.
@@ -70,6 +71,7 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
         raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
     layout = layout_of(layout, path, explicit=chosen.images is not None or chosen.trajectory is not None)
     chosen.reject(layout, *_REFUSED[layout].split(), *(("drive", "scans") if layout != "kitti360" else ()))
+    chosen.reject(layout, *(("topics",) if layout != "bag" else ()))
     if chosen.trajectory is None and layout != "generic":
         chosen.reject(layout, "fps")
     sequence = READERS[layout].read(path, chosen)

@@ -40,6 +40,7 @@ class Options:
     distortion: str | Sequence[str | float] | None = None
     pose_scale: float | None = None  # metres per unit of the poses, and of a file of landmarks
     max_truth: float | None = None  # depths beyond are no ground truth [m]: what a window shows
+    topics: Sequence[str] | None = None  # of a bag that has several; a pose's with =FRAME, whose pose it is
     drive: str | int | None = None  # name or number of the drive, where the path is KITTI-360's root
     # Laser scans of as many frames before and after a frame that are added to its own (KITTI-360); moving things smear.
     scans: int | None = None

@@ -6,8 +6,10 @@ record that exists is not computed again, so that a killed evaluation continues 
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
+import queue
 import signal
 import threading
 import time
@@ -17,6 +19,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from logging.handlers import QueueHandler
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -31,6 +34,7 @@ from ufmstar_torch.eval.suite.folder import EvalFolder
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.work_items import Shard, WorkItem
 from ufmstar_torch.optional import optional
+from ufmstar_torch.stream_warnings import LOGGER
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
 _POLL_SECONDS = 0.1
@@ -132,10 +136,11 @@ def run_pool(
     report: Report,
 ) -> bool:
     """Do a task for every item in a pool of processes, and report what it returns; whether all were done. The processes
-    end with this one, also when it is killed. Raises what the task raises."""
+    end with this one, also when it is killed. Their warnings are logged here. Raises what the task raises."""
     spawn = multiprocessing.get_context("spawn")
     parent_alive, alive = spawn.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(processes, spawn, initializer=_begin, initargs=(parent_alive, threads))
+    warnings: multiprocessing.Queue[logging.LogRecord] = spawn.Queue()
+    pool = ProcessPoolExecutor(processes, spawn, initializer=_begin, initargs=(parent_alive, warnings, threads))
     try:
         waiting = {pool.submit(task, item) for item in items}
         # Python's pool does not watch the process that it started last until the next submission wakes it: without
@@ -143,6 +148,7 @@ def run_pool(
         pool.submit(os.getpid)
         while waiting and not stop():
             done, waiting = wait(waiting, _POLL_SECONDS, FIRST_COMPLETED)
+            _log(warnings)
             for line in filter(None, [one.result() for one in done]):
                 report(line)
         if not waiting:
@@ -155,11 +161,21 @@ def run_pool(
     finally:
         alive.close()  # ends those processes that are at work
         pool.shutdown(cancel_futures=True)
+        _log(warnings)
 
 
-def _begin(parent_alive: Connection, threads: int) -> None:
+def _log(warnings: multiprocessing.Queue[logging.LogRecord]) -> None:
+    """Log in this process what others have sent."""
+    with suppress(queue.Empty):
+        while True:
+            LOGGER.handle(warnings.get_nowait())
+
+
+def _begin(parent_alive: Connection, warnings: multiprocessing.Queue[logging.LogRecord], threads: int) -> None:
     """In each process, before its first task."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal: the parent decides
+    LOGGER.addHandler(QueueHandler(warnings))
+    LOGGER.propagate = False
     torch.set_num_threads(threads)
     threading.Thread(target=_end_with_parent, args=(parent_alive,), daemon=True).start()
 

@@ -1,0 +1,321 @@
+"""ROS 1 bags and ROS 2 bags (db3, mcap), through rosbags: images, camera info, depth, and poses of a topic or of tf.
+
+A PoseStamped without more is the camera's own pose (its optical frame); an Odometry is its ``child_frame_id``'s, from
+where tf leads to the image's frame. Opening reads every chosen message once, for its time; images are decoded later.
+Messages are of ROS's own types, so that no definition in the file is compiled.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+from weakref import finalize
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences import ros_messages as ros
+from ufmstar_torch.eval.sequences.attach import UNKNOWN
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Skipped
+from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.poses import associate
+from ufmstar_torch.optional import optional
+from ufmstar_torch.trajectory import interpolate_pose
+
+LOOKED_FOR = "a .bag, .db3 or .mcap file, or a folder that holds one"
+_SUFFIXES = (".bag", ".db3", ".mcap")
+_METADATA = "metadata.yaml"
+_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_INFO, _TF = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
+_TF_FIELDS = "geometry_msgs/TransformStamped[] transforms"
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_POSES = (_ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+_TYPES = (_IMAGE, _COMPRESSED, _INFO, _TF, *_POSES)
+_OLD_NAMES = {"tf/msg/tfMessage": _TF}
+_NANOSECOND = 1e-9
+# What rosbags raises for damaged files, beside its own errors.
+_BROKEN = (
+    *(OSError, EOFError, LookupError, AssertionError, ArithmeticError, AttributeError, RuntimeError, TypeError),
+    *(ValueError, MemoryError, struct.error),
+)
+
+
+class Place(NamedTuple):
+    """A message in a bag: its topic, when it was received [ns], and which one of that moment it is."""
+
+    topic: str
+    received: int
+    number: int
+
+
+class Bag:
+    """A bag that is opened when it is first read; a worker process opens its own."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._reader: Any = None
+        self._store: Any = None
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """The types of the topics that have a message, by name. Raises FrameError: the bag cannot be read."""
+        try:
+            return {c.topic: _OLD_NAMES.get(c.msgtype, c.msgtype) for c in self._open().connections if c.msgcount}
+        except self._errors() as error:
+            raise self._broken(error) from error
+
+    def messages(self, topics: Iterable[str], *when: int) -> Iterator[tuple[Place, Any]]:
+        """The messages of topics in the order in which they were received, those of [start, stop) [ns] where that is
+        given. Raises FrameError: one cannot be read."""
+        types, wanted = self.topics, set(topics)
+        decode = self._store.deserialize_ros1 if self.path.suffix == ".bag" else self._store.deserialize_cdr
+        last: dict[str, tuple[int, int]] = {}
+        try:
+            chosen = [c for c in self._open().connections if c.topic in wanted]
+            for connection, received, raw in self._open().messages(chosen, *when) if chosen else ():
+                before, number = last.get(connection.topic, (-1, 0))
+                number = number + 1 if before == received else 0
+                last[connection.topic] = (received, number)
+                yield Place(connection.topic, received, number), decode(raw, types[connection.topic])
+        except self._errors() as error:
+            raise self._broken(error) from error
+
+    def read(self, place: Place) -> Any:
+        """One message. Raises FrameError: it cannot be read."""
+        for found, message in self.messages([place.topic], place.received, place.received + 1):
+            if found == place:
+                return message
+        raise FrameError(self.path, f"the message of {place.topic} at {place.received} ns is missing")
+
+    def _open(self) -> Any:
+        if self._reader is None:
+            how = ("ROS bags need rosbags", "'ufmstar-torch[recordings]'")
+            stores, ros1 = optional("rosbags.typesys", *how), self.path.suffix == ".bag"
+            reader = optional("rosbags.rosbag1" if ros1 else "rosbags.rosbag2", *how).Reader(self.path)
+            reader.open()
+            self._store = stores.get_typestore(stores.Stores.ROS1_NOETIC if ros1 else stores.Stores.ROS2_HUMBLE)
+            if ros1:  # ROS 1's types in rosbags have no tf
+                self._store.register(stores.get_types_from_msg(_TF_FIELDS, _TF))
+            self._reader = reader
+            finalize(self, reader.close)
+        return self._reader
+
+    def _errors(self) -> tuple[type[Exception], ...]:
+        how = ("ROS bags need rosbags", "'ufmstar-torch[recordings]'")
+        own = [optional(f"rosbags.{name}", *how).ReaderError for name in ("rosbag1", "rosbag2")]
+        zstd, sqlite = optional("rosbags.rosbag2.storage_mcap", *how).zstd, optional("apsw", *how)
+        return (*own, optional("rosbags.serde", *how).SerdeError, zstd.ZstdError, sqlite.Error, *_BROKEN)
+
+    def _broken(self, error: Exception) -> FrameError:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        return FrameError(self.path, f"the bag cannot be read: {reason}")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"path": self.path, "_reader": None, "_store": None}
+
+
+class _Topics(NamedTuple):
+    """The chosen topics, "" where there is none, and the frame that a pose's topic names behind "="."""
+
+    image: str
+    info: str
+    depth: str
+    pose: str
+    frame: str
+
+
+def detect(path: Path) -> bool:
+    """Whether the path is a bag, or a folder that holds one."""
+    return _bag_path(path) is not None
+
+
+def _bag_path(path: Path) -> Path | None:
+    if path.is_file():
+        return path if path.suffix in _SUFFIXES else None
+    files = [p for p in path.iterdir() if any(end in p.suffixes for end in _SUFFIXES)] if path.is_dir() else []
+    if files and (path / _METADATA).is_file():
+        return path
+    return files[0] if len(files) == 1 and files[0].suffix in _SUFFIXES else None
+
+
+def read(path: Path, options: Options) -> FrameSequence:
+    """Opens the images of one camera, called by their number; times are the headers', or where those are 0, when a
+    message was received. ``options.topics`` chooses where there are several.
+
+    Raises:
+        ModuleNotFoundError: rosbags is not installed.
+        ValueError: a damaged bag, topics that are missing or not unique (listed), a camera that is not calibrated, or
+            no usable frame.
+    """
+    file = _bag_path(path)
+    assert file is not None
+    bag = Bag(file)
+    try:
+        topics = _choose(bag, options)
+        content = _Content(bag, topics)
+    except FrameError as error:
+        raise ValueError(error) from error
+    stamps = content.image_stamps
+    entries: list[Entry | Skipped] = []
+    paired = associate(stamps, content.depth_stamps, options.max_time_difference)
+    for number, place in enumerate(content.images):
+        load_depth = None
+        if number in paired:
+            load_depth = partial(_depth, bag, content.depths[paired[number]], options.depth_scale)
+        time = float(stamps[number])
+        T = content.pose(time + options.time_offset, options.max_pose_gap) if options.trajectory is None else UNKNOWN
+        name = f"{number:06d}"
+        if T is None:
+            entries.append(Skipped(name, f"no pose within {options.max_pose_gap:g} s around the image"))
+        else:
+            entries.append(Entry(name, T, partial(_colour, bag, place), load_depth, time))
+    lens = content.lens or _sized(bag, content.images)
+    lenses = dict.fromkeys((entry.name for entry in entries), lens)
+    return sequence_of_lenses(path.resolve().stem, "bag", entries, lenses, path, options, times=stamps)
+
+
+def _colour(bag: Bag, place: Place) -> np.ndarray:
+    return ros.colour(bag.read(place), bag.path)
+
+
+def _depth(bag: Bag, place: Place, scale: float | None) -> np.ndarray:
+    return ros.depth(bag.read(place), scale, bag.path)
+
+
+def _sized(bag: Bag, images: list[Place]) -> Lens:
+    """A camera of which the images' size alone is known, for ``options.intrinsics``."""
+    for place in images:
+        height, width = _colour(bag, place).shape[:2]
+        return Lens((1.0, 1.0, width / 2, height / 2), (height, width))
+    raise ValueError(f"{bag.path} holds no image")
+
+
+def _choose(bag: Bag, options: Options) -> _Topics:
+    """The topics by type, ``options.topics`` first. Raises ValueError: missing or not unique."""
+    types = bag.topics
+    named = dict(word.partition("=")[::2] for word in options.topics or ())
+    unknown = [name for name in named if types.get(name) not in _TYPES]
+    if unknown:
+        raise ValueError(f"topics: {unknown[0]!r} cannot be used; {bag.path} has {_listing(types)}")
+    images: dict[str, str] = {}
+    depths: dict[str, str] = {}
+    for name in (name for name, kind in types.items() if kind in (_IMAGE, _COMPRESSED)):
+        first = next(bag.messages([name]))[1]
+        is_depth = getattr(first, "encoding", "") in ros.DEPTH_ENCODINGS or ros.COMPRESSED_DEPTH in getattr(
+            first, "format", ""
+        )
+        (depths if is_depth else images)[name] = ros.frame_name(first.header.frame_id)
+    image = _one("the image", bag, images, named, types)
+    if not image:
+        raise ValueError(f"{bag.path} has no topic of colour images, but {_listing(types)}")
+    infos = [name for name, kind in types.items() if kind == _INFO]
+    beside = [name for name in infos if name.rsplit("/", 1)[0] in (image.rsplit("/", 1)[0], image.rsplit("/", 2)[0])]
+    info = "" if options.intrinsics is not None else _one("the camera info", bag, beside or infos, named, types)
+    if not info and options.intrinsics is None:
+        raise ValueError(f"{bag.path} has no camera info: pass intrinsics")
+    same_view = [name for name, frame in depths.items() if frame == images[image]]
+    depth = _one("the depth", bag, same_view, named, types)
+    other = [name for name in named if name in depths and name not in same_view]
+    if other:
+        raise ValueError(
+            f"topics: {other[0]!r} shows another camera's view ({depths[other[0]]!r}, not {images[image]!r})"
+        )
+    pose = ""
+    if options.trajectory is None:
+        by_tf = [name for name in named if types[name] == _TF]
+        poses = [name for name, kind in types.items() if kind in _POSES]
+        pose = by_tf[0] if by_tf else _one("the pose", bag, poses, named, types)
+        pose = pose or next((name for name, kind in types.items() if kind == _TF and "static" not in name), "")
+        if not pose:
+            raise ValueError(f"{bag.path} has no poses: pass trajectory")
+    return _Topics(image, info, depth, pose, ros.frame_name(named.get(pose, "")))
+
+
+def _one(kind: str, bag: Bag, candidates: Iterable[str], named: dict[str, str], types: dict[str, str]) -> str:
+    candidates = list(candidates)
+    candidates = [name for name in candidates if name in named] or candidates
+    if len(candidates) > 1:
+        raise ValueError(f"{bag.path}: {kind} may be {', '.join(sorted(candidates))}: name one with --topics")
+    return candidates[0] if candidates else ""
+
+
+def _listing(types: dict[str, str]) -> str:
+    return ", ".join(f"{name} ({kind})" for name, kind in sorted(types.items())[:30]) or "no message"
+
+
+class _Content:
+    """What one pass over the chosen topics finds: the places of images and depth maps, the camera, and poses."""
+
+    def __init__(self, bag: Bag, topics: _Topics) -> None:
+        self.bag, self.topics = bag, topics
+        self.lens: Lens | None = None
+        self.images: list[Place] = []
+        self.depths: list[Place] = []
+        self._stamps: dict[str, list[float]] = {topics.image: [], topics.depth: []}
+        self._tree, self._body, self._camera, samples = ros.FrameTree(), "", "", ros.Samples()
+        tf = [name for name, kind in bag.topics.items() if kind == _TF]
+        for place, message in bag.messages({*filter(None, topics[:4]), *tf}):
+            if place.topic in tf:
+                for transform in message.transforms:
+                    self._tree.add(_stamp(transform, place), transform)
+            elif place.topic == topics.pose:
+                pose = message.pose if message.__msgtype__ == _POSES[1] else message.pose.pose
+                samples.add(_stamp(message, place), pose.position, pose.orientation)
+                self._body = ros.frame_name(getattr(message, "child_frame_id", ""))
+            elif place.topic == topics.info:
+                self._add_lens(message)
+            else:
+                (self.images if place.topic == topics.image else self.depths).append(place)
+                self._stamps[place.topic].append(_stamp(message, place))
+                if place.topic == topics.image:
+                    self._camera = ros.frame_name(message.header.frame_id)
+        self.image_stamps, self.depth_stamps = (np.array(self._stamps[name]) for name in (topics.image, topics.depth))
+        self._trajectory = samples.trajectory() if samples.stamps else None
+        self._prepare()
+
+    def _add_lens(self, message: Any) -> None:
+        rectified = "rect" in self.topics.image
+        lens = ros.lens(message, rectified, f"{self.bag.path}: {self.topics.info}")
+        if self.lens not in (None, lens):
+            raise ValueError(f"{self.bag.path}: {self.topics.info} changes from message to message: pass intrinsics")
+        self.lens = lens
+
+    def _prepare(self) -> None:
+        """Find the frames between which poses lead. Raises ValueError: nothing connects them, or nothing moves."""
+        topics, chain = self.topics, self._tree.chain(self._camera)
+        if not topics.pose:
+            return
+        if self._trajectory is None:  # tf
+            self._body = topics.frame or chain[-1]
+            if self._body not in chain or not self._tree.moves(chain[: chain.index(self._body)]):
+                raise ValueError(
+                    f"{self.bag.path}: tf does not say how the image's frame {self._camera!r} moves in "
+                    f"{self._body!r}; it has {', '.join(chain)}; name another one by --topics {topics.pose}=FRAME"
+                )
+            return
+        of_odometry = self.bag.topics[topics.pose] == _ODOMETRY
+        self._body = topics.frame or (self._body if of_odometry else self._camera)
+        if self._body != self._camera and not set(self._tree.chain(self._body)) & set(chain):
+            raise ValueError(
+                f"{self.bag.path}: tf does not connect {self._body!r}, whose poses {topics.pose} has, with the image's "
+                f"frame {self._camera!r}; if they are the camera's, say --topics {topics.pose}={self._camera}"
+            )
+
+    def pose(self, time: float, max_gap: float) -> np.ndarray | None:
+        """[4, 4] camera-to-world at ``time`` [s]; None where there is none."""
+        if self._trajectory is None:
+            return self._tree.at(self._camera, self._body, time, max_gap)
+        T_world_body = interpolate_pose(self._trajectory, time, max_gap)
+        if self._body == self._camera or T_world_body is None:
+            return T_world_body
+        T_body_camera = self._tree.between(self._camera, self._body, time, max_gap)
+        return None if T_body_camera is None else np.asarray(T_world_body @ T_body_camera)
+
+
+def _stamp(message: Any, place: Place) -> float:
+    """[s] of a message's header, or when it was received."""
+    stamp = message.header.stamp
+    return stamp.sec + stamp.nanosec * _NANOSECOND or place.received * _NANOSECOND

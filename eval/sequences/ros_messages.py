@@ -1,0 +1,218 @@
+"""Messages of a ROS bag as arrays: images, depth maps, cameras, poses, and the tree of frames (tf).
+
+REP 103: an image's ``header.frame_id`` names the optical frame, x right, y down, z forward. REP 118: depth is 16UC1
+[mm] or 32FC1 [m]. https://ros.org/reps/rep-0103.html
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from ufmstar_torch.eval.sequences.frame import FrameError
+from ufmstar_torch.eval.sequences.images import positive, read_color
+from ufmstar_torch.eval.sequences.lens import Lens
+from ufmstar_torch.eval.sequences.poses import poses_from_quaternions
+from ufmstar_torch.trajectory import Trajectory, interpolate_pose
+
+DEPTH_ENCODINGS = {"16UC1": "u2", "32FC1": "f4"}
+COMPRESSED_DEPTH = "compressedDepth"
+# Encoding: bytes of a pixel, and OpenCV's conversion to RGB (None: it is RGB).
+_COLOURS: dict[str, tuple[int, str | None]] = {
+    "rgb8": (3, None),
+    "bgr8": (3, "BGR2RGB"),
+    "8UC3": (3, "BGR2RGB"),
+    "rgba8": (4, "RGBA2RGB"),
+    "bgra8": (4, "BGRA2RGB"),
+    "8UC4": (4, "BGRA2RGB"),
+    "mono8": (1, "GRAY2RGB"),
+    "8UC1": (1, "GRAY2RGB"),
+    **{f"bayer_{name}8": (1, f"BAYER_{name.upper()}2RGB") for name in ("rggb", "bggr", "gbrg", "grbg")},
+    "uyvy": (2, "YUV2RGB_UYVY"),
+    "yuv422": (2, "YUV2RGB_UYVY"),
+    "yuyv": (2, "YUV2RGB_YUYV"),
+    "yuv422_yuy2": (2, "YUV2RGB_YUYV"),
+}
+_RADIAL, _FISHEYES = ("plumb_bob", "rational_polynomial", ""), ("equidistant", "fisheye")
+_COUNTS = (4, 5, 8)  # of OpenCV's coefficients
+_STILL = 1e-9  # [m], [1] a transform whose samples differ by less does not move
+_NORM_TOLERANCE = 0.02  # of a quaternion
+
+
+def colour(message: Any, path: Path) -> np.ndarray:
+    """[H, W, 3] uint8 RGB of an Image or CompressedImage. Raises FrameError: it cannot be decoded."""
+    if not hasattr(message, "encoding"):
+        return read_color(path, bytes(message.data))
+    if message.encoding not in _COLOURS:
+        raise FrameError(path, f"an image's encoding must be one of {', '.join(_COLOURS)}, got {message.encoding!r}")
+    channels, conversion = _COLOURS[message.encoding]
+    pixels = _rows(message, np.dtype(np.uint8), channels, path)
+    if conversion is None:
+        return pixels
+    import cv2
+
+    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}")))
+
+
+def depth(message: Any, scale: float | None, path: Path) -> np.ndarray:
+    """[H, W] float32 [m], 0 = invalid, of an Image or a CompressedImage of ``compressed_depth_image_transport``;
+    ``scale`` in metres per unit instead of REP 118's. Raises FrameError: it cannot be decoded."""
+    if hasattr(message, "encoding"):
+        if message.encoding not in DEPTH_ENCODINGS:
+            raise FrameError(path, f"depth must be 16UC1 or 32FC1, got {message.encoding!r}")
+        order = ">" if message.is_bigendian else "<"
+        values = _rows(message, np.dtype(order + DEPTH_ENCODINGS[message.encoding]), 1, path)
+    else:
+        values = _compressed_depth(bytes(message.data), str(message.format), path)
+    scale = scale or (1e-3 if values.dtype.kind == "u" else 1.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return positive((values * np.float64(scale)).astype(np.float32))
+
+
+def _compressed_depth(data: bytes, form: str, path: Path) -> np.ndarray:
+    """A 16-bit PNG behind 12 bytes: i32 format, f32 a, f32 b; for 32FC1 it holds a / depth + b, 0 = invalid."""
+    try:
+        _, a, b = struct.unpack_from("<iff", data)
+        with Image.open(BytesIO(data[12:])) as image:
+            values = np.array(image)
+    except (struct.error, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FrameError(path, f"compressed depth ({form[:40]!r}) must be PNG: {error}") from error
+    if values.ndim != 2:
+        raise FrameError(path, f"compressed depth must have one channel, got {list(values.shape)}")
+    if not form.startswith("32FC1"):
+        return values.astype(np.uint16)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(values > 0, a / (values - np.float32(b)), 0).astype(np.float32)
+
+
+def _rows(message: Any, kind: np.dtype, channels: int, path: Path) -> np.ndarray:
+    """[H, W] or [H, W, C] of an Image, whose rows may be padded."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    used, data = width * channels * kind.itemsize, np.asarray(message.data, np.uint8)
+    if not (0 < used <= step and height > 0 and data.size == step * height):
+        raise FrameError(path, f"an image of {width}x{height} {message.encoding} has {data.size} bytes, {step} a row")
+    pixels = np.ascontiguousarray(data.reshape(height, step)[:, :used]).view(kind)
+    return pixels if channels == 1 else pixels.reshape(height, width, channels)
+
+
+def lens(info: Any, rectified: bool, where: str) -> Lens:
+    """A CameraInfo's camera; of ``rectified`` images P without the distortion. Raises ValueError: it is not calibrated,
+    its model is not OpenCV's, or its images are cropped or binned."""
+
+    def field(name: str) -> np.ndarray:  # ROS 1 has capitals
+        return np.asarray(getattr(info, name, None) if hasattr(info, name) else getattr(info, name.upper()), np.float64)
+
+    roi, model = info.roi, str(info.distortion_model)
+    cropped = (roi.width, roi.height) not in ((0, 0), (info.width, info.height))
+    if cropped or max(info.binning_x, info.binning_y) > 1:
+        raise ValueError(f"{where}: the images are cropped or binned: pass intrinsics")
+    if model not in (*_RADIAL, *_FISHEYES):
+        raise ValueError(f"{where}: distortion_model {model[:40]!r} is none of {', '.join((*_RADIAL[:2], *_FISHEYES))}")
+    size = (int(info.height), int(info.width))
+    K = field("p").reshape(3, 4) if rectified else field("k").reshape(3, 3)
+    if min(size) < 1 or not np.isfinite(K).all() or min(K[0, 0], K[1, 1]) <= 0:
+        raise ValueError(f"{where}: the camera is not calibrated, its focal lengths are {K[0, 0]}, {K[1, 1]}")
+    coefficients = () if rectified else tuple(float(x) for x in field("d"))
+    while len(coefficients) > 4 and coefficients[-1] == 0 and len(coefficients) not in _COUNTS:
+        coefficients = coefficients[:-1]  # of 12 or 14, thin prisms and tilts that are none
+    fisheye = model in _FISHEYES and any(coefficients)
+    return Lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), size, coefficients if any(coefficients) else (), fisheye)
+
+
+def frame_name(text: str) -> str:
+    """A frame's id; ROS 1 may write a slash before it."""
+    return text.lstrip("/")
+
+
+class Samples:
+    """Poses of one frame in another, as they are read; ``add`` and then ``trajectory``."""
+
+    def __init__(self) -> None:
+        self.stamps: list[float] = []
+        self.values: list[tuple[float, ...]] = []
+
+    def add(self, stamp: float, position: Any, rotation: Any) -> None:
+        """A pose at ``stamp`` [s], of a message's position [m] and quaternion."""
+        self.stamps.append(stamp)
+        at, q = position, rotation
+        self.values.append((at.x, at.y, at.z, q.x, q.y, q.z, q.w))
+
+    def trajectory(self) -> Trajectory:
+        """In the order of time, one of each; NaN where the quaternion is none."""
+        stamps, first = np.unique(np.array(self.stamps), return_index=True)
+        values = np.array(self.values, dtype=np.float64)[first]
+        norm = np.linalg.norm(values[:, 3:], axis=1)
+        usable = np.isfinite(values).all(axis=1) & (np.abs(norm - 1) < _NORM_TOLERANCE)
+        T = np.full((len(stamps), 4, 4), np.nan)
+        if usable.any():
+            T[usable] = poses_from_quaternions(values[usable, :3], values[usable, 3:])
+        return Trajectory(stamps, T)
+
+
+class FrameTree:
+    """The frames of tf: each has one parent."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, str] = {}
+        self._samples: dict[str, Samples] = {}
+        self._edges: dict[str, Trajectory] = {}
+
+    def add(self, stamp: float, transform: Any) -> None:
+        """A TransformStamped at ``stamp`` [s]. Raises ValueError: the frame had another parent."""
+        parent, child = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
+        if self._parents.setdefault(child, parent) != parent:
+            raise ValueError(f"tf: frame {child!r} has the parents {self._parents[child]!r} and {parent!r}")
+        motion = transform.transform
+        self._samples.setdefault(child, Samples()).add(stamp, motion.translation, motion.rotation)
+
+    def chain(self, frame: str) -> list[str]:
+        """The frame, its parent, ... up to the root. Raises ValueError: a loop."""
+        listed = [frame]
+        while listed[-1] in self._parents:
+            listed.append(self._parents[listed[-1]])
+            if listed[-1] in listed[:-1]:
+                raise ValueError(f"tf: the frames {', '.join(listed)} are a loop")
+        return listed
+
+    def moves(self, frames: Iterable[str]) -> bool:
+        """Whether any of these frames moves in its parent."""
+        return any(len(self._edge(frame)) > 1 for frame in frames)
+
+    def at(self, frame: str, above: str, time: float, max_gap: float) -> np.ndarray | None:
+        """[4, 4] the pose of ``frame`` in ``above``, one of its chain, at ``time`` [s]; None where a sample is missing
+        (``interpolate_pose``)."""
+        T, listed = np.eye(4), self.chain(frame)
+        for child in listed[: listed.index(above)]:
+            edge = self._edge(child)
+            step = edge.T_world_cam[0] if len(edge) == 1 else interpolate_pose(edge, time, max_gap)
+            if step is None:
+                return None
+            T = step @ T
+        return T
+
+    def between(self, frame: str, other: str, time: float, max_gap: float) -> np.ndarray | None:
+        """[4, 4] the pose of ``frame`` in ``other``, as :meth:`at`. Raises ValueError: nothing connects them."""
+        above = self.chain(other)
+        common = next((name for name in self.chain(frame) if name in above), None)
+        if common is None:
+            raise ValueError(f"tf does not connect the frames {other!r} and {frame!r}")
+        T_common_frame = self.at(frame, common, time, max_gap)
+        T_common_other = self.at(other, common, time, max_gap)
+        if T_common_frame is None or T_common_other is None:
+            return None
+        return np.asarray(np.linalg.inv(T_common_other) @ T_common_frame)
+
+    def _edge(self, child: str) -> Trajectory:
+        """A frame's poses in its parent: one, where it does not move."""
+        if child not in self._edges:
+            edge = self._samples[child].trajectory() if child in self._samples else Trajectory(None, np.eye(4)[None])
+            if not (np.abs(edge.T_world_cam - edge.T_world_cam[0]) > _STILL).any():
+                edge = Trajectory(None, edge.T_world_cam[:1])
+            self._edges[child] = edge
+        return self._edges[child]

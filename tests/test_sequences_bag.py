@@ -1,0 +1,218 @@
+"""ROS bags: what is read equals what rosbags' writers wrote; choice of topics; truncated and hostile files."""
+
+from __future__ import annotations
+
+import pickle
+import random
+from pathlib import Path
+from types import SimpleNamespace
+
+import layouts
+import layouts_bag as written
+import numpy as np
+import pytest
+
+from ufmstar_torch import cli
+from ufmstar_torch.eval.sequences import FrameError, open_sequence, ros_messages
+from ufmstar_torch.eval.sequences.lens import Lens
+
+KINDS = ("ros1", "db3", "mcap")
+
+
+def require_same(sequence, truth, atol=2e-4):
+    """Poses within the error of interpolating a jump of 11 cm in the middle: none, as both samples are the pose."""
+    assert len(sequence) == 6
+    for i, frame in enumerate(sequence):
+        np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-9)
+        np.testing.assert_array_equal(frame.image, truth.images[i])
+        np.testing.assert_allclose(frame.intrinsics, truth.K, atol=1e-9)
+        np.testing.assert_allclose(frame.depth, truth.depths[i], atol=atol)
+        assert frame.timestamp == pytest.approx((written.START + i * written.STEP) * 1e-9, abs=1e-6)
+
+
+@pytest.mark.parametrize("poses", ["odometry", "tf", "pose", "covariance"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_read_is_what_was_written(tmp_path, kind, poses):
+    path, truth = written.write_bag(tmp_path, kind, poses)
+    sequence = pickle.loads(pickle.dumps(open_sequence(path)))
+    assert (sequence.layout, sequence.name, sequence.skipped) == ("bag", "walk", ())
+    require_same(sequence, truth, atol=5e-4 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("how", "atol"),
+    [
+        ({"compressed": True, "depth": "32FC1"}, 1e-6),
+        ({"depth": "16UC1; compressedDepth png"}, 5e-4 + 1e-6),
+        ({"depth": "32FC1; compressedDepth"}, 8e-3),  # half a step of 2000 / depth at 4 m
+    ],
+)
+def test_compressed_images_and_depth(tmp_path, how, atol):
+    path, truth = written.write_bag(tmp_path, **how)
+    require_same(open_sequence(path), truth, atol)
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "rgba8", "mono8", "bayer_rggb8", "yuv422_yuy2"])
+def test_encodings(encoding):
+    rgb = np.zeros((4, 6, 3), np.uint8) + np.uint8([200, 100, 50])
+    grey = np.full((4, 6), 90, np.uint8)
+    bayer = np.tile(np.uint8([[200, 100], [100, 50]]), (2, 3))
+    stored = {"rgb8": rgb, "rgba8": np.dstack([rgb, grey]), "mono8": grey, "bayer_rggb8": bayer}
+    stored["yuv422_yuy2"] = np.dstack([grey, grey * 0 + 128])
+    expected = rgb if encoding[0] in "rb" else np.dstack([grey] * 3)
+    with_padding = np.pad(stored[encoding].reshape(4, -1), ((0, 0), (0, 3)))
+    message = SimpleNamespace(
+        encoding=encoding, height=4, width=6, step=with_padding.shape[1], data=with_padding.ravel()
+    )
+    np.testing.assert_allclose(ros_messages.colour(message, Path("a.bag")).astype(int), expected, atol=4)
+    message.data = message.data[:-1]
+    with pytest.raises(FrameError, match="an image of 6x4"):
+        ros_messages.colour(message, Path("a.bag"))
+    message.encoding = "rgb16"
+    with pytest.raises(FrameError, match=r"encoding must be one of rgb8, .* got 'rgb16'"):
+        ros_messages.colour(message, Path("a.bag"))
+
+
+def test_the_camera_info_describes_the_lens(tmp_path):
+    distorted = {"coefficients": (-0.05, 0.01, -0.002, 0.0005), "model": "equidistant"}
+    path, truth = written.write_bag(tmp_path / "fisheye", camera=distorted)
+    sequence = open_sequence(path)
+    lens = Lens((truth.K[0, 0], truth.K[1, 1], truth.K[0, 2], truth.K[1, 2]), (48, 64), distorted["coefficients"], True)
+    np.testing.assert_allclose(sequence.intrinsics, lens.K)
+    assert (sequence[0].image != truth.images[0]).any()
+    np.testing.assert_array_equal(open_sequence(path, intrinsics=[50, 50, 31, 23])[0].image, truth.images[0])
+
+    info = SimpleNamespace(height=48, width=64, distortion_model="rational_polynomial", binning_x=0, binning_y=0)
+    info.roi, info.D = SimpleNamespace(width=0, height=0), np.zeros(14)
+    info.K, info.P = truth.K.ravel(), np.hstack([2 * truth.K, np.ones((3, 1))]).ravel()
+    assert ros_messages.lens(info, False, "").coefficients == ()
+    assert ros_messages.lens(info, True, "").intrinsics[0] == 2 * truth.K[0, 0]
+    info.D[:8] = 0.001
+    assert ros_messages.lens(info, False, "").coefficients == (0.001,) * 8
+    for name, value, message in (
+        ("binning_x", 2, "cropped or binned"),
+        ("distortion_model", "omni", "distortion_model 'omni'"),
+        ("K", np.zeros(9), "not calibrated"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ros_messages.lens(SimpleNamespace(**{**vars(info), name: value}), False, "")
+
+
+def second_camera(bag):
+    image = np.zeros((48, 64, 3), np.uint8)
+    bag.write("/left/image", written.START, bag.image(written.START, "left", image, "rgb8"))
+    bag.write("/left/camera_info", written.START, bag.info(written.START, "left"))
+    bag.write("/left/depth", written.START, bag.image(written.START, "left", image[..., 0].astype("<u2"), "16UC1"))
+    bag.write("/slam", written.START, bag.pose_stamped(written.START, "map", np.eye(4)))
+
+
+def test_topics_are_named_where_there_are_several(tmp_path):
+    path, truth = written.write_bag(tmp_path, change=second_camera)
+    with pytest.raises(ValueError, match=r"image may be /camera/image, /left/image: name one with --topics"):
+        open_sequence(path)
+    with pytest.raises(ValueError, match=r"the pose may be /odom, /slam: name one"):
+        open_sequence(path, topics=["/left/image"])
+    require_same(open_sequence(path, topics=["/camera/image", "/odom"]), truth, 6e-4)
+    left = open_sequence(path, topics=["/left/image", "/slam"])
+    assert (len(left), left[0].image.max(), left.depth_size) == (1, 0, (48, 64))
+    np.testing.assert_array_equal(left[0].T_world_cam, np.eye(4))
+    with pytest.raises(
+        ValueError, match=r"topics: '/left/depth' shows another camera's view \('left', not 'optical'\)"
+    ):
+        open_sequence(path, topics=["/camera/image", "/left/depth", "/odom"])
+    with pytest.raises(ValueError, match=r"topics: '/lidar' cannot be used; .* has /camera/camera_info \(sensor_msgs"):
+        open_sequence(path, topics=["/lidar"])
+    assert cli.main(["data", "check", str(path), "--topics", "/camera/image", "/odom"]) == 0
+
+
+def test_the_frame_of_a_pose_can_be_named(tmp_path, capfd):
+    """A pose of the body without its name, and the world of tf."""
+    path, truth = written.write_bag(tmp_path / "tf", poses="tf")
+    in_odom = open_sequence(path, topics=["/tf=odom"])
+    for i, frame in enumerate(in_odom):
+        expected = np.linalg.inv(written.T_MAP_ODOM) @ truth.T_world_cam[i]
+        np.testing.assert_allclose(frame.T_world_cam, expected, atol=1e-9)
+    with pytest.raises(
+        ValueError, match=r"how the image's frame 'optical' moves in 'base'; it has optical, base, odom, m"
+    ):
+        open_sequence(path, topics=["/tf=base"])
+
+    def body(bag):
+        bag.write("/tf_static", written.START, bag.tf(written.START, ("base", "optical", written.T_BODY_CAMERA)))
+
+    path, truth = written.write_bag(tmp_path / "pose", poses="pose", change=body)
+    require_same(open_sequence(path), truth, 6e-4)
+    moved = open_sequence(path, topics=["/pose=base"])
+    np.testing.assert_allclose(moved[3].T_world_cam, truth.T_world_cam[3] @ written.T_BODY_CAMERA, atol=1e-9)
+    with pytest.raises(ValueError, match=r"does not connect 'arm', .* say --topics /pose=optical"):
+        open_sequence(path, topics=["/pose=arm"])
+    assert cli.main(["data", "check", str(path), "--topics", "/pose=arm"]) == 1
+    assert "--topics /pose=optical" in capfd.readouterr().out
+
+
+def loop(bag):
+    bag.write("/tf_static", written.START, bag.tf(written.START, ("optical", "map", np.eye(4))))
+
+
+def two_parents(bag):
+    bag.write("/tf_static", written.START, bag.tf(written.START, ("map", "optical", np.eye(4))))
+
+
+@pytest.mark.parametrize(
+    ("how", "options", "message"),
+    [
+        ({"poses": ""}, {}, "has no poses: pass trajectory"),
+        ({"poses": "tf", "change": loop}, {}, "are a loop"),
+        ({"poses": "tf", "change": two_parents}, {}, "'optical' has the parents 'base' and 'map'"),
+        ({"camera": {"size": (480, 640)}}, {}, "principal point|do not fit"),
+        ({}, {"images": "x"}, "layout 'bag' takes no images"),
+    ],
+)
+def test_what_does_not_fit_is_named(tmp_path, how, options, message):
+    path, _ = written.write_bag(tmp_path, **how)
+    with pytest.raises(ValueError, match=message):
+        open_sequence(path, **options)
+
+
+def test_other_layouts_take_no_topics(tmp_path):
+    path, _ = layouts.write_generic(tmp_path)
+    with pytest.raises(ValueError, match="layout 'generic' takes no topics"):
+        open_sequence(path, topics=["/image"])
+
+
+def test_a_trajectory_replaces_the_poses(tmp_path):
+    path, truth = written.write_bag(tmp_path, poses="")
+    times = [(written.START + i * written.STEP) * 1e-9 for i in range(6)]
+    lines = [f"{t:.9f} {layouts.quaternion_line(T)}" for t, T in zip(times, truth.T_world_cam, strict=True)]
+    (tmp_path / "slam.txt").write_text("\n".join(lines))
+    require_same(open_sequence(path, trajectory=tmp_path / "slam.txt"), truth, 6e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_bags(tmp_path, kind):
+    """Cut anywhere, spoiled, emptied: an error that names the file, or frames that can be read or are named."""
+    path, truth = written.write_bag(tmp_path, kind, depth="16UC1")
+    file = path if kind == "ros1" else next(path.glob(f"*.{kind}"))
+    whole, rng, read = file.read_bytes(), random.Random(0), 0
+    messages = []
+    changes = [b"", b"\xff" * 64, b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n" + b"\xff" * 90]
+    changes += [whole[: rng.randrange(len(whole))] for _ in range(10)]
+    for _ in range(30):
+        data = bytearray(whole)
+        for _ in range(8):
+            data[rng.randrange(len(data))] = rng.randrange(256)
+        changes.append(bytes(data))
+    for content in changes:
+        file.write_bytes(content)
+        try:
+            sequence = open_sequence(file)
+            frames = list(sequence.readable(lambda error: None))
+        except ValueError as error:
+            messages.append(str(error))
+            continue
+        read += bool(frames)
+        assert len(sequence) + len(sequence.skipped) <= 6
+    assert read > 5
+    assert max(map(len, messages)) < 3000
+    file.write_bytes(whole)
+    require_same(open_sequence(file), truth, 6e-4)
