@@ -40,8 +40,9 @@ def load_network(name: str, weights: str | Path | None = None, **options: Any) -
                 ``weights``: an ONNX export, which runs in ONNX Runtime (``runtime="torch"``: in torch), a .tflite file,
                 or a state_dict (.pth, .pt, .safetensors).
             monodepth2: ``strides`` ("v1.5" or "v1"), ``size``, ``dropout``. ``weights``: a state_dict.
-            trained: none. ``weights``: a file of ``save_trained``; where it has several members, all of them as
-                one network (``Ensemble``). ``load_trained`` gives them one by one, and takes several files.
+            trained: ``backbone``, of a head on a module of one's own. ``weights``: a file of ``save_trained``; where
+                it has several members, all of them as one network (``Ensemble``). ``load_trained`` gives them one by
+                one, and takes several files.
             onnx: ``spec`` (an ``OnnxSpec``, a dict or a JSON file), ``threads``, ``providers``.
             litert: ``spec`` (a ``ProgramSpec``, a dict or a JSON file), ``threads``. ``weights``: a .tflite file.
             depth_anything: ``spec`` with "size", "keep_aspect" and, for a relative checkpoint, "alignment" (a dict or

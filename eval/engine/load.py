@@ -255,6 +255,8 @@ def _label(model: str, file: Path, network: DepthNetwork) -> str:
     """ "FastDepth", "ResNet50-Monodepth2", "Depth Anything V2", or the name of the file with the (first) weights."""
     if model == "trained":
         spec = read_info(file).spec
+        if spec.module is not None:
+            return Path(spec.module.source).name
         return "FastDepth" if spec.architecture == "fastdepth" else f"ResNet{spec.layers}-Monodepth2"
     if model == "fastdepth":
         return "FastDepth"
