@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from ufmstar_torch.arguments import as_tensor
 from ufmstar_torch.models.checkpoints import read_tensors
+from ufmstar_torch.models.hugging_face import from_hugging_face, of_transformers
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import METRIC, OutputSpec, ProgramSpec, Spread
 from ufmstar_torch.models.preprocess import Preprocess
@@ -77,30 +78,55 @@ def wrap_network(
     focal: float | None = None,
     max_depth: float | None = None,
     takes_intrinsics: bool = False,
-    preprocess: Preprocess | None = None,
-) -> WrappedNetwork:
+    preprocess: Preprocess | Any = None,
+) -> DepthNetwork:
     """A network of one's own for UfM*.
 
     Args:
         network: takes an image [B, 3, H, W]; returns metric depth [B, 1, H, W] or [B, H, W], a mapping or
-            an object with named tensors, a tuple of tensors, or a ``DepthPrediction``; NumPy arrays are as good.
+            an object with named tensors, a tuple of tensors, or a ``DepthPrediction``; NumPy arrays are as good. Or a
+            depth model or pipeline of ``transformers``, as ``from_hugging_face`` takes it, which becomes metric.
         output: which of several outputs is depth: a name, or a position in a tuple.
         scale: [m] length of one unit of depth.
         inverse: declares inverse or relative depth, which is refused.
         aleatoric, aleatoric_kind, epistemic, epistemic_kind, resize, focal, max_depth: as in :class:`OutputSpec`.
         takes_intrinsics: whether it is called as ``network(x, K)``, K [B, 3, 3] [px] of ``x``; an attribute
             ``takes_intrinsics = True`` of ``network`` does the same.
-        preprocess: what its input needs; None: images in [0, 1] at their own size.
+        preprocess: what its input needs; None: images in [0, 1] at their own size. Of a model of ``transformers``, also
+            its image processor; None: the pipeline's.
 
     Raises:
-        ValueError: ``inverse``, or a value out of range.
-        TypeError: ``network`` cannot be called.
+        ValueError: ``inverse``, a value out of range, or a relative model of ``transformers``.
+        TypeError: ``network`` cannot be called, or does not estimate depth; ``preprocess`` is something else.
     """
-    if not callable(network):
-        raise TypeError(f"network must be an nn.Module or a function, got {type(network).__name__}")
+    if isinstance(network, type) or not callable(network):
+        raise TypeError(f"network must be an nn.Module or a function, got {_described(network)}")
+    if of_transformers(network):
+        if inverse or resize or any(v is not None for v in (output, aleatoric, epistemic, focal, max_depth)):
+            raise ValueError("of a model of transformers only scale, takes_intrinsics and preprocess can be declared")
+        own = preprocess is None or isinstance(preprocess, Preprocess)
+        declared: dict[str, Any] = {
+            "preprocess" if own else "processor": preprocess,
+            "takes_intrinsics": takes_intrinsics,
+        }
+        return from_hugging_face(network, kind=METRIC, scale=scale, **declared)
+    if preprocess is not None and not isinstance(preprocess, Preprocess):
+        raise TypeError(f"preprocess must be a Preprocess or None, got {_described(preprocess)}")
     kind, spreads = "inverse" if inverse else METRIC, (aleatoric, aleatoric_kind, epistemic, epistemic_kind)
     spec = OutputSpec(kind, output, scale, *spreads, resize, focal, max_depth)
     return WrappedNetwork(network, spec, preprocess or Preprocess(), takes_intrinsics)
+
+
+def _described(value: object) -> str:
+    """What was given in place of a network or a preprocessing, and what to do."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}: give an instance, {value.__name__}(...)"
+    if isinstance(value, str | Path):
+        return f"{type(value).__name__} {str(value)!r}: load it, as load_network(name, weights) or from_hugging_face do"
+    if isinstance(value, Mapping):
+        return f"{type(value).__name__}: weights need their network, network.load_state_dict(weights)"
+    several = "; several networks are a list of wrapped ones" if isinstance(value, list | tuple) else ""
+    return type(value).__name__ + several
 
 
 def load_torchscript(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:

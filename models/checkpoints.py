@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.models.atomic import write_atomic
+from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.optional import optional
 
 # Keys under which training programs store the weights in a checkpoint, and prefixes that wrappers add to every key.

@@ -50,6 +50,8 @@ class HuggingFaceSpec(Checked):
         size: (height, width) [px] of the input; None = that of preprocessor_config.json.
         keep_aspect: whether ``size`` is only approximate and the aspect kept; None = as the configuration states.
         preprocess: instead of the checkpoint's own; excludes ``size`` and ``keep_aspect``.
+        takes_intrinsics: Depth Pro: its inverse depth becomes metric by the camera's K instead of by the field of view
+            that it estimates.
         allow_missing: beginnings of weights that the checkpoint may lack (and that stay random), as the unused
             "neck.fusion_stage.layers.0.residual_layer1" of Intel/dpt-large.
         alignment: of a relative network; for :func:`load_hugging_face`.
@@ -60,6 +62,7 @@ class HuggingFaceSpec(Checked):
     size: tuple[int, int] | None = None
     keep_aspect: bool | None = None
     preprocess: Preprocess | None = None
+    takes_intrinsics: bool = False
     allow_missing: tuple[str, ...] = ()
     alignment: Alignment | None = None
 
@@ -71,7 +74,7 @@ class Checkpoint:
     name: str  # directory or hub name
     config: dict[str, Any]  # config.json
     processor: dict[str, Any]  # preprocessor_config.json, empty if there is none
-    options: dict[str, Any]  # keyword arguments of every call of ``transformers``
+    options: dict[str, Any]  # keyword arguments of every call of ``transformers``; {} = random weights
 
     @property
     def model_type(self) -> str:
@@ -104,9 +107,10 @@ class RawDepth(nn.Module):
         super().__init__()
         self.model, self.multiple, self.canonical, self.padded = model, multiple, canonical, padded
 
-    def forward(self, image: Tensor) -> Tensor:
-        """[B, H, W], at least in single precision, of ``image`` [B, 3, H, W]; a smaller output is enlarged. Raises
-        ValueError: the image has another shape, or sides that are no multiples of ``multiple``."""
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> Tensor:
+        """[B, H, W], at least in single precision, of ``image`` [B, 3, H, W]; a smaller output is enlarged.
+        ``intrinsics`` [B, 3, 3] [px] replace Depth Pro's estimate of the field of view. Raises ValueError: the image
+        has another shape, or sides that are no multiples of ``multiple``."""
         height, width = require_image(image, self.multiple)
         down, right = (int(math.sqrt(side / 2) * _PADDING) if self.padded else 0 for side in (height, width))
         if self.padded:
@@ -115,7 +119,9 @@ class RawDepth(nn.Module):
         outputs = self.model(pixel_values=image.to(next(self.model.parameters()).dtype))
         depth = as_map(outputs.predicted_depth, "predicted_depth")
         depth = depth if depth.dtype == torch.float64 else depth.float()
-        if self.canonical:
+        if self.canonical and intrinsics is not None:
+            depth = depth * (width / intrinsics[..., 0, 0].to(depth)).reshape(-1, 1, 1)
+        elif self.canonical:
             width_per_focal = 2 * (outputs.field_of_view.to(depth) * (math.pi / 360)).tan()
             depth = depth * width_per_focal.reshape(-1, 1, 1)
         size = (height + 2 * down, width + 2 * right)
@@ -134,9 +140,11 @@ class HuggingFaceDepth(DepthNetwork):
         kind: "metric", "inverse" or "affine".
         scale: [m] length of one unit, where metric.
         max_depth: [m] the ``max_depth`` of a metric checkpoint, of which its output is a share.
+        takes_intrinsics: whether it is called as ``network(x, K)``: Depth Pro, if so declared.
     """
 
     max_depth: float | None = None
+    takes_intrinsics = False
 
     def __init__(
         self, raw: RawDepth, preprocess: Preprocess, kind: str, *, scale: float = 1.0, source: str = ""
@@ -152,17 +160,26 @@ class HuggingFaceDepth(DepthNetwork):
         self.kind, self.scale, self.source = kind, scale, source
 
     @classmethod
-    def of_checkpoint(cls, checkpoint: Checkpoint, spec: HuggingFaceSpec, dtype: torch.dtype = torch.float32) -> Self:
-        """From a checkpoint that was read, in eval mode; errors as :func:`from_hugging_face`."""
-        kind, preprocess = _kind(checkpoint, spec.kind), spec.preprocess
+    def of_checkpoint(
+        cls,
+        checkpoint: Checkpoint,
+        spec: HuggingFaceSpec,
+        dtype: torch.dtype = torch.float32,
+        model: nn.Module | None = None,
+    ) -> Self:
+        """From a checkpoint that was read, or the ``model`` that is in memory already, in eval mode; errors as
+        :func:`from_hugging_face`."""
+        kind, preprocess = _kind(checkpoint, spec.kind, spec.takes_intrinsics), spec.preprocess
         if preprocess is None:
             preprocess = _preprocess(checkpoint, spec.size, spec.keep_aspect)
         elif spec.size is not None or spec.keep_aspect is not None:
             raise ValueError("preprocess excludes size and keep_aspect, which it contains")
         padded = checkpoint.model_type == "zoedepth" and checkpoint.processor.get("do_pad", True)
-        model, canonical = _load_model(checkpoint, dtype, spec.allow_missing), checkpoint.model_type == "depth_pro"
+        model = _load_model(checkpoint, dtype, spec.allow_missing) if model is None else model
+        canonical = checkpoint.model_type == "depth_pro"
         raw = RawDepth(model, checkpoint.patch, canonical=canonical, padded=padded)
         network = cls(raw, preprocess, kind, scale=spec.scale, source=checkpoint.name)
+        network.takes_intrinsics = spec.takes_intrinsics
         if checkpoint.config.get("depth_estimation_type") == METRIC:
             network.max_depth = spec.scale * float(checkpoint.config["max_depth"])
         return network.eval()
@@ -172,10 +189,16 @@ class HuggingFaceDepth(DepthNetwork):
         """Whether it can be used without an alignment."""
         return self.kind == METRIC
 
-    def forward(self, image: Tensor) -> DepthPrediction:
-        """Depth [B, H, W] [m], at least in single precision, of ``image`` [B, 3, H, W] as ``preprocess`` returns it.
-        Raises ValueError: the network is relative, or the image does not fit."""
-        return DepthPrediction(self.aligned(None).raw(image) * self.scale)
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
+        """Depth [B, H, W] [m], at least in single precision, of ``image`` [B, 3, H, W] as ``preprocess`` returns it,
+        with ``intrinsics`` [B, 3, 3] [px] where it takes them. Raises ValueError: the network is relative, the image
+        does not fit, or the intrinsics are missing."""
+        if self.takes_intrinsics and intrinsics is None:
+            raise ValueError(
+                "the network was declared to take intrinsics: call network(x, K), K [B, 3, 3] of its input x"
+            )
+        K = intrinsics if self.takes_intrinsics else None
+        return DepthPrediction(self.aligned(None).raw(image, K) * self.scale)
 
     def aligned(self, alignment: Alignment | None) -> Any:
         """The metric network that a relative one becomes by a fixed alignment; the weights are shared. None: this
@@ -197,8 +220,9 @@ class HuggingFaceDepth(DepthNetwork):
 
 
 def from_hugging_face(
-    name_or_dir: str | Path,
+    name_or_dir: Any,
     *,
+    processor: Any = None,
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
     revision: str | None = None,
@@ -208,22 +232,51 @@ def from_hugging_face(
     """A depth model of ``AutoModelForDepthEstimation`` in eval mode: DPT, GLPN, Depth Anything, Depth Pro, ZoeDepth.
 
     Args:
-        name_or_dir: "owner/name" on the hub, or a directory with config.json and weights.
+        name_or_dir: "owner/name" on the hub, or a directory with config.json and weights; or the model or
+            depth-estimation pipeline in memory, whose dtype and device then stay.
+        processor: image processor of a model in memory, if ``preprocess`` is not declared.
         dtype: of the weights; what comes out is float32 in any case (float64 for float64).
         device: where they go; None = the CPU.
         revision: branch, tag or commit on the hub.
         local_files_only: do not access the hub.
-        declared: kind, scale, size, keep_aspect, preprocess and allow_missing: see :class:`HuggingFaceSpec`.
+        declared: kind, scale, size, keep_aspect, preprocess, takes_intrinsics and allow_missing: see
+            :class:`HuggingFaceSpec`.
 
     Raises:
+        TypeError: a model or pipeline in memory that does not estimate depth.
         ValueError: the kind is declared nowhere or contradicts the configuration, a Depth Pro without the part that
             estimates the field of view, or a value is out of range.
         CheckpointError: a directory or checkpoint is damaged, incomplete or of another kind of model; named.
         FileNotFoundError, OSError: there is no such directory, or the hub cannot be reached.
         ModuleNotFoundError: transformers is missing.
     """
+    spec = HuggingFaceSpec(**declared)
+    if of_transformers(name_or_dir):
+        model, checkpoint = _in_memory(name_or_dir, processor)
+        return HuggingFaceDepth.of_checkpoint(checkpoint, spec, model=model).to(device)
+    if processor is not None:
+        raise ValueError("processor goes with a model in memory: a checkpoint has its own")
     checkpoint = read_checkpoint(name_or_dir, revision, local_files_only)
-    return HuggingFaceDepth.of_checkpoint(checkpoint, HuggingFaceSpec(**declared), dtype).to(device)
+    return HuggingFaceDepth.of_checkpoint(checkpoint, spec, dtype).to(device)
+
+
+def of_transformers(network: object) -> bool:
+    """Whether it is a model or a pipeline of ``transformers``, which is not imported for that."""
+    bases = {cls.__name__ for cls in type(network).__mro__ if cls.__module__.startswith("transformers.")}
+    return bool(bases & {"PreTrainedModel", "Pipeline"})
+
+
+def _in_memory(network: Any, processor: Any) -> tuple[nn.Module, Checkpoint]:
+    """A model or pipeline, and what its checkpoint would say. Raises TypeError: it does not estimate depth."""
+    model, name = network, type(network).__name__
+    if not isinstance(network, nn.Module):
+        if network.task != "depth-estimation":
+            raise TypeError(f"network must be a pipeline of the task depth-estimation, got {network.task!r}")
+        model, processor = network.model, processor or network.image_processor
+    if not type(model).__name__.endswith("ForDepthEstimation"):
+        raise TypeError(f"network must be a ...ForDepthEstimation of transformers, got {type(model).__name__}")
+    described = {} if processor is None else processor.to_dict()
+    return model, Checkpoint(name, model.config.to_dict(), described, {})
 
 
 def load_hugging_face(weights: Path, spec: Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
@@ -274,12 +327,17 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
 
 
 def _load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: tuple[str, ...]) -> nn.Module:
-    """The model with every weight from the checkpoint, on the CPU. Raises CheckpointError: not a depth model, damaged,
-    or with missing, misshapen or non-finite weights; the message names the directory."""
+    """The model with every weight from the checkpoint, on the CPU, or random ones. Raises CheckpointError: not a depth
+    model, damaged, or with missing, misshapen or non-finite weights; the message names the directory."""
     from huggingface_hub.errors import StrictDataclassError
     from safetensors import SafetensorError
-    from transformers import AutoModelForDepthEstimation
+    from transformers import CONFIG_MAPPING, AutoModelForDepthEstimation
 
+    if not checkpoint.options:
+        untrained: nn.Module = AutoModelForDepthEstimation.from_config(
+            CONFIG_MAPPING[checkpoint.model_type].from_dict(checkpoint.config), dtype=dtype
+        )
+        return untrained.eval()
     try:
         model, report = AutoModelForDepthEstimation.from_pretrained(
             checkpoint.name, dtype=dtype, output_loading_info=True, **checkpoint.options
@@ -337,14 +395,21 @@ def _preprocess(checkpoint: Checkpoint, size: tuple[int, int] | None, keep_aspec
     )
 
 
-def _kind(checkpoint: Checkpoint, kind: str | None) -> str:
+def _kind(checkpoint: Checkpoint, kind: str | None, takes_intrinsics: bool) -> str:
     """The kind of depth, from the configuration, the architecture and the declaration."""
     config, name, model_type = checkpoint.config, checkpoint.name, checkpoint.model_type
     if model_type not in _ALWAYS_METRIC:
         known = ", ".join(_ALWAYS_METRIC)
         raise CheckpointError(f"{name} ({model_type}) cannot be loaded as a depth model: covered are {known}")
-    if model_type == "depth_pro" and not config.get("use_fov_model"):
-        raise ValueError(f"{name} predicts inverse depth per focal length, but not the field of view (use_fov_model)")
+    if takes_intrinsics and model_type != "depth_pro":
+        raise ValueError(
+            f"takes_intrinsics goes with Depth Pro, whose depth depends on the focal length, not {model_type}"
+        )
+    if model_type == "depth_pro" and not config.get("use_fov_model") and not takes_intrinsics:
+        raise ValueError(
+            f"{name} predicts inverse depth per focal length, but not the field of view (use_fov_model): declare "
+            "takes_intrinsics=True"
+        )
     stated = config.get("depth_estimation_type", "relative" if model_type == "depth_anything" else None)
     if stated not in (None, *_DECLARED):
         raise ValueError(f"{name}: depth_estimation_type must be one of {list(_DECLARED)}, got {stated!r}")
@@ -357,6 +422,7 @@ def _kind(checkpoint: Checkpoint, kind: str | None) -> str:
             "(inverse depth up to scale and shift) or 'affine' (depth up to scale and shift)"
         )
     if own is not None and kind not in (None, own):
+        aligned = "" if own == METRIC else ": from_hugging_face(...).aligned(alignment) makes it metric"
         source = f"depth_estimation_type {stated!r}" if stated else f"the architecture {model_type}"
-        raise ValueError(f"kind={kind!r}, but {name} states {source}, which is {own!r}")
+        raise ValueError(f"kind={kind!r}, but {name} states {source}, which is {own!r}{aligned}")
     return own or str(kind)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from torch import Tensor, nn
 
@@ -34,6 +35,11 @@ class DepthNetwork(nn.Module, ABC):
     def max_depth(self) -> float | None:
         """[m] The largest depth that it can predict; None where it is not bounded, or not known."""
         return stated_range(self.wrapped)
+
+    if TYPE_CHECKING:
+
+        def __call__(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
+            """As :meth:`forward`."""
 
     @abstractmethod
     def forward(self, image: Tensor) -> DepthPrediction:

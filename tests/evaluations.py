@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.judge import OF_ALL
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
@@ -81,13 +80,10 @@ def judge(maps: Maps, references: Mapping[str, Tensor]) -> tuple[Record, dict[st
     curves: dict[str, Any] = metrics.curves()
     sums = {"metrics": dict(metrics.state_dict())}
     for name, confident in references.items() if variance is not None else ():
-        by_error, of_all = NLLByError(), NLLByError(**OF_ALL)
+        by_error = NLLByError()
         by_error.update(depth, variance, truth, confident)
-        of_all.add_levels(depth, variance, truth, variance)
-        curves |= {f"{curve}:{name}": value.tolist() for curve, value in by_error.compute().items()}
-        sums |= {
-            f"nll_by_error{kind}:{name}": dict(m.state_dict()) for kind, m in (("", by_error), ("_of_all", of_all))
-        }
+        curves[f"nll_by_error:{name}"] = by_error.compute()["nll_by_error"].tolist()
+        sums[f"nll_by_error:{name}"] = dict(by_error.state_dict())
     return Record("", "", "", "", "", figures=metrics.compute(), curves=curves), sums
 
 

@@ -13,6 +13,8 @@ from ufmstar_torch.segment import spgf
 PUBLIC = {
     "DepthPrediction",
     "GaussianMixture",
+    "LiveDepth",
+    "LiveResult",
     "AnchorConfig",
     "MergeConfig",
     "PosteriorConfig",

@@ -15,7 +15,8 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from ufmstar_torch.models import CheckpointError, atomic, load_state_dict_file, load_weights, save_checkpoint
+from ufmstar_torch import atomic
+from ufmstar_torch.models import CheckpointError, load_state_dict_file, load_weights, save_checkpoint
 
 FORMATS = ["w.pth", "w.pt", "w.safetensors"]
 

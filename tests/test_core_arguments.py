@@ -133,7 +133,6 @@ REFUSED = {
         lambda: DepthPrediction(DEPTH, DEPTH[:, 1:]), ValueError, "aleatoric_variance must have the depth's shape"
     ),
     "a map without knots": (lambda: Recalibration((), ()), ValueError, "Recalibration needs knots"),
-    "an unknown kind of map": (lambda: Recalibration((1.0,), (1.0,), kind="a"), ValueError, "Recalibration.kind must"),
 }  # fmt: skip
 
 

@@ -320,7 +320,7 @@ class TestErrors:
             (lambda: ECEDelta(1.0), "delta must lie"),
             (lambda: ECEQuantile([0.5, 0.5]), "levels must rise"),
             (lambda: EntropyHistogram(low=1.0, high=1.0), "low < high"),
-            (lambda: NLLByError(0), "percentiles, bins and levels must be >= 1"),
+            (lambda: NLLByError(0), "percentiles and bins must be >= 1"),
         ],
     )
     def test_settings(self, make: Callable[[], SumMetric], match: str) -> None:

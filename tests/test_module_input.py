@@ -30,25 +30,11 @@ def begun() -> UfMStar:
     return ufm
 
 
-def mean(**options) -> object:
-    return begun().mean_uncertainty(*frame(1), **options)
-
-
 settings, segment = UfMStarConfig.from_dict, SPGFConfig.from_dict
 # Of arguments that are no frame's: those are in test_core_arguments.py.
 REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: begun().reset([7]), "7"),
     (lambda: begun().reset(torch.tensor([True, False])), "mask"),
-    (lambda: begun().query(torch.zeros(2, 5, 3)), "points"),
-    (lambda: begun().query(torch.zeros(5, 3)), "points"),
-    (lambda: begun().query(torch.zeros(1, 5, 2)), "points"),
-    (lambda: begun().query(torch.zeros(1, 5, 3), frame="camera"), "frame"),
-    (lambda: UfMStar().query(torch.zeros(1, 5, 3)), "first"),
-    (lambda: mean(pixels=0), "pixels"),
-    (lambda: mean(pixels=H * W + 1), "pixels"),
-    (lambda: mean(fraction=0.0), "fraction"),
-    (lambda: mean(fraction=1.5), "fraction"),
-    (lambda: mean(pixels=5, fraction=0.5), "pixels or fraction"),
     (lambda: UfMStar().warm_up((0, 4)), "size and streams must be positive"),
     (lambda: settings({"eta": 0.0}), "eta"),
     (lambda: settings({"eta": 1.5}), "eta"),

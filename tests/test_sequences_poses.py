@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
-from ufmstar_torch.eval.sequences.poses import associate, interpolate_pose, read_pose, read_trajectory
+from ufmstar_torch.eval.sequences.poses import associate, read_pose, read_trajectory
+from ufmstar_torch.trajectory import Trajectory, interpolate_pose
 
 QUARTER = np.sqrt(0.5)
 # 90 degrees about z: x -> y, y -> -x.
@@ -114,6 +115,20 @@ def test_interpolation_is_linear_and_turns_evenly(tmp_path):
     np.testing.assert_allclose(T[:3, 3], [6.0, 0.5, -2.0], rtol=1e-12)
     np.testing.assert_allclose(T[:3, :3], Rotation.from_euler("z", 22.5, degrees=True).as_matrix(), atol=1e-12)
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
+
+
+def test_interpolated_rotations_are_slerp():
+    rng = np.random.default_rng(0)
+    turns = [np.zeros(3), 1e-9 * rng.normal(size=3), *rng.normal(size=(50, 3)), np.array([0, np.pi - 1e-7, 0])]
+    for turn in turns:
+        first = Rotation.random(random_state=1)
+        samples = Rotation.concatenate([first, first * Rotation.from_rotvec(turn)])
+        poses = np.tile(np.eye(4), (2, 1, 1))
+        poses[:, :3, :3] = samples.as_matrix()
+        for share in (0.1, 0.5, 0.8):
+            found = interpolate_pose(Trajectory(np.array([0.0, 1.0]), poses), share, 1.0)
+            np.testing.assert_allclose(found[:3, :3], Slerp([0, 1], samples)(share).as_matrix(), atol=1e-9)
+    assert interpolate_pose(Trajectory(np.zeros(0), np.zeros((0, 4, 4))), 0.0) is None
 
 
 def test_interpolation_needs_samples_around(tmp_path):

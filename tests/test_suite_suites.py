@@ -231,15 +231,6 @@ multiples = { "segment.line_thresh" = [1.0, 2.0] }
     assert "UfM*-FullEnsemble" in {row.method.name for row in own.rows}
 
 
-@pytest.mark.parametrize("name", ["paper-table-2", "paper-table-3", "ablation-anchors", "ablation-segmentation"])
-def test_a_suite_is_the_same_after_a_way_through_json(name):
-    suite = suite_named(name)
-    again = pickle.loads(pickle.dumps(suite))
-    assert again == suite
-    assert [row.title for row in again.rows] == [row.title for row in suite.rows]
-    assert again.rows == suite.rows
-
-
 @pytest.mark.parametrize(
     ("text", "told"),
     [

@@ -35,7 +35,7 @@ class Absent(MetaPathFinder):
 sys.meta_path.insert(0, Absent())
 import numpy as np, torch
 def trajectory():
-    from ufmstar_torch.eval.sequences import interpolate_pose
+    from ufmstar_torch.eval.sequences import read_trajectory
 def hugging_face():
     from ufmstar_torch.models import from_hugging_face
     from_hugging_face("a/b")
@@ -63,7 +63,7 @@ def test_every_package_of_an_extra_is_known():
     with (ROOT / "pyproject.toml").open("rb") as file:
         extras = tomllib.load(file)["project"]["optional-dependencies"]
     imported = {"opencv-python-headless": "cv2", "pillow": "PIL"}
-    for extra in ("models", "eval", "viz", "train", "energy", "cluster"):
+    for extra in ("models", "eval", "viz", "train", "energy", "cluster", "litert"):
         for line in extras[extra]:
             package = line.partition(">")[0].partition("[")[0]
             name = imported.get(package, package.replace("-", "_"))
@@ -78,7 +78,7 @@ def test_what_is_missing_without_extras_is_named():
     assert done.returncode == 0, said
     assert "tensor(" in said, said
     for who, package, extra in (
-        ("trajectory ufmstar_torch.eval.sequences.interpolate_pose", "scipy", "eval"),
+        ("trajectory ufmstar_torch.eval.sequences.read_trajectory", "scipy", "eval"),
         ("hugging_face", "transformers", "models"),
         ("ufmstar run: failed: this command", "scipy", "eval"),
     ):

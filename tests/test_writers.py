@@ -20,10 +20,10 @@ from hypothesis import strategies as st
 from PIL import Image
 from runs import read_summary
 
+from ufmstar_torch import atomic
 from ufmstar_torch.eval.run.files import to_json, write_atomic, write_json_atomic
 from ufmstar_torch.eval.run.writers import FULL, FrameWriter, encode_length_png, fitting_unit, read_frame
 from ufmstar_torch.eval.sequences.images import read_depth, read_map
-from ufmstar_torch.models import atomic
 
 
 def frame(seed=0, far=8.0):

@@ -23,7 +23,7 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from ufmstar_torch.models.atomic import write_atomic
+from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.train.module import FIGURES_KEY
 
 NAME = "last.ckpt"

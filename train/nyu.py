@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.eval.sequences.intrinsics import pinhole, scale_intrinsics
 from ufmstar_torch.eval.sequences.nyu import INTRINSICS, NATIVE_SIZE, PARTS, part_files, read_h5
-from ufmstar_torch.models.atomic import write_atomic
 from ufmstar_torch.train.samples import RawSample, SampleError
 
 if TYPE_CHECKING:

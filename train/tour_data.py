@@ -27,9 +27,9 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.array_files import read_npy
+from ufmstar_torch.atomic import write_together
 from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.eval.tour.style import style_of
-from ufmstar_torch.models.atomic import write_together
 from ufmstar_torch.train.samples import RawSample, SampleError
 
 _LOG = logging.getLogger(__name__)

@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.config import PosteriorConfig as PosteriorConfig
     from ufmstar_torch.config import SPGFConfig as SPGFConfig
     from ufmstar_torch.config import UfMStarConfig as UfMStarConfig
+    from ufmstar_torch.live import LiveDepth as LiveDepth
+    from ufmstar_torch.live import LiveResult as LiveResult
     from ufmstar_torch.mixture import GaussianMixture as GaussianMixture
     from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
     from ufmstar_torch.pipeline import UncertainDepth as UncertainDepth
@@ -24,6 +26,8 @@ __all__ = [
     "AnchorConfig",
     "DepthPrediction",
     "GaussianMixture",
+    "LiveDepth",
+    "LiveResult",
     "MergeConfig",
     "PosteriorConfig",
     "Recalibration",

@@ -4,7 +4,7 @@ and device, each with one wording."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias, cast
 
 import numpy as np
 import torch
@@ -15,7 +15,19 @@ Shapes = Sequence[tuple[int, ...]]
 Array: TypeAlias = Tensor | NDArray[Any]
 # An image may also be Pillow's, and intrinsics four numbers.
 ImageLike: TypeAlias = Any
-CameraLike: TypeAlias = Tensor | NDArray[Any] | Sequence[float]
+CameraLike: TypeAlias = "Tensor | NDArray[Any] | Sequence[float] | PinholeCamera"
+
+
+class PinholeCamera(Protocol):
+    """kornia's camera: a pose and intrinsics in one; it may be given as both."""
+
+    @property
+    def extrinsics(self) -> Tensor:
+        """[B, 4, 4] world-to-camera [m]."""
+
+    @property
+    def intrinsics(self) -> Tensor:
+        """[B, 4, 4] [px], first pixel's centre at (0, 0)."""
 
 
 def as_tensor(name: str, value: object) -> Tensor:
@@ -59,12 +71,18 @@ def as_image(image: ImageLike) -> Tensor:
 
 
 def as_pose(pose: CameraLike) -> Tensor:
-    """[B, 4, 4] or [4, 4] camera-to-world of such a matrix, or of one without its last row [..., 3, 4].
+    """[B, 4, 4] or [4, 4] camera-to-world of such a matrix, of one without its last row [..., 3, 4], or of a
+    :class:`PinholeCamera`, whose world-to-camera matrix is inverted.
 
     Raises:
         TypeError: something else.
         ValueError: another shape.
     """
+    if (camera := _camera(pose)) is not None:
+        T_cam_world = require_float("pose.extrinsics", camera.extrinsics)
+        if T_cam_world.dim() != 3 or T_cam_world.shape[1:] != (4, 4):
+            raise ValueError(f"pose.extrinsics must be [B, 4, 4] world-to-camera, got {tuple(T_cam_world.shape)}")
+        return torch.linalg.inv_ex(T_cam_world.double()).inverse  # a singular one becomes infinite: not rigid
     T = _numbers("pose", pose)
     if T.dim() in (2, 3) and T.shape[-2:] == (3, 4):
         return torch.cat([T, T.new_tensor([[0.0, 0.0, 0.0, 1.0]]).expand(*T.shape[:-2], 1, 4)], dim=-2)
@@ -74,14 +92,17 @@ def as_pose(pose: CameraLike) -> Tensor:
 
 
 def as_intrinsics(intrinsics: CameraLike) -> Tensor:
-    """[B, 3, 3] or [3, 3] of such a matrix, of one beside an empty fourth row and column [..., 4, 4], or of the four
-    numbers fx, fy, cx, cy [px].
+    """[B, 3, 3] or [3, 3] of such a matrix, of one beside an empty fourth row and column [..., 4, 4], of the four
+    numbers fx, fy, cx, cy [px], or of a :class:`PinholeCamera`.
 
     Raises:
         TypeError: something else.
         ValueError: another shape, or a fourth row or column that is not empty.
     """
-    K = _numbers("intrinsics", intrinsics)
+    camera = _camera(intrinsics)
+    K = _numbers("intrinsics", intrinsics if camera is None else camera.intrinsics)
+    if camera is not None and K.shape[-2:] == (4, 4):
+        K = K[..., :3, :3]  # the rest of kornia's matrix is not read by kornia either
     if K.shape == (4,):
         (fx, fy, cx, cy), zero, one = K, K.new_zeros(()), K.new_ones(())
         return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).view(3, 3)
@@ -92,6 +113,12 @@ def as_intrinsics(intrinsics: CameraLike) -> Tensor:
     if K.dim() not in (2, 3) or K.shape[-2:] != (3, 3):
         raise ValueError(f"intrinsics must be [B, 3, 3], [3, 3] or fx, fy, cx, cy, got {tuple(K.shape)}")
     return K
+
+
+def _camera(value: object) -> PinholeCamera | None:
+    """A camera of kornia, which need not be imported for that; None: something else."""
+    known = any(cls.__name__ == "PinholeCamera" and cls.__module__.startswith("kornia.") for cls in type(value).__mro__)
+    return cast("PinholeCamera", value) if known else None
 
 
 def _numbers(name: str, value: object) -> Tensor:

@@ -2,8 +2,8 @@
 
 For the figure of NLL by error, the paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is
 confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, the share ``confident``
-of the reference's pixels with the smallest variance, of every frame, and of all sequences with one threshold. All rows
-on the same frames are judged on the same pixels.
+of the reference's pixels with the smallest variance, of every frame. All rows on the same frames are judged on the same
+pixels.
 """
 
 from __future__ import annotations
@@ -30,9 +30,7 @@ if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence with
 # Names of a run's figures: UfM*, beside it the network alone, and the posterior if there is one.
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Names of a row's sums.
-METRICS, BY_ERROR, BY_ERROR_OF_ALL = "metrics", "nll_by_error", "nll_by_error_of_all"
-# Of the sums with one threshold: variances within 60 % of each other share a level, errors within 11 % a bin.
-OF_ALL = {"levels": 60, "bins": 128}
+METRICS, BY_ERROR = "metrics", "nll_by_error"
 
 
 class SequenceError(Exception):
@@ -98,8 +96,8 @@ class RowFigures:
     curves: dict[str, Any]
     state: dict[str, float]
     ms: dict[str, float]
-    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``), "nll_by_error:REFERENCE"
-    # and "nll_by_error_of_all:REFERENCE" (``NLLByError``), to be added up over sequences.
+    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and "nll_by_error:REFERENCE"
+    # (``NLLByError``), to be added up over sequences.
     sums: dict[str, dict[str, Tensor]]
 
 
@@ -115,20 +113,13 @@ class RowJudge:
         self._ms: list[Mapping[str, float]] = []
         self._memory: list[Mapping[str, float]] = []
 
-    def add(
-        self,
-        result: RowResult,
-        memory: Mapping[str, float],
-        masks: Mapping[str, Tensor],
-        rows: Mapping[str, RowResult],
-    ) -> None:
+    def add(self, result: RowResult, memory: Mapping[str, float], masks: Mapping[str, Tensor]) -> None:
         """Add a frame. Pixels that the row leaves out are NaN, not masked, so that the metrics count them.
 
         Args:
             result: of this row.
             memory: of its estimator after the frame.
             masks: confident pixels by reference.
-            rows: results of all rows by key.
         """
         if result.statistics is not None:
             segments, matched = (int(count[0]) for count in (result.statistics.segments, result.statistics.matched))
@@ -151,11 +142,6 @@ class RowJudge:
         for other, name in self.named.items():
             by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
             by_error.update(depth, variance, target, masks[other])
-            of_all = NLLByError(**OF_ALL, sync_on_compute=False)
-            of_all = self._by_error.setdefault(f"{BY_ERROR_OF_ALL}:{name}", of_all)
-            reference = rows[other]
-            assert reference.variance is not None
-            of_all.add_levels(depth, variance, target, torch.where(reference.valid, reference.variance, torch.nan))
 
     def figures(self) -> RowFigures:
         """The figures after the last frame. Raises SequenceError: no frame was judged."""
@@ -168,9 +154,7 @@ class RowJudge:
         curves: dict[str, Any] = metrics.curves()
         sums = {METRICS: metrics.state_dict()}
         for name, by_error in self._by_error.items():
-            kind, _, reference = name.partition(":")
-            if kind == BY_ERROR:
-                curves |= {f"{curve}:{reference}": values.tolist() for curve, values in by_error.compute().items()}
+            curves[name] = by_error.compute()["nll_by_error"].tolist()
             sums[name] = by_error.state_dict()
         stages = ("network", "anchors", "uncertainty")
         times = {stage: [ms[stage] for ms in self._ms if stage in ms] for stage in stages}
@@ -215,7 +199,7 @@ class RowJudges(FrameSink):
         expected = {other for key in judged for other in self._judges[key].named}
         masks = {other: confident_pixels(result.rows[other], self._confident) for other in expected}
         for key, row in result.rows.items():
-            self._judges[key].add(row, self._estimators[key].memory(), masks, result.rows)
+            self._judges[key].add(row, self._estimators[key].memory(), masks)
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:

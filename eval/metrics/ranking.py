@@ -7,14 +7,13 @@ of one bin count as ties. Each class states a bound on the error that this makes
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric, flat_pixels
-from ufmstar_torch.eval.metrics.pixel_sums import HIGH, LOW, add_joint, add_nll_by_error, add_sparsification
+from ufmstar_torch.eval.metrics.base import SumMetric
+from ufmstar_torch.eval.metrics.pixel_sums import add_joint, add_nll_by_error, add_sparsification
 
 # In the logarithm of the variance or of the error; of both together: 5.5 % in variance, 2 MB of counts.
 BINS, JOINT_BINS = 4096, 512
@@ -119,52 +118,28 @@ class NLLByError(SumMetric):
 
     The paper looks at pixels where another method is confident: pass these as ``valid``, and the same
     ones for every method that is compared.
-    ``compute()``: curves [percentiles] ``nll_by_error``, mean NLL over v > 0, and
-    ``error_by_error``, mean |d - g| [m], of the pixels between one percentile and the next, NaN without a
-    pixel. Errors that agree within a bin (4096 bins of squared error: .35 % of the error) count as equal.
-
-    With ``levels``, the threshold of confidence is chosen after all sequences: :meth:`add_levels` counts the pixels by
-    the level of the other method's variance, and ``compute()`` takes the share ``confident`` with the lowest (of the
-    level at the threshold a part, as if its pixels were in random order).
+    ``compute()``: curve [percentiles] ``nll_by_error``, mean NLL over v > 0 of the pixels between one percentile and
+    the next, NaN without a pixel. Errors that agree within a bin (4096 bins of squared error: .35 % of the error)
+    count as equal.
 
     Args:
         percentiles: number of groups of equal size; 10 = deciles.
         bins: of the logarithm of the squared error.
-        levels: of the other method's variance.
-        confident: share of the pixels that is judged.
     """
 
     OF_VARIANCE = "NLL by error"
     ADD = add_nll_by_error
 
-    def __init__(
-        self, percentiles: int = 10, bins: int = 4096, levels: int = 1, confident: float = 1.0, **kwargs: Any
-    ) -> None:
-        if min(percentiles, bins, levels) < 1:
-            raise ValueError(f"percentiles, bins and levels must be >= 1, got {percentiles}, {bins} and {levels}")
-        settings = {"percentiles": percentiles, "bins": bins, "levels": levels, "confident": confident}
-        super().__init__(settings, **kwargs)
-        self.percentiles, self.levels, self.confident = percentiles, levels, confident
-        self.add_counts("count", shape=(levels, bins + 2))
-        self.add_sums("nll", "error", shape=(levels, bins + 2))
-
-    def add_levels(self, depth: Tensor, variance: Tensor, target: Tensor, confidence: Tensor) -> None:
-        """Add frames [...]; ``confidence`` [...] is the other method's variance [m^2], NaN where it is not to count."""
-        used = confidence >= 0
-        level = (torch.where(used, confidence, LOW).clamp(LOW, HIGH) / LOW).log() * (self.levels / math.log(HIGH / LOW))
-        level = torch.where(used, level.long().clamp(max=self.levels - 1) + 1, 0)
-        self.add(flat_pixels(depth, variance, target)._replace(use=level.cpu().flatten().numpy()))
+    def __init__(self, percentiles: int = 10, bins: int = 4096, **kwargs: Any) -> None:
+        if min(percentiles, bins) < 1:
+            raise ValueError(f"percentiles and bins must be >= 1, got {percentiles} and {bins}")
+        super().__init__({"percentiles": percentiles, "bins": bins}, **kwargs)
+        self.percentiles = percentiles
+        self.add_counts("count", shape=(bins + 2,))
+        self.add_sums("nll", shape=(bins + 2,))
 
     def compute(self) -> dict[str, Tensor]:
         steps = torch.arange(1, self.percentiles + 1, dtype=torch.float64, device=self.count.device)
         kept = steps / self.percentiles
-        pixels = self.count.double().sum(1)
-        upto = pixels.cumsum(0)
-        part = ((self.confident * upto[-1] - upto + pixels) / pixels.clamp(min=1)).clamp(0, 1)
-        count, nll, error = (part @ value.double() for value in (self.count, self.nll, self.error))
-        return {"nll_by_error": self._groups(count, nll, kept), "error_by_error": self._groups(count, error, kept)}
-
-    def _groups(self, count: Tensor, total: Tensor, kept: Tensor) -> Tensor:
-        """[percentiles] mean of each group, from the sums up to its end."""
-        upto = mean_of_share(count, total, kept) * kept
-        return torch.diff(upto, prepend=upto.new_zeros(1)) * self.percentiles
+        upto = mean_of_share(self.count, self.nll, kept) * kept
+        return {"nll_by_error": torch.diff(upto, prepend=upto.new_zeros(1)) * self.percentiles}

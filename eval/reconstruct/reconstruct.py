@@ -24,8 +24,8 @@ from ufmstar_torch.eval.sequences.attach import attach
 from ufmstar_torch.eval.sequences.colmap import SCALE_FILE
 from ufmstar_torch.eval.sequences.frame import Entry
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import Trajectory
 from ufmstar_torch.optional import optional
+from ufmstar_torch.trajectory import Trajectory
 
 # Up to so many keyframes, all pairs are matched; of more, each with the next ten and those 16, 32, ... 512 later.
 _ALL_PAIRS = 60

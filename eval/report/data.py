@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.judge import BY_ERROR_OF_ALL, METRICS, OF_ALL
+from ufmstar_torch.eval.engine.judge import METRICS
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.methods.setting import Setting
@@ -54,7 +54,7 @@ class Merged(NamedTuple):
     """Several sequences evaluated as one, every pixel with the same weight."""
 
     figures: Mapping[str, float]  # SequenceMetrics.compute()
-    curves: Mapping[str, list[float]]  # its curves(), "nll_by_error:REFERENCE" and "nll_by_error_of_all:REFERENCE"
+    curves: Mapping[str, list[float]]  # its curves(), and "nll_by_error:REFERENCE"
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def load_results(out: Path, *, with_sums: bool = True) -> Results:
     by_path = dict(sorted(by_path.items(), key=place))
     _check(out, about, by_path)
     records, failed = tuple(by_path.values()), _failed(out)
-    merged, notes = _merged(by_path, about) if with_sums else ({}, [])
+    merged, notes = _merged(by_path) if with_sums else ({}, [])
     missing, efficiency = _missing(about, records, failed), _read_json(out / "efficiency.json")
     return Results(out, about, records, merged, failed, missing, efficiency, tuple(notes))
 
@@ -255,9 +255,7 @@ def _missing(
 # ---- sums over sequences ----
 
 
-def _merged(
-    records: Mapping[Path, Record], about: Mapping[str, Any]
-) -> tuple[dict[tuple[str, Row], Merged], list[str]]:
+def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Merged], list[str]]:
     """Sums of each (dataset, row), added in the order of the sequences; a note where a file is missing."""
     groups: dict[tuple[str, Row], list[Path]] = {}
     for path, record in records.items():
@@ -275,7 +273,7 @@ def _merged(
                 if {key: value.shape for key, value in mine.items()} != {k: v.shape for k, v in states.items()}:
                     raise ResultsError(f"{path} holds sums of other metrics than the sequences before it ({name})")
                 total[name] = {key: mine[key] + value for key, value in states.items()}
-        merged[dataset, row] = _compute(total, files[0], about)
+        merged[dataset, row] = _compute(total, files[0])
     return merged, notes
 
 
@@ -290,7 +288,7 @@ def read_sums(path: Path) -> Sums:
     return {name: {key: unpack(value) for key, value in states.items()} for name, states in sums.items()}
 
 
-def _compute(total: Sums, file: Path, about: Mapping[str, Any]) -> Merged:
+def _compute(total: Sums, file: Path) -> Merged:
     """Figures and curves of summed states; ``file`` is named in errors."""
     from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 
@@ -299,10 +297,7 @@ def _compute(total: Sums, file: Path, about: Mapping[str, Any]) -> Merged:
     many = "NLL" in kinds and states["metrics.ECEDelta.pixels"].numel() == 100
     bins = "authors" if many else "ours"
     metrics = SequenceMetrics(with_variance="NLL" in kinds, ranking="Sparsification" in kinds, bins=bins)
-    of_all = {**OF_ALL, "confident": (about.get("settings") or {}).get("confident", 0.5)}
-    by_error = {
-        name: NLLByError(**(of_all if name.startswith(BY_ERROR_OF_ALL) else {})) for name in total if name != METRICS
-    }
+    by_error = {name: NLLByError() for name in total if name != METRICS}
     try:
         metrics.load_state_dict(dict(states))
         for name, metric in by_error.items():

@@ -1,4 +1,4 @@
-"""Strict JSON, and the files that are complete or absent (``ufmstar_torch.models.atomic``)."""
+"""Strict JSON, and the files that are complete or absent (``ufmstar_torch.atomic``)."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ufmstar_torch.models.atomic import remove_temporaries as remove_temporaries
-from ufmstar_torch.models.atomic import write_atomic as write_atomic
-from ufmstar_torch.models.atomic import write_together as write_together
+from ufmstar_torch.atomic import remove_temporaries as remove_temporaries
+from ufmstar_torch.atomic import write_atomic as write_atomic
+from ufmstar_torch.atomic import write_together as write_together
 
 
 def write_json_atomic(path: Path, data: Mapping[str, Any]) -> None:

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.sequences.layout import find_sequences as find_sequences
     from ufmstar_torch.eval.sequences.open import open_sequence as open_sequence
     from ufmstar_torch.eval.sequences.poses import CONVENTIONS as CONVENTIONS
-    from ufmstar_torch.eval.sequences.poses import Trajectory as Trajectory
-    from ufmstar_torch.eval.sequences.poses import interpolate_pose as interpolate_pose
     from ufmstar_torch.eval.sequences.poses import read_trajectory as read_trajectory
+    from ufmstar_torch.trajectory import Trajectory as Trajectory
+    from ufmstar_torch.trajectory import interpolate_pose as interpolate_pose
 else:
     __getattr__, __dir__ = lazy_names(__name__)

@@ -18,7 +18,8 @@ import numpy as np
 from ufmstar_torch.eval.sequences.frame import Entry, Loader, Skipped
 from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, list_files, read_color
 from ufmstar_torch.eval.sequences.options import Options, resolve
-from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate_pose, read_pose, read_trajectory
+from ufmstar_torch.eval.sequences.poses import read_pose, read_trajectory
+from ufmstar_torch.trajectory import Trajectory, interpolate_pose
 
 # Integer timestamps as file names: EuRoC and ROS write nanoseconds, some cameras microseconds [units/s].
 _NANOSECONDS_ABOVE, _MICROSECONDS_ABOVE = 1e17, 1e14

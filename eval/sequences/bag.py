@@ -21,8 +21,9 @@ from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Skipped
 from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import associate, interpolate_pose
+from ufmstar_torch.eval.sequences.poses import associate
 from ufmstar_torch.optional import optional
+from ufmstar_torch.trajectory import interpolate_pose
 
 LOOKED_FOR = "a .bag, .db3 or .mcap file, or a folder that holds one"
 _SUFFIXES = (".bag", ".db3", ".mcap")

@@ -1,4 +1,4 @@
-"""Poses: conventions, reading of trajectories in the common text formats, interpolation, association by timestamp.
+"""Poses: conventions, reading of trajectories in the common text formats, association by timestamp.
 
 All poses are camera-to-world. The number of columns of a line is the format:
 
@@ -16,22 +16,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
+
+from ufmstar_torch.trajectory import Trajectory
 
 # TUM writes quaternions with four decimals, which leaves the norm within 2e-4 of 1; a hundred times that
 # is no rounding any more but another column order or unit.
 _QUATERNION_TOLERANCE = 0.02
-# An image this close to a sample takes its pose as it is, whatever the gap around it [s]: timestamps are
-# printed with four to six decimals, and at 1 m/s the camera moves 1 mm in that time.
-_SAME_TIME = 1e-3
-# An image between samples that are too far apart, or outside the trajectory, takes a sample this close as it is [s]:
-# a camera at 1 m/s is 5 mm away from it.
-_NEAREST = 5e-3
 # Two poses with one timestamp are alike up to this distance [the poses' unit], or the median step between samples if
 # that is larger (rounded timestamps), and this angle [degrees].
 _SAME_PLACE, _SAME_DIRECTION = 0.01, 2.0
@@ -59,19 +54,6 @@ CONVENTIONS = {
         "camera-to-world with OpenGL axes (x right, y up, z backward)", lambda T: T @ _OPENGL_FROM_CAMERA
     ),
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """Camera-to-world poses, in order."""
-
-    # [N] float64, strictly increasing [s] (or frame numbers, if the file has those), or None where pose i belongs to
-    # frame i.
-    timestamps: np.ndarray | None
-    T_world_cam: np.ndarray  # [N, 4, 4] float64; a pose that was not finite in the file is all NaN
-
-    def __len__(self) -> int:
-        return len(self.T_world_cam)
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
@@ -102,46 +84,12 @@ def read_trajectory(path: str | Path) -> Trajectory:
         bad = np.flatnonzero(~np.isfinite(timestamps))
         if bad.size:
             raise ValueError(f"{lines[bad[0]]}: the timestamp must be finite, got {timestamps[bad[0]]}")
-    T_world_cam = _poses_from_columns(values, lines)
+    T_world_cam = poses_from_columns(values, lines)
     if timestamps is not None:
         stamps, first, same = np.unique(timestamps, return_index=True, return_inverse=True)
         _require_consistent(T_world_cam, first, same, lines)
         timestamps, T_world_cam = stamps, T_world_cam[first]
     return Trajectory(timestamps, T_world_cam)
-
-
-def interpolate_pose(trajectory: Trajectory, time: float, max_gap: float = 0.1) -> np.ndarray | None:
-    """The camera-to-world pose [4, 4] at ``time`` [s], between the samples before and after it.
-
-    The position is interpolated linearly, the rotation along the shortest arc (slerp). A sample within 1 ms is taken as
-    it is; and where the samples before and after lie more than ``max_gap`` [s] apart, or one of them is missing at the
-    end of the trajectory, one within 5 ms. NaN where a sample that is needed is not finite.
-
-    Returns:
-        The pose; None where there is none.
-
-    Raises:
-        ValueError: the trajectory has no timestamps.
-    """
-    times = trajectory.timestamps
-    if times is None:
-        raise ValueError("trajectory has no timestamps, so it cannot be interpolated")
-    after = int(np.searchsorted(times, time))
-    around = [i for i in (after - 1, after) if 0 <= i < len(times)]
-    nearest = min(around, key=lambda i: abs(times[i] - time))
-    if abs(times[nearest] - time) <= _SAME_TIME:
-        return trajectory.T_world_cam[nearest].copy()
-    if len(around) < 2 or times[after] - times[after - 1] > max_gap:
-        return trajectory.T_world_cam[nearest].copy() if abs(times[nearest] - time) <= _NEAREST else None
-    first, second = trajectory.T_world_cam[after - 1], trajectory.T_world_cam[after]
-    if not (np.isfinite(first).all() and np.isfinite(second).all()):
-        return np.full((4, 4), np.nan)
-    share = (time - times[after - 1]) / (times[after] - times[after - 1])
-    turn = Slerp([0.0, 1.0], Rotation.from_matrix([first[:3, :3], second[:3, :3]]))
-    T = np.eye(4)
-    T[:3, :3] = turn(share).as_matrix()
-    T[:3, 3] = (1 - share) * first[:3, 3] + share * second[:3, 3]
-    return T
 
 
 def associate(first: np.ndarray, second: np.ndarray, max_difference: float) -> dict[int, int]:
@@ -182,7 +130,7 @@ def read_pose(path: str | Path) -> np.ndarray:
     T = read_matrix(path)
     if T.shape != (4, 4):
         raise ValueError(f"{path}: expected a 4x4 matrix, got {' x '.join(map(str, T.shape))} numbers")
-    return _poses_from_columns(T.reshape(1, 16), [str(path)])[0]
+    return poses_from_columns(T.reshape(1, 16), [str(path)])[0]
 
 
 def poses_from_quaternions(position: np.ndarray, quaternion_xyzw: np.ndarray) -> np.ndarray:
@@ -201,8 +149,28 @@ def numbered_lines(path: str | Path) -> list[tuple[int, str]]:
         raise ValueError(f"{path}: expected a text file, got bytes that are none: {error.reason}") from error
 
 
-def _poses_from_columns(values: np.ndarray, lines: list[str]) -> np.ndarray:
-    """[N, 4, 4] from rows of 7 (position, quaternion), 12 or 16 numbers; non-finite rows become NaN."""
+def csv_rows(path: str | Path) -> list[tuple[list[str], str]]:
+    """The words of each line that has any, and FILE:LINE of each, of a table with commas; ``#`` starts a comment line.
+    Raises ValueError: it is no text file."""
+    lines = ((text.strip(), f"{path}:{number}") for number, text in numbered_lines(path))
+    return [
+        ([word.strip() for word in text.replace(";", ",").split(",")], where)
+        for text, where in lines
+        if text and not text.startswith("#")
+    ]
+
+
+def csv_numbers(words: list[str], where: str) -> list[float]:
+    """The words of :func:`csv_rows` as numbers. Raises ValueError: one is none."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        raise ValueError(f"{where}: expected numbers separated by commas, got {','.join(words)[:60]!r}") from None
+
+
+def poses_from_columns(values: np.ndarray, lines: list[str]) -> np.ndarray:
+    """[N, 4, 4] from rows of 7 (position, quaternion), 12 or 16 numbers; non-finite rows become NaN. Raises ValueError:
+    no rotation in a row, whose FILE:LINE is in ``lines``."""
     T = np.full((len(values), 4, 4), np.nan)
     finite = np.isfinite(values).all(axis=1)
     if values.shape[1] == 7:
@@ -266,4 +234,4 @@ def _number(token: str, where: str) -> float:
     try:
         return float(token)
     except ValueError:
-        raise ValueError(f"{where}: expected a number, got {token!r}") from None
+        raise ValueError(f"{where}: expected a number, got {token[:60]!r}") from None

@@ -18,7 +18,8 @@ from PIL import Image
 from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.eval.sequences.images import positive, read_color
 from ufmstar_torch.eval.sequences.lens import Lens
-from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate_pose, poses_from_quaternions
+from ufmstar_torch.eval.sequences.poses import poses_from_quaternions
+from ufmstar_torch.trajectory import Trajectory, interpolate_pose
 
 DEPTH_ENCODINGS = {"16UC1": "u2", "32FC1": "f4"}
 COMPRESSED_DEPTH = "compressedDepth"

@@ -28,8 +28,7 @@ class Record:
     frames: Mapping[str, Any] = field(default_factory=dict)
     # ``SequenceMetrics.compute()``: "delta1", "nll", "ece_delta", ... (NaN is kept as None).
     figures: Mapping[str, float | None] = field(default_factory=dict)
-    # ``SequenceMetrics.curves()``, and "nll_by_error:REFERENCE", "error_by_error:REFERENCE" over the pixels of which
-    # the method REFERENCE is confident.
+    # ``SequenceMetrics.curves()``, and "nll_by_error:REFERENCE" over the pixels of which REFERENCE is confident.
     curves: Mapping[str, Any] = field(default_factory=dict)
     # of the multiview method: "bytes_mean", "bytes_max", "bytes_end" [B], "count_mean", "count_max", "count_end"
     # (points or components), "smoothing_bytes" (the map kept for smoothing) [B]; {} if alone.

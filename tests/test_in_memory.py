@@ -1,0 +1,147 @@
+"""What is in memory already as input: kornia's camera, models and pipelines of ``transformers``, ``torch.hub``."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import transformers
+from depth_anything_files import write_depth_anything, write_other
+from modules import CONFIG, H, K, W, frame, same
+from PIL import Image
+from torch import nn
+
+from ufmstar_torch import UfMStar, UncertainDepth
+from ufmstar_torch.models import Preprocess, from_hugging_face, wrap_network
+
+DEPTH, POSE, _ = frame(3)
+K4 = torch.eye(4, dtype=torch.float64)
+K4[:3, :3] = K
+IMAGES = torch.randint(0, 256, (2, 3, 48, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+CAMERA = torch.tensor([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]])
+
+
+def kornia_camera(extrinsics, intrinsics=K4):
+    camera = pytest.importorskip("kornia.geometry.camera").PinholeCamera
+    size = (torch.tensor([float(n)]).expand(len(extrinsics)) for n in (H, W))
+    return camera(intrinsics.expand_as(extrinsics).to(extrinsics), extrinsics, *size)
+
+
+def test_kornias_camera_is_pose_and_intrinsics():
+    """Its matrix is world-to-camera; it may be given once for both arguments, also to ``UncertainDepth``."""
+    camera = kornia_camera(torch.linalg.inv(POSE.double()))
+    expected = UfMStar(CONFIG)(DEPTH, POSE, K)
+    torch.testing.assert_close(UfMStar(CONFIG)(DEPTH, camera, camera).variance, expected.variance, equal_nan=True)
+    network = wrap_network(lambda x: 1 + x.mean(1))
+    model, twin = (UncertainDepth(network, CONFIG, preprocess=network.preprocess) for _ in range(2))
+    image = torch.rand(1, 3, H, W, generator=torch.Generator().manual_seed(0))
+    assert same(model(image, camera, camera).intrinsics, twin(image, POSE, K).intrinsics)
+    for T, message in ((2 * torch.eye(4)[None], "not orthonormal|last row"), (torch.zeros(1, 4, 4), "NaN or infinity")):
+        with pytest.raises(ValueError, match=f"stream 0: pose .*({message})"):
+            UfMStar(CONFIG)(DEPTH, kornia_camera(T), K)
+    with pytest.raises(ValueError, match=r"pose.extrinsics must be \[B, 4, 4\] world-to-camera"):
+        UfMStar(CONFIG)(DEPTH, kornia_camera(torch.eye(4).expand(1, 2, 4, 4)), K)
+
+
+@pytest.mark.parametrize("architecture", ["depth_anything", "depth_pro", "dpt", "glpn", "zoedepth"])
+def test_a_model_in_memory_is_its_checkpoint(tmp_path, architecture):
+    folder = tmp_path / architecture
+    published = architecture == "depth_anything"
+    write_depth_anything(folder, "metric") if published else write_other(folder, architecture)
+    stored = from_hugging_face(folder, kind="metric", **({} if published else {"size": (64, 64)}))
+    model = transformers.AutoModelForDepthEstimation.from_pretrained(folder)
+    network = wrap_network(model, preprocess=stored.preprocess)
+    x, _ = stored.preprocess(IMAGES, CAMERA)
+    with torch.no_grad():
+        assert torch.equal(network(x).depth, stored(x).depth)
+    assert network.max_depth == stored.max_depth
+
+
+def test_a_pipeline_brings_its_image_processor(tmp_path):
+    folder = write_depth_anything(tmp_path / "n", "metric")
+    pipe = transformers.pipeline("depth-estimation", model=str(folder))
+    network, stored = wrap_network(pipe), from_hugging_face(folder)
+    assert network.preprocess == stored.preprocess
+    assert wrap_network(pipe.model, preprocess=pipe.image_processor).preprocess == stored.preprocess
+    image = IMAGES[0].permute(1, 2, 0).numpy()
+    with torch.no_grad():
+        depth = network(network.preprocess(image, CAMERA)[0]).depth
+        expected = pipe(Image.fromarray(image))["predicted_depth"]
+    torch.testing.assert_close(depth.mean(), expected.mean(), rtol=0.05, atol=0)
+    assert UncertainDepth(network, CONFIG, preprocess=network.preprocess)(image, torch.eye(4), CAMERA).depth.mean() > 0
+
+
+def test_depth_pro_takes_the_cameras_focal_length(tmp_path):
+    """inverse depth [1/m] times fx/W, whatever the field of view that the network estimates, if any."""
+    folder = write_other(tmp_path / "n", "depth_pro", use_fov_model=False)
+    model = transformers.AutoModelForDepthEstimation.from_pretrained(folder)
+    with pytest.raises(ValueError, match=r"not the field of view .*declare takes_intrinsics=True"):
+        wrap_network(model)
+    network = wrap_network(model, takes_intrinsics=True, preprocess=Preprocess(size=(64, 64)))
+    x, K_net = network.preprocess(IMAGES, CAMERA)
+    near, far = (network(x, K_net * torch.tensor([[f], [f], [1.0]])).depth for f in (1.0, 2.0))
+    raw = model(pixel_values=x).predicted_depth[:, None] * 64 / float(K_net[0, 0])
+    expected = 1 / nn.functional.interpolate(raw, (64, 64), mode="bilinear")[:, 0]
+    inside = (near > 2e-4) & (near < 5e3)
+    torch.testing.assert_close(near[inside], expected[inside])
+    torch.testing.assert_close(far[inside], 2 * near[inside])
+    with pytest.raises(ValueError, match=r"call network\(x, K\)"):
+        network(x)
+
+
+def test_a_model_of_torch_hub_is_a_module(tmp_path):
+    """``torch.hub.load`` returns what its repository's function does: a module."""
+    (tmp_path / "hubconf.py").write_text("import torch\ndef depth():\n    return torch.nn.Conv2d(3, 1, 1)\n")
+    model = torch.hub.load(str(tmp_path), "depth", source="local")
+    network = wrap_network(model, preprocess=Preprocess(size=(24, 32)))
+    x, _ = network.preprocess(IMAGES, CAMERA)
+    assert torch.equal(network(x).depth, model(x)[:, 0])
+
+
+def glpn():
+    small = {"depths": [1] * 4, "hidden_sizes": [8] * 4, "num_attention_heads": [1] * 4, "decoder_hidden_size": 8}
+    return transformers.GLPNConfig(**small)
+
+
+def tiny():
+    return transformers.GLPNForDepthEstimation(glpn()).eval()
+
+
+REFUSED = {
+    "a class": (lambda: wrap_network(nn.ReLU), TypeError, r"got the class ReLU: give an instance, ReLU\(...\)"),
+    "a name": (lambda: wrap_network("glpn-nyu"), TypeError, "got str 'glpn-nyu': load it, as load_network"),
+    "weights": (lambda: wrap_network(nn.ReLU().state_dict()), TypeError, "weights need their network"),
+    "several": (lambda: wrap_network([nn.ReLU()]), TypeError, "several networks are a list of wrapped ones"),
+    "a size": (lambda: wrap_network(nn.ReLU(), preprocess=(224, 224)), TypeError, "preprocess must be a Preprocess"),
+    "features": (
+        lambda: wrap_network(transformers.GLPNModel(glpn())), TypeError, "a ...ForDepthEstimation .*got GLPNModel"
+    ),
+    "no processor": (
+        lambda: wrap_network(tiny()), ValueError, "does not say what its input needs"
+    ),
+    "two declarations": (
+        lambda: wrap_network(tiny(), focal=300.0), ValueError, "only scale, takes_int"
+    ),
+    "another's camera": (
+        lambda: wrap_network(tiny(), takes_intrinsics=True),
+        ValueError, "takes_intrinsics goes with Depth Pro",
+    ),
+    "a raw model": (
+        lambda: UncertainDepth(tiny())(IMAGES[:1, :, :32, :32] / 255, torch.eye(4), CAMERA),
+        TypeError, "got DepthEstimatorOutput: wrap it with",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "error", "message"), REFUSED.values(), ids=REFUSED)
+def test_every_other_kind_is_refused(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_other_tasks_and_relative_models_are_refused(tmp_path):
+    pipe = transformers.pipeline("depth-estimation", model=str(write_depth_anything(tmp_path / "n", "relative")))
+    with pytest.raises(ValueError, match=r"'relative', which is 'inverse': .*aligned\(alignment\) makes it metric"):
+        wrap_network(pipe)
+    pipe.task = "image-classification"
+    with pytest.raises(TypeError, match="pipeline of the task depth-estimation, got 'image-classification'"):
+        wrap_network(pipe)

@@ -1,0 +1,378 @@
+"""``LiveDepth``: which image is taken, what is dropped and why, late and lost poses, errors, saving, signals."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from ufmstar_torch import DepthPrediction, LiveDepth, UncertainDepth
+from ufmstar_torch.live import BACKWARDS, CLOSED, GAP, LATE, LOST, NEWER
+
+K = (50.0, 50.0, 31.5, 23.5)
+PICTURE = np.zeros((48, 64, 3), np.uint8)
+
+
+class Network(torch.nn.Module):
+    """Two metres everywhere; ``gate`` holds it up, ``entered`` tells that it was called."""
+
+    def __init__(self):
+        super().__init__()
+        self.gate, self.entered = threading.Event(), threading.Event()
+        self.gate.set()
+
+    def forward(self, x):
+        self.entered.set()
+        assert self.gate.wait(20)
+        if x.float().mean() > 200:
+            raise OSError("the network failed")
+        return DepthPrediction(torch.full((len(x), 48, 64), 2.0))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled():
+    """The first image need not wait for a compiler."""
+    UncertainDepth(Network())(PICTURE, np.eye(4), K)
+
+
+@pytest.fixture
+def network():
+    return Network()
+
+
+@pytest.fixture
+def model(network):
+    return UncertainDepth(network)
+
+
+def at(x):
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
+def stamps(results):
+    return [result.stamp for result in results]
+
+
+def require_all_counted(live):
+    counts = live.statistics
+    assert counts.images == counts.results + sum(counts.dropped.values()) + sum(counts.skipped.values())
+    return counts
+
+
+def test_a_result_has_the_pose_at_its_stamp(model):
+    results = []
+    with LiveDepth(model, results.append, K) as live:
+        live.push_pose(0.0, at(0))
+        live.push_pose(0.1, at(1))
+        live.push_image(0.025, PICTURE)
+        assert live.wait_idle(20)
+    (result,) = results
+    np.testing.assert_allclose(result.T_world_cam, at(0.25), atol=1e-12)
+    assert result.out.depth.shape == (1, 48, 64)
+    assert bool((result.out.variance > 0).any())
+    assert 0 < result.finished - result.started <= result.latency
+    same = UncertainDepth(Network())(PICTURE, at(0.25), K)
+    torch.testing.assert_close(result.out.variance, same.variance)
+
+
+def test_a_late_pose_is_waited_for_and_others_go_on_being_pushed(model):
+    results = []
+    with LiveDepth(model, results.append, K, max_wait=20) as live:
+        live.push_pose(0.0, at(0))
+        for n in range(1, 40):  # more than it keeps; the oldest has its pose first
+            live.push_image(n / 100, PICTURE)
+        time.sleep(0.05)
+        assert not results
+        live.push_pose(0.015, at(1))
+        while not results:
+            time.sleep(0.001)
+        assert stamps(results) == [0.01]
+        live.push_pose(0.15, at(2))
+        live.push_pose(0.4, at(2))  # a gap around the newest one
+        assert live.wait_idle(20)
+        assert live.statistics.skipped == {GAP: 1}
+    assert stamps(results) == [0.01, 0.15]
+    require_all_counted(live)
+
+
+def test_the_newest_image_wins_while_the_model_is_busy(model, network):
+    results = []
+    network.gate.clear()
+    with LiveDepth(model, results.append, K) as live:
+        for n in range(4):
+            live.push_pose(n / 100, at(n / 100))
+        live.push_image(0.0, PICTURE)
+        assert network.entered.wait(20)
+        for n in (1, 2, 3):
+            live.push_image(n / 100, PICTURE)
+        network.gate.set()
+        assert live.wait_idle(20)
+    assert stamps(results) == [0.0, 0.03]
+    assert require_all_counted(live).dropped == {NEWER: 2}
+
+
+def test_the_image_may_be_overwritten_after_the_push(model, network):
+    network.gate.clear()
+    results, buffer = [], PICTURE.copy()
+    with LiveDepth(model, results.append, K) as live:
+        live.push_pose(0, at(0))
+        live.push_image(0, buffer)
+        buffer[:] = 255
+        network.gate.set()
+        assert live.wait_idle(20)
+    assert not results[0].image.any()
+
+
+def test_why_images_are_skipped(model, caplog):
+    results = []
+    with LiveDepth(model, results.append, K, max_wait=0.02, max_gap=0.1) as live:
+        live.push_image(0.5, PICTURE)  # no pose at all
+        assert live.wait_idle(20)
+        assert live.statistics.skipped == {LATE: 1}
+        for stamp, T in ((1.0, at(0)), (1.05, np.full((4, 4), np.nan)), (1.1, at(0)), (1.5, at(0))):
+            live.push_pose(stamp, T)
+        for stamp in (0.9, 1.02, 1.07, 1.3):  # before all, beside a lost one twice, in a gap
+            live.push_image(stamp, PICTURE)
+            assert live.wait_idle(20)
+        for stamp in (1.3, 0.2):  # not after the one before
+            live.push_image(stamp, PICTURE)
+        live.push_image(1.5, PICTURE)
+        live.push_image(1.504, PICTURE)  # its next pose never comes: the one within 5 ms
+        assert live.wait_idle(20)
+    assert stamps(results) == [1.5, 1.504]
+    assert require_all_counted(live).skipped == {LATE: 1, GAP: 2, LOST: 2, BACKWARDS: 2}
+    assert "image at 0.500 s skipped: no pose in time (poses: none" in caplog.text
+    assert caplog.text.count(BACKWARDS) == 1
+
+
+def test_poses_in_any_order_and_replaced(model):
+    results = []
+    with LiveDepth(model, results.append, K) as live:
+        live.push_pose(0.1, at(1))
+        live.push_pose(0.0, at(5))
+        live.push_pose(0.0, at(0))
+        live.push_image(0.05, torch.zeros(3, 48, 64, dtype=torch.uint8))
+        assert live.wait_idle(20)
+    assert results[0].T_world_cam[0, 3] == pytest.approx(0.5)
+    assert live.statistics.poses == 3
+
+
+def test_a_reset_forgets_views_and_times(model):
+    results = []
+    with LiveDepth(model, results.append, K, max_wait=0.02) as live:
+        live.push_pose(9, at(0))
+        live.push_image(9, PICTURE)
+        assert live.wait_idle(20)
+        live.reset()
+        live.push_image(1, PICTURE)  # the old pose would be no help, and is gone
+        assert live.wait_idle(20)
+        live.push_pose(2, at(0))
+        live.push_image(2, PICTURE)
+        assert live.wait_idle(20)
+    assert stamps(results) == [9, 2]
+    assert live.statistics.skipped == {LATE: 1}
+    assert int(model.image_index) == 1
+
+
+@pytest.mark.parametrize("what", ["model", "on_result", "exit"])
+def test_an_error_reaches_every_thread_that_pushes(model, what):
+    def on_result(_):
+        if what == "exit":
+            raise SystemExit(3)
+        if what == "on_result":
+            raise ZeroDivisionError("no plan")
+
+    expected = {"model": OSError, "on_result": ZeroDivisionError, "exit": SystemExit}[what]
+    live = LiveDepth(model, on_result, K)
+    live.push_pose(0, at(0))
+    live.push_image(0, PICTURE + (255 if what == "model" else 0))
+    with pytest.raises(expected):
+        live.wait_idle(20)
+    for call in (lambda: live.push_image(1, PICTURE), lambda: live.push_pose(1, at(0)), live.reset, live.close):
+        with pytest.raises(expected):
+            call()
+    with pytest.raises(KeyError), live:  # an error of the block's own is not replaced
+        raise KeyError
+
+
+def test_closing_while_busy_waits_for_the_image_and_drops_the_rest(model, network):
+    results = []
+    network.gate.clear()
+    live = LiveDepth(model, results.append, K)
+    live.push_pose(0, at(0))
+    live.push_pose(1, at(0))
+    live.push_image(0, PICTURE)
+    assert network.entered.wait(20)
+    live.push_image(1, PICTURE)
+    closing = threading.Thread(target=live.close)
+    closing.start()
+    time.sleep(0.02)
+    assert closing.is_alive()
+    network.gate.set()
+    closing.join(20)
+    live.push_image(2, PICTURE)  # a camera's callback that comes after the end
+    live.push_pose(2, at(0))
+    live.close()
+    assert stamps(results) == [0]
+    assert require_all_counted(live).dropped == {CLOSED: 2}
+    assert live.wait_idle(20)
+
+
+def test_on_result_may_close(model):
+    def on_result(_):
+        live.close()
+
+    live = LiveDepth(model, on_result, K)
+    live.push_pose(0, at(0))
+    live.push_image(0, PICTURE)
+    live._worker.join(20)
+    live.close()
+    assert live.statistics.results == 1
+
+
+def test_many_threads(model):
+    results = []
+    live = LiveDepth(model, results.append, K, max_gap=1)
+
+    def push(n):
+        for i in range(30):
+            live.push_pose(i / 100 + n / 1e4, at(i / 100))
+            live.push_image(i / 100 + n / 1e4, PICTURE)
+
+    threads = [threading.Thread(target=push, args=(n,)) for n in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert live.wait_idle(60)
+    live.close()
+    assert require_all_counted(live).images == 8 * 30
+    assert live.statistics.poses == 8 * 30
+    assert stamps(results) == sorted(stamps(results))
+    assert results
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "text"),
+    [
+        (lambda live: live.push_image(float("nan"), PICTURE), ValueError, "stamp must be finite"),
+        (lambda live: live.push_image("1.0", PICTURE), TypeError, "stamp must be a number of seconds, got str"),
+        (lambda live: live.push_image(0, PICTURE[..., 0]), ValueError, r"\[H, W, 3\] RGB"),
+        (lambda live: live.push_image(0, np.stack([PICTURE] * 2)), ValueError, "must be one image"),
+        (lambda live: live.push_image(0, PICTURE), ValueError, "intrinsics of the image are needed"),
+        (lambda live: live.push_image(0, PICTURE, (1, 2, 3)), ValueError, "intrinsics must be"),
+        (lambda live: live.push_pose(0, np.eye(3)), ValueError, "pose must be camera-to-world"),
+        (lambda live: live.push_pose(0, np.eye(4)[None]), ValueError, "T must be one pose"),
+        (lambda live: live.push_pose(0, np.diag([2.0, 2, 2, 1])), ValueError, "T: pose has a rotation that is not"),
+        (lambda live: live.push_pose(0, np.diag([1.0, 1, -1, 1])), ValueError, "T: pose has a reflection"),
+    ],
+)
+def test_impossible_arguments_are_refused_in_the_callers_thread(model, call, error, text):
+    with LiveDepth(model, print) as live:
+        with pytest.raises(error, match=text):
+            call(live)
+        assert live.statistics.images == 0
+
+
+def test_impossible_settings_are_refused(model, tmp_path):
+    with pytest.raises(ValueError, match="max_wait must be a number of seconds"):
+        LiveDepth(model, print, max_wait=-1)
+    with pytest.raises(TypeError, match="on_result must be callable, got NoneType"):
+        LiveDepth(model, None)
+    with pytest.raises(FileNotFoundError, match="state: no such folder"):
+        LiveDepth(model, print, state=tmp_path / "nowhere" / "state.pt")
+    refused = []
+
+    def elsewhere():
+        try:
+            LiveDepth(model, print, at_sigterm=True)
+        except ValueError as error:
+            refused.append(str(error))
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join(20)
+    assert "needs the main thread" in refused[0]
+
+
+def test_the_state_goes_on_where_it_ended(model, network, tmp_path):
+    with LiveDepth(model, lambda _: None, K, state=tmp_path / "state.pt", save_every=0) as live:
+        for n in range(3):
+            live.push_pose(n, at(n / 100))
+            live.push_image(n, PICTURE)
+            assert live.wait_idle(20)
+    assert live.statistics.saved == 3
+    again = UncertainDepth(Network())
+    again.load_state_dict(torch.load(tmp_path / "state.pt"))
+    torch.testing.assert_close(
+        again(PICTURE, at(0.03), K).variance, model(PICTURE, at(0.03), K).variance, rtol=0, atol=0
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["state.pt"]
+    with LiveDepth(model, print, K, state=tmp_path / "other.pt"):
+        pass  # nothing has changed: nothing is written over
+    assert not (tmp_path / "other.pt").exists()
+
+
+def test_a_state_that_cannot_be_written_is_an_error(model, tmp_path):
+    (tmp_path / "state.pt").mkdir()
+    live = LiveDepth(model, lambda _: None, K, state=tmp_path / "state.pt")
+    live.push_pose(0, at(0))
+    live.push_image(0, PICTURE)
+    assert live.wait_idle(20)
+    with pytest.raises(OSError, match=r"state\.pt"):
+        live.close()
+
+
+def test_sigterm_saves_and_comes_again_to_the_handler_before(model, tmp_path):
+    received = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
+    try:
+        live = LiveDepth(model, lambda _: None, K, state=tmp_path / "state.pt", save_every=1e9, at_sigterm=True)
+        live.push_pose(0, at(0))
+        live.push_image(0, PICTURE)
+        assert live.wait_idle(20)
+        assert not (tmp_path / "state.pt").exists()
+        os.kill(os.getpid(), signal.SIGTERM)
+        deadline = time.monotonic() + 20
+        while not received and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert received == [signal.SIGTERM]
+        assert live.statistics.saved == 1
+        live.close()
+        handler = signal.getsignal(signal.SIGTERM)
+        with LiveDepth(model, print, K, at_sigterm=True):
+            assert signal.getsignal(signal.SIGTERM) != handler
+        assert signal.getsignal(signal.SIGTERM) == handler
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.slow
+def test_sigterm_ends_a_process_that_has_no_handler(tmp_path):
+    script = textwrap.dedent(
+        f"""
+        import sys, time
+        sys.path.insert(0, {str(os.path.dirname(__file__))!r})
+        import test_live as t
+        live = t.LiveDepth(t.UncertainDepth(t.Network()), lambda _: print("ready", flush=True), t.K,
+                           state={str(tmp_path / "state.pt")!r}, at_sigterm=True)
+        live.push_pose(0, t.at(0)); live.push_image(0, t.PICTURE)
+        time.sleep(60)
+        """
+    )
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "ready\n"
+    process.terminate()
+    assert process.wait(30) == -signal.SIGTERM
+    process.stdout.close()
+    assert "image_index" in torch.load(tmp_path / "state.pt")
