@@ -35,14 +35,18 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.ensemble import LazyMember as LazyMember
     from ufmstar_torch.models.fastdepth import FastDepth as FastDepth
     from ufmstar_torch.models.fastdepth import FastDepthWidths as FastDepthWidths
+    from ufmstar_torch.models.heads import AleatoricHead as AleatoricHead
     from ufmstar_torch.models.heads import AleatoricNetwork as AleatoricNetwork
     from ufmstar_torch.models.heads import DepthOnlyNetwork as DepthOnlyNetwork
+    from ufmstar_torch.models.heads import EvidentialHead as EvidentialHead
     from ufmstar_torch.models.heads import EvidentialNetwork as EvidentialNetwork
     from ufmstar_torch.models.heads import UncertaintyNetwork as UncertaintyNetwork
     from ufmstar_torch.models.heads import with_head as with_head
     from ufmstar_torch.models.hugging_face import HuggingFaceDepth as HuggingFaceDepth
     from ufmstar_torch.models.hugging_face import from_hugging_face as from_hugging_face
     from ufmstar_torch.models.load import load_network as load_network
+    from ufmstar_torch.models.module_backbone import ModuleBackbone as ModuleBackbone
+    from ufmstar_torch.models.module_backbone import ModuleSpec as ModuleSpec
     from ufmstar_torch.models.monodepth2 import MonodepthResNet as MonodepthResNet
     from ufmstar_torch.models.monodepth2_import import load_monodepth2 as load_monodepth2
     from ufmstar_torch.models.network import Backbone as Backbone

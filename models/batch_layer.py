@@ -53,6 +53,11 @@ class BatchLayer(nn.Module):
         self.train(layer.training)
 
     @property
+    def weight(self) -> Tensor:
+        """W, whose type some networks look up."""
+        return self.shared.weight
+
+    @property
     def members(self) -> int:
         """N."""
         return len(self.r)

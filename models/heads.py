@@ -1,4 +1,4 @@
-"""Uncertainty heads: one more convolution on a backbone's last features.
+"""Uncertainty heads: one more convolution on a network's features.
 
 Aleatoric: Gaussian depth and log-variance (Kendall and Gal 2017). Evidential: the four parameters of a
 Normal-Inverse-Gamma distribution (Amini et al. 2020). Depth stays the backbone's own, so that pretrained
@@ -8,7 +8,7 @@ weights keep their meaning when a head is added.
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 
 import torch
 import torch.nn.functional as F
@@ -32,6 +32,55 @@ BETA_FLOOR = 1e-6
 HEAD_SCALE = 0.1
 
 
+class UncertaintyHead(nn.Module, ABC):
+    """A 3x3 convolution on a feature map of any network, for a model of one's own; ``train.loss_of`` is its loss.
+
+    Args:
+        channels: C of the feature map.
+    """
+
+    method = ""  # of a ``NetworkSpec`` with such a head
+    outputs = 0  # channels of the convolution
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.convolution = _convolution(channels, self.outputs)
+
+    def forward(self, features: Tensor, depth: Tensor) -> DepthDistribution:
+        """The distribution [B, H, W] of ``depth`` [B, H, W] [m], at least in single precision, from ``features``
+        [B, C, h, w] of any resolution."""
+        raw = _single(self.convolution(features))
+        return self.distribution(_single(depth), resized(raw, (depth.shape[-2], depth.shape[-1])))
+
+    @staticmethod
+    @abstractmethod
+    def distribution(depth: Tensor, raw: Tensor) -> DepthDistribution:
+        """The parameters of depth [B, H, W] [m] from the convolution's outputs [B, outputs, H, W]."""
+
+
+class AleatoricHead(UncertaintyHead):
+    """A learned data variance (Kendall and Gal 2017)."""
+
+    method, outputs = "aleatoric", 1
+
+    @staticmethod
+    def distribution(depth: Tensor, raw: Tensor) -> GaussianDepth:
+        """Depth and log-variance within :data:`LOG_VARIANCE_RANGE`."""
+        return GaussianDepth(depth, soft_range(raw[:, 0], *LOG_VARIANCE_RANGE))
+
+
+class EvidentialHead(UncertaintyHead):
+    """Learned data and model variance (Amini et al. 2020)."""
+
+    method, outputs = "evidential", 3
+
+    @staticmethod
+    def distribution(depth: Tensor, raw: Tensor) -> EvidentialDepth:
+        """gamma is the depth; nu, alpha - 1 and beta are softplus of the three channels."""
+        nu, alpha, beta = F.softplus(raw).unbind(1)
+        return EvidentialDepth(depth, nu + EVIDENCE_FLOOR, alpha + (1 + EVIDENCE_FLOOR), beta + BETA_FLOOR)
+
+
 class UncertaintyNetwork(DepthNetwork):
     """A backbone with a head.
 
@@ -44,7 +93,7 @@ class UncertaintyNetwork(DepthNetwork):
         ValueError: more scales than the backbone has.
     """
 
-    outputs = 0  # channels of a head
+    kind: type[UncertaintyHead] | None = None  # of head
 
     def __init__(self, backbone: Backbone, scales: int = 1) -> None:
         super().__init__()
@@ -53,15 +102,29 @@ class UncertaintyNetwork(DepthNetwork):
             raise ValueError(f"scales must be from 1 to {len(channels)} of this backbone, got {scales}")
         self.backbone = backbone
         self.preprocess = backbone.preprocess
-        if self.outputs:
-            self.head = _head(channels[0], self.outputs)
+        if self.kind is not None:
+            # The convolutions alone, under the names that stored weights have.
+            self.head = _convolution(channels[0], self.kind.outputs)
             if scales > 1:
-                self.coarse = nn.ModuleList(_head(channels[s], self.outputs) for s in range(1, scales))
+                coarse = (_convolution(channels[s], self.kind.outputs) for s in range(1, scales))
+                self.coarse = nn.ModuleList(coarse)
 
-    @abstractmethod
+    @property
+    def wrapped(self) -> tuple[nn.Module]:
+        """The backbone."""
+        return (self.backbone,)
+
     def distribution(self, image: Tensor) -> DepthDistribution:
         """The parameters that the losses need, each [B, H, W], of ``image`` [B, 3, H, W]; in training mode with S
         scales [S B, H, W], full resolution first, each with the same depth."""
+        if self.kind is None:
+            return PointDepth(_single(self.backbone.depth(self.backbone.features(image))))
+        coarse = self.coarse if self.training and hasattr(self, "coarse") else ()
+        maps = self.backbone.pyramid(image) if coarse else [self.backbone.features(image)]
+        raws = [_single(head(x)) for head, x in zip((self.head, *coarse), maps, strict=False)]
+        size = (raws[0].shape[-2], raws[0].shape[-1])
+        depth = _single(self.backbone.depth(maps[0])).repeat(len(raws), 1, 1)
+        return self.kind.distribution(depth, torch.cat([resized(raw, size) for raw in raws]))
 
     def forward(self, image: Tensor) -> DepthPrediction:
         """Depth [B, H, W] [m] and the head's variances [m^2] of ``image`` as ``preprocess`` returns it."""
@@ -69,49 +132,21 @@ class UncertaintyNetwork(DepthNetwork):
         scales = len(prediction.depth) // max(len(image), 1)
         return prediction if scales <= 1 else split_batch(prediction, scales)[0]
 
-    def _raw(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Depth [S B, H, W] [m] and the heads' outputs [S B, outputs, H, W], at least in single precision."""
-        coarse = self.coarse if self.training and hasattr(self, "coarse") else ()
-        if not coarse:
-            features = self.backbone.features(image)
-            raw = _single(self.head(features))
-            return _single(self.backbone.depth(features)), raw
-        maps = self.backbone.pyramid(image)
-        raws = [_single(head(x)) for head, x in zip((self.head, *coarse), maps, strict=False)]
-        size = raws[0].shape[-2:]
-        raws = [raws[0], *(F.interpolate(x, size, mode="bilinear", align_corners=False) for x in raws[1:])]
-        return _single(self.backbone.depth(maps[0])).repeat(len(raws), 1, 1), torch.cat(raws)
-
 
 class DepthOnlyNetwork(UncertaintyNetwork):
     """No head: depth without a variance ("DepthOnly")."""
-
-    def distribution(self, image: Tensor) -> PointDepth:
-        """The backbone's depth."""
-        return PointDepth(_single(self.backbone.depth(self.backbone.features(image))))
 
 
 class AleatoricNetwork(UncertaintyNetwork):
     """Depth and a learned data variance ("Aleatoric")."""
 
-    outputs = 1
-
-    def distribution(self, image: Tensor) -> GaussianDepth:
-        """Depth and log-variance within :data:`LOG_VARIANCE_RANGE`."""
-        depth, raw = self._raw(image)
-        return GaussianDepth(depth, soft_range(raw[:, 0], *LOG_VARIANCE_RANGE))
+    kind = AleatoricHead
 
 
 class EvidentialNetwork(UncertaintyNetwork):
     """Depth with learned data and model variance from one inference ("Evidential")."""
 
-    outputs = 3
-
-    def distribution(self, image: Tensor) -> EvidentialDepth:
-        """gamma is the backbone's depth; nu, alpha - 1 and beta are softplus of the head's channels."""
-        depth, raw = self._raw(image)
-        nu, alpha, beta = F.softplus(raw).unbind(1)
-        return EvidentialDepth(depth, nu + EVIDENCE_FLOOR, alpha + (1 + EVIDENCE_FLOOR), beta + BETA_FLOOR)
+    kind = EvidentialHead
 
 
 HEADS: dict[str, type[UncertaintyNetwork]] = {
@@ -139,7 +174,12 @@ def soft_range(x: Tensor, low: float, high: float) -> Tensor:
     return high - F.softplus(high - x)
 
 
-def _head(inputs: int, outputs: int) -> nn.Conv2d:
+def resized(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """x [B, C, h, w] at another size, linearly between the centres of pixels."""
+    return x if x.shape[-2:] == size else F.interpolate(x, size, mode="bilinear", align_corners=False)
+
+
+def _convolution(inputs: int, outputs: int) -> nn.Conv2d:
     """A 3x3 convolution that starts near 0, whatever features a trained backbone has; members still differ."""
     head = nn.Conv2d(inputs, outputs, 3, padding=1)
     assert head.bias is not None

@@ -74,7 +74,7 @@ class Checkpoint:
     name: str  # directory or hub name
     config: dict[str, Any]  # config.json
     processor: dict[str, Any]  # preprocessor_config.json, empty if there is none
-    options: dict[str, Any]  # keyword arguments of every call of ``transformers``
+    options: dict[str, Any]  # keyword arguments of every call of ``transformers``; {} = random weights
 
     @property
     def model_type(self) -> str:
@@ -327,12 +327,17 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
 
 
 def _load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: tuple[str, ...]) -> nn.Module:
-    """The model with every weight from the checkpoint, on the CPU. Raises CheckpointError: not a depth model, damaged,
-    or with missing, misshapen or non-finite weights; the message names the directory."""
+    """The model with every weight from the checkpoint, on the CPU, or random ones. Raises CheckpointError: not a depth
+    model, damaged, or with missing, misshapen or non-finite weights; the message names the directory."""
     from huggingface_hub.errors import StrictDataclassError
     from safetensors import SafetensorError
-    from transformers import AutoModelForDepthEstimation
+    from transformers import CONFIG_MAPPING, AutoModelForDepthEstimation
 
+    if not checkpoint.options:
+        untrained: nn.Module = AutoModelForDepthEstimation.from_config(
+            CONFIG_MAPPING[checkpoint.model_type].from_dict(checkpoint.config), dtype=dtype
+        )
+        return untrained.eval()
     try:
         model, report = AutoModelForDepthEstimation.from_pretrained(
             checkpoint.name, dtype=dtype, output_loading_info=True, **checkpoint.options

@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from ufmstar_torch.checked import Checked, choice, number
+from torch import nn
+
+from ufmstar_torch.checked import Checked, choice, number, section
 from ufmstar_torch.models.batch_ensemble import INIT_STD, BatchEnsemble
 from ufmstar_torch.models.heads import HEADS, UncertaintyNetwork, with_head
+from ufmstar_torch.models.module_backbone import ModuleBackbone, ModuleSpec
 from ufmstar_torch.models.network import Backbone, fits
 from ufmstar_torch.models.preprocess import Preprocess
 
@@ -15,7 +18,7 @@ _MULTIPLE = 32  # [px] both architectures halve the image five times
 _SMALLEST = {"fastdepth": 32, "monodepth2": 64}  # [px]
 # Fields of one architecture; with the other they keep their defaults, so that two specs of the same network are equal.
 _ONLY = {"widths": "fastdepth", "norm": "fastdepth", "positive": "fastdepth"}
-_ONLY |= {"layers": "monodepth2", "strides": "monodepth2"}
+_ONLY |= {"layers": "monodepth2", "strides": "monodepth2", "module": "module"}
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class NetworkSpec(Checked):
     An ensemble is several "aleatoric" networks of one spec; its files state how many.
 
     Attributes:
-        architecture: "fastdepth" or "monodepth2".
+        architecture: "fastdepth", "monodepth2", or "module": a network of one's own.
         method: "depth" (no variance), "aleatoric", "evidential", "mc_dropout" (aleatoric, sampled by its
             decoder's dropout) or "batch_ensemble" (aleatoric, ``members`` in one).
         widths: of FastDepth: "full", "pruned", or a multiple of the full ones.
@@ -41,12 +44,13 @@ class NetworkSpec(Checked):
         size: (height, width) [px] of the input, multiples of 32.
         preprocess: how a camera image comes to that size: "nyu" (the centre crop of NYU's validation)
             or "resize" (the whole image, each axis by its own factor).
+        module: the network of "module", whose ``preprocess`` decides instead of ``size`` and ``preprocess``.
 
     Raises:
         ValueError: a value that cannot be, or fields that contradict each other.
     """
 
-    architecture: str = choice("fastdepth", "monodepth2")
+    architecture: str = choice("fastdepth", "monodepth2", "module")
     method: str = choice("aleatoric", "depth", "evidential", "mc_dropout", "batch_ensemble")
     widths: str | float = "full"
     norm: bool = True
@@ -59,6 +63,7 @@ class NetworkSpec(Checked):
     members: int = number(1, "N", "networks", 1)
     size: tuple[int, int] = (224, 224)
     preprocess: str = choice("nyu", "resize")
+    module: ModuleSpec | None = section(ModuleSpec, optional=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -71,9 +76,12 @@ class NetworkSpec(Checked):
         if (self.members > 1) != (self.method == "batch_ensemble"):
             expected = "1" if self.members > 1 else "at least 2"
             raise ValueError(f"NetworkSpec.members must be {expected} for {self.method!r}, got {self.members}")
-        size, smallest = self.size, _SMALLEST[self.architecture]
+        own = self.architecture == "module"
+        if own and self.module is None:
+            raise ValueError("NetworkSpec.module must describe the network of architecture 'module'")
+        size, smallest = self.size, _SMALLEST.get(self.architecture, 1)
         whole = type(size) is tuple and len(size) == 2 and all(type(side) is int for side in size)
-        if not whole or not fits(*size, _MULTIPLE, smallest):
+        if not whole or not fits(*size, 1 if own else _MULTIPLE, smallest):
             expected = f"multiples of {_MULTIPLE} px from {smallest} px on"
             raise ValueError(f"NetworkSpec.size must be (height, width) in {expected}, got {size!r}")
         for f in fields(self):
@@ -82,10 +90,15 @@ class NetworkSpec(Checked):
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain values for JSON."""
-        return {**super().to_dict(), "size": list(self.size)}
+        values = {**super().to_dict(), "size": list(self.size)}
+        if self.module is None:
+            del values["module"]  # as files have it that are older than the field
+        return values
 
     def input(self) -> Preprocess:
         """The preprocessing from a camera image to the network's input."""
+        if self.module is not None:
+            return self.module.preprocess
         statistics: dict[str, Any] = {}
         if self.architecture == "monodepth2":
             from ufmstar_torch.models.monodepth2 import IMAGENET_MEAN, IMAGENET_STD
@@ -95,8 +108,10 @@ class NetworkSpec(Checked):
         return Preprocess.nyu(self.size, **statistics) if nyu else Preprocess(size=self.size, **statistics)
 
 
-def build_backbone(spec: NetworkSpec) -> Backbone:
-    """The encoder and decoder of ``spec``, with random weights from torch's generator."""
+def build_backbone(spec: NetworkSpec, module: nn.Module | None = None) -> Backbone:
+    """The encoder and decoder of ``spec``, with random weights from torch's generator, or a ``module`` of one's own."""
+    if spec.module is not None:
+        return ModuleBackbone(spec.module.build() if module is None else module, spec.module, spec.dropout)
     backbone: Backbone
     options: dict[str, Any] = {name: getattr(spec, name) for name in ("dropout", "dropout_both", "size")}
     if spec.architecture == "fastdepth":

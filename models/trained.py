@@ -6,6 +6,7 @@ Member n's tensors have the prefix "member.<n>."; a BatchEnsemble, whose members
 
 from __future__ import annotations
 
+import copy
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble
 from ufmstar_torch.models.checkpoints import CheckpointError, fill, read_safetensors, save_checkpoint
@@ -22,7 +23,7 @@ from ufmstar_torch.models.dropout import MonteCarloDropout
 from ufmstar_torch.models.ensemble import Ensemble, LazyMember
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.spec import NetworkSpec, build_network
+from ufmstar_torch.models.spec import NetworkSpec, build_backbone, build_network
 
 FORMAT = "ufmstar_torch trained networks"
 VERSION = 1
@@ -72,10 +73,13 @@ def save_trained(
     members = [networks] if isinstance(networks, DepthNetwork) else list(networks)
     if path.suffix != ".safetensors" or not members:
         raise ValueError(f"need a file .safetensors and at least one network, got {path.name} and {len(members)}")
-    expected = {key: value.shape for key, value in _new(spec).state_dict().items()}
+    # A network of one's own is compared with the first member.
+    own_module = spec.module is not None and spec.module.checkpoint is None
+    reference = _unwrapped(members[0]) if own_module else _new(spec)
+    expected = {key: value.shape for key, value in reference.state_dict().items()}
     state: dict[str, Tensor] = {}
     for n, member in enumerate(members):
-        own = (member.network if isinstance(member, MonteCarloDropout) else member).state_dict()
+        own = _unwrapped(member).state_dict()
         if {key: value.shape for key, value in own.items()} != expected:
             raise ValueError(f"network {n} ({type(member).__name__}) is not what its spec describes: {spec}")
         state |= {f"member.{n}.{key}": value for key, value in own.items()}
@@ -95,7 +99,11 @@ def read_info(path: str | Path) -> TrainedInfo:
 
 
 def load_trained(
-    path: str | Path | Iterable[str | Path], *, lazy: bool = False, offload: bool = False
+    path: str | Path | Iterable[str | Path],
+    *,
+    backbone: nn.Module | None = None,
+    lazy: bool = False,
+    offload: bool = False,
 ) -> list[DepthNetwork]:
     """The networks in one or several files, in eval mode and on the CPU, as ``UncertainDepth`` alternates them.
 
@@ -104,6 +112,7 @@ def load_trained(
 
     Args:
         path: a file, or several, whose networks follow each other.
+        backbone: the network of one's own below the heads, as ``train_module`` got it; copied, with the file's weights.
         lazy: read a network's weights when it is first called; their metadata are read now.
         offload: as :class:`LazyMember` has it.
 
@@ -113,7 +122,7 @@ def load_trained(
     """
     paths = [path] if isinstance(path, str | Path) else list(path)
     members: list[DepthNetwork] = []
-    for file in [_TrainedFile(Path(p)) for p in paths]:
+    for file in [_TrainedFile(Path(p), backbone) for p in paths]:
         if not lazy and not offload:
             members += [file.member(n) for n in range(file.info.members)]
             continue
@@ -126,17 +135,17 @@ def load_trained(
     return members
 
 
-def load_ensemble(weights: Path) -> DepthNetwork:
-    """All networks in a file as one: the network itself, or an :class:`Ensemble` of several; errors as
+def load_ensemble(weights: Path, backbone: nn.Module | None = None) -> DepthNetwork:
+    """All networks in a file as one: the network itself, or an :class:`Ensemble` of several; arguments and errors as
     :func:`load_trained`."""
-    members = load_trained(weights)
+    members = load_trained(weights, backbone=backbone)
     return members[0] if len(members) == 1 else Ensemble(members)
 
 
-def load_for_training(path: str | Path) -> list[UncertaintyNetwork | BatchEnsemble]:
-    """The networks in a file as ``build_network`` made them, in training mode, to go on from. Raises FileNotFoundError,
-    CheckpointError, ModuleNotFoundError: as :func:`load_trained`."""
-    file = _TrainedFile(Path(path))
+def load_for_training(path: str | Path, backbone: nn.Module | None = None) -> list[UncertaintyNetwork | BatchEnsemble]:
+    """The networks in a file as ``build_network`` made them, in training mode, to go on from; arguments and errors as
+    :func:`load_trained`."""
+    file = _TrainedFile(Path(path), backbone)
     return [file.read(index).train() for index in range(file.info.networks)]
 
 
@@ -144,8 +153,8 @@ class _TrainedFile:
     """One file, whose networks are read one by one. Shared weights are read once. Raises FileNotFoundError,
     CheckpointError, ModuleNotFoundError: as :func:`read_info`."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, backbone: nn.Module | None = None) -> None:
+        self.path, self.backbone = path, backbone
         self.info = _parse(path, read_safetensors(path, prefix=None)[1])
         self._shared: dict[int, Any] = {}  # a BatchEnsemble's members are of one network
         self._lock = threading.Lock()
@@ -162,12 +171,12 @@ class _TrainedFile:
                 self._shared[index] = self.read(index)
             return self._shared[index].member(member)
 
-    def __reduce__(self) -> tuple[type[_TrainedFile], tuple[Path]]:
-        return _TrainedFile, (self.path,)  # a copy reads the file again
+    def __reduce__(self) -> tuple[type[_TrainedFile], tuple[Any, ...]]:
+        return _TrainedFile, (self.path, self.backbone)  # a copy reads the file again
 
     def read(self, index: int) -> UncertaintyNetwork | BatchEnsemble:
         """The network stored under an index, in eval mode. Raises CheckpointError: as :meth:`member`."""
-        network = _new(self.info.spec)
+        network = _new(self.info.spec, self.backbone)
         fill(network, read_safetensors(self.path, f"member.{index}.")[0], f"{self.path}, member {index},")
         return network.eval()
 
@@ -191,10 +200,14 @@ def _parse(path: Path, metadata: Any) -> TrainedInfo:
     return TrainedInfo(path, spec, count, info)
 
 
-def _new(spec: NetworkSpec) -> UncertaintyNetwork | BatchEnsemble:
+def _new(spec: NetworkSpec, backbone: nn.Module | None = None) -> UncertaintyNetwork | BatchEnsemble:
     """A network to be filled or compared with, whose random weights do not use up the caller's seed."""
     with torch.random.fork_rng(devices=[]):
-        return build_network(spec)
+        return build_network(spec, build_backbone(spec, copy.deepcopy(backbone)))
+
+
+def _unwrapped(network: DepthNetwork) -> nn.Module:
+    return network.network if isinstance(network, MonteCarloDropout) else network
 
 
 def _fits_half(key: str, value: Tensor) -> bool:

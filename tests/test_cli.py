@@ -99,7 +99,7 @@ def test_help_loads_nothing_beyond_the_package():
 
 # The words behind ``ufmstar run SEQUENCE --out OUT``, or a whole line, and what the message contains.
 MISTAKES = {
-    "unknown command": ("ufmstar walk", "no command 'walk', there are demo, run, eval,"),
+    "unknown command": ("ufmstar walk", "no command 'walk', there are demo, run, rank, eval,"),
     "no sequence": ("ufmstar run", "sequence"),
     "no out": ("ufmstar run {path} --depth self", "out"),
     "no such sequence": ("ufmstar run /nowhere --depth self --out {out}", "no such file or folder: /nowhere"),

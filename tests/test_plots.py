@@ -84,20 +84,24 @@ class TestContactSheet:
     def test_sigma_and_error_share_a_scale(self, tmp_path: Path) -> None:
         one = panel()  # the error is twice sigma
         scales = fit_scales([one])
-        assert scales["length"].low == 0
+        assert scales["length"].logarithmic
         assert scales["length"].high == pytest.approx(np.percentile(2 * one.maps["sigma"][4:], 99))
         labels = [(c.label, c.scale) for c in map_columns([one])]
         assert labels[1:] == [(name, scales["length"]) for name in ("σ", "|error|")]
 
-    def test_the_posterior_has_a_scale_of_its_own(self) -> None:
-        """Its sigma was black beside the network's errors."""
+    def test_a_small_sigma_of_the_posterior_is_not_black_beside_the_networks_errors(self) -> None:
         one = panel()
-        small = {name: one.maps[of] / 50 for name, of in (("posterior_sigma", "sigma"), ("posterior_error", "error"))}
+        small = {name: one.maps[of] / 10 for name, of in (("posterior_sigma", "sigma"), ("posterior_error", "error"))}
         both = FramePanel("a", one.image, {**one.maps, "posterior": one.maps["depth"], **small})
         columns = {c.field: c for c in map_columns([both])}
-        assert columns["posterior_sigma"].scale == columns["posterior_error"].scale != columns["sigma"].scale
-        assert columns["sigma"].scale == fit_scales([one])["length"]
-        np.testing.assert_array_equal(columns["posterior_sigma"].rgb(both), columns["sigma"].rgb(both))
+        assert columns["posterior_sigma"].scale == columns["posterior_error"].scale == columns["sigma"].scale
+        ends = [columns[name].rgb(both)[-1, -1].astype(int).sum() for name in ("posterior_sigma", "sigma")]
+        assert 100 < ends[0] < ends[1]
+
+    def test_equal_factors_are_equal_steps_of_a_logarithmic_scale(self) -> None:
+        scale, table = ColourScale(0.01, 1.0, ERROR_MAP, logarithmic=True), colour_table(ERROR_MAP)
+        values = np.array([0.0, 0.01, 0.1, 1.0, 3.0])
+        np.testing.assert_array_equal(scale.rgb(values), table[[0, 0, 128, 255, 255]])
 
     def test_frames_without_a_pixel_and_names_like_formulas(self, tmp_path: Path) -> None:
         import matplotlib
@@ -175,6 +179,7 @@ MAPS = {"depth": np.ones((2, 3)), "sigma": np.ones((2, 3))}
     ("call", "match"),
     [
         (lambda: ColourScale(1.0, 1.0, DEPTH_MAP), "low must be less"),
+        (lambda: ColourScale(0.0, 1.0, DEPTH_MAP, logarithmic=True), "above 0"),
         (lambda: contact_sheet([], "x.png"), "at least one frame"),
         (lambda: FramePanel("a", FLOATS, MAPS), "image must be uint8"),
         (lambda: FramePanel("a", FLOATS.astype(np.uint8), MAPS | {"sigma": np.ones((3, 3))}), "sigma must have"),

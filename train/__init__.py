@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.train.module import TrainingModule as TrainingModule
     from ufmstar_torch.train.nyu import NyuFrames as NyuFrames
     from ufmstar_torch.train.nyu import convert_labelled as convert_labelled
+    from ufmstar_torch.train.own_network import own_job as own_job
+    from ufmstar_torch.train.own_network import train_module as train_module
     from ufmstar_torch.train.presets import PRESETS as PRESETS
     from ufmstar_torch.train.presets import Recipe as Recipe
     from ufmstar_torch.train.presets import preset as preset
@@ -33,5 +35,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.train.start import starting_network as starting_network
     from ufmstar_torch.train.tour_data import TourSettings as TourSettings
     from ufmstar_torch.train.tour_data import tour_frames as tour_frames
+    from ufmstar_torch.train.uncertainty import UncertaintyCallback as UncertaintyCallback
+    from ufmstar_torch.train.uncertainty import judge_network as judge_network
 else:
     __getattr__, __dir__ = lazy_names(__name__)

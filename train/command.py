@@ -12,7 +12,7 @@ from ufmstar_torch.eval.commands.options import UsageError, fields_of, option, p
 from ufmstar_torch.models.spec import NetworkSpec
 from ufmstar_torch.train.augment import AugmentationConfig
 from ufmstar_torch.train.data_config import KINDS, DataConfig
-from ufmstar_torch.train.presets import PRESETS, Recipe, preset, table
+from ufmstar_torch.train.presets import METHOD_ROWS, PRESETS, Recipe, preset, table
 from ufmstar_torch.train.settings import FitSettings, Job
 
 
@@ -21,7 +21,26 @@ class RecipeOptions:
     """Instead of the preset's values."""
 
     recipe: dict[str, Any] = fields_of(Recipe, without=("network", "members"), unset=True)
-    network: dict[str, Any] = fields_of(NetworkSpec, "network.", without=("members",), unset=True)
+    network: dict[str, Any] = fields_of(NetworkSpec, "network.", without=("members", "module"), unset=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackboneOptions:
+    """A network of your own instead of a preset.
+
+    Attributes:
+        backbone: directory or hub name of a depth model of transformers.
+        head: what is trained on it.
+        fine_tune: train the network too, not the head alone.
+        features: part of the network whose input the head reads; default: the last convolution.
+        spec: JSON with declarations about the network: kind, scale, size, alignment.
+    """
+
+    backbone: Path | None = None
+    head: str = option("aleatoric", choices=tuple(METHOD_ROWS))
+    fine_tune: bool = False
+    features: str | None = None
+    spec: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +94,9 @@ class TrainOptions:
         debug: show tracebacks.
     """
 
-    USAGE: ClassVar[str] = "ufmstar train --preset NAME --data {nyu,sequences,tour} [--root DIR...] --out OUT [options]"
+    USAGE: ClassVar[str] = (
+        "ufmstar train {--preset NAME,--backbone DIR} --data {nyu,sequences,tour} [--root DIR...] --out OUT [options]"
+    )
 
     list: bool = False
     preset: str | None = option(None, choices=tuple(PRESETS))
@@ -85,6 +106,7 @@ class TrainOptions:
     overwrite: bool = False
     threads: int | None = None
     debug: bool = False
+    own: BackboneOptions = field(default_factory=BackboneOptions)
     changes: RecipeOptions = field(default_factory=RecipeOptions)
     source: DataOptions = field(default_factory=DataOptions)
     session: SessionOptions = field(default_factory=SessionOptions)
@@ -92,7 +114,7 @@ class TrainOptions:
     def recipe(self) -> Recipe:
         """The preset with the values that the options change. Raises ValueError: no preset, or an impossible value."""
         if self.preset is None:
-            raise ValueError("--preset is missing; ufmstar train --help")
+            raise ValueError("--preset or --backbone is missing; ufmstar train --help")
         recipe = preset(self.preset)
         network = replace(recipe.network, **self.changes.network)
         recipe = replace(recipe, network=network, **self.changes.recipe)
@@ -101,7 +123,10 @@ class TrainOptions:
     def job(self) -> Job:
         """The training that the options mean. Raises ValueError: an option is missing, options contradict each other,
         or a value is impossible."""
-        recipe, d, s = self.recipe(), self.source, self.session
+        d, s, own = self.source, self.session, self.own
+        if self.preset is not None and own.backbone is not None:
+            raise ValueError("--preset and --backbone contradict each other")
+        recipe = None if own.backbone is not None else self.recipe()
         if d.data is None or self.out is None:
             raise ValueError(f"--{'data' if d.data is None else 'out'} is missing; ufmstar train --help")
         if self.resume and self.overwrite:
@@ -117,7 +142,18 @@ class TrainOptions:
             tensorboard=not s.no_tensorboard,
             **s.settings,
         )
-        return Job(recipe, data, settings)
+        if recipe is not None:
+            return Job(recipe, data, settings)
+        from ufmstar_torch.train.own_network import own_job
+
+        assert own.backbone is not None
+        how: dict[str, Any] = {
+            "fine_tune": own.fine_tune,
+            "features": own.features,
+            "spec": own.spec,
+            "network": self.changes.network,
+        }
+        return own_job(own.backbone, own.head, data, settings, members=self.members, **how, **self.changes.recipe)
 
 
 @dataclass(frozen=True, kw_only=True)

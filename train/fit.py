@@ -129,7 +129,7 @@ def _conclude(job: Job, stopped: str | None, seconds: float, command: Sequence[s
         "hardware": {**hardware(), "threads": torch.get_num_threads(), "gpus": gpus},
     }
     if members:
-        networks = [load_for_training(job.folder(m) / WEIGHTS)[0] for m in members]
+        networks = [load_for_training(job.folder(m) / WEIGHTS, job.backbone)[0] for m in members]
         info = {"recipe": r.to_dict(), "mean": summary["mean"], "command": list(command)}
         save_trained(out / WEIGHTS, networks, r.network, half=r.half, info=info)
     write_json_atomic(out / SUMMARY, summary)

@@ -24,7 +24,7 @@ from ufmstar_torch.train.settings import Job
 from ufmstar_torch.train.start import starting_network, train_only
 
 _LIGHTNINGS_OWN = r"`isinstance\(treespec, LeafSpec\)` is deprecated"
-_ADVICE = r".*(does not have many workers|smaller than the logging interval)"
+_ADVICE = r".*(does not have many workers|smaller than the logging interval|in eval mode at the start)"
 WEIGHTS, RESULT = "trained.safetensors", "result.json"
 
 
@@ -32,7 +32,7 @@ def new_network(job: Job, member: int) -> DepthNetwork:
     """The network that a member starts with; it depends on the seed alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(step_seed(job.seed(member), 0, -1))
-        network = starting_network(job.recipe.network, job.settings.init, member)
+        network = starting_network(job.recipe.network, job.settings.init, member, job.backbone)
     train_only(network, job.settings.trainable)
     return network.train()
 

@@ -21,6 +21,9 @@ OURS: dict[str, dict[str, Any]] = {
     "monodepth2": {"learning_rate": 1e-4, "batch_size": 8, "schedule": "cosine"},
     "fastdepth": {"learning_rate": 1e-3, "batch_size": 8, "schedule": "cosine"},
 }
+# A new head on a frozen network, and a whole pretrained network, whose weights large steps would undo.
+OF_HEAD: dict[str, Any] = {"learning_rate": 1e-3, "batch_size": 8, "epochs": 10, "clip": 10.0}
+OF_MODULE: dict[str, Any] = {**OF_HEAD, "learning_rate": 1e-5}
 # Largest ensemble; the seeds of two trainings differ by this (``train.settings.Job.seed``).
 MOST_MEMBERS = 1000
 
@@ -102,9 +105,9 @@ class Recipe(Checked):
 
 
 # [1] Decoder dropout of every model that the paper trains.
-_DROPOUT = 0.2
+DROPOUT = 0.2
 # Second half of a preset's name -> the network's fields, members of the ensemble.
-_METHOD_ROWS: dict[str, tuple[dict[str, Any], int]] = {
+METHOD_ROWS: dict[str, tuple[dict[str, Any], int]] = {
     "depth-only": ({"method": "depth"}, 1),
     "aleatoric": ({"method": "aleatoric"}, 1),
     "evidential": ({"method": "evidential"}, 1),
@@ -140,14 +143,14 @@ _DISTILLED = Recipe(
 
 
 def _paper(architecture: str, network: dict[str, Any], members: int) -> Recipe:
-    spec = NetworkSpec(architecture=architecture, dropout=_DROPOUT, **network)
+    spec = NetworkSpec(architecture=architecture, dropout=DROPOUT, **network)
     return Recipe(network=spec, members=members, **OURS[architecture])
 
 
 PRESETS: dict[str, Recipe] = {
     f"{architecture}-{row}": _paper(architecture, network, members)
     for architecture in OURS
-    for row, (network, members) in _METHOD_ROWS.items()
+    for row, (network, members) in METHOD_ROWS.items()
 } | {"fastdepth-ufmstar": _DISTILLED, "demo": _DEMO}
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+
+from torch import nn
 
 from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.train.data_config import DataConfig
@@ -61,11 +63,13 @@ class FitSettings(Checked):
 
 @dataclass(frozen=True)
 class Job:
-    """Recipe, data and settings of a training; plain values that pickle."""
+    """Recipe, data and settings of a training: values that pickle."""
 
     recipe: Recipe  # decides the weights
     data: DataConfig  # where samples come from; its batch size and seed are replaced by the recipe's and the member's
     settings: FitSettings  # of this session
+    # the network of one's own that the recipe is about, with the weights to start from; None = a file or random ones
+    backbone: nn.Module | None = field(default=None, compare=False)
 
     def folder(self, member: int) -> Path:
         """The folder of one member's files."""

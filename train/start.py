@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,9 @@ PRETRAINED_STD = 0.1
 WAYS = f"trained .safetensors, FastDepth's .onnx, ResNet weights (.pth, or {IMAGENET!r}), or Monodepth2's folder"
 
 
-def starting_network(spec: NetworkSpec, init: Path | None, member: int = 0) -> DepthNetwork:
+def starting_network(
+    spec: NetworkSpec, init: Path | None, member: int = 0, module: nn.Module | None = None
+) -> DepthNetwork:
     """The network of a spec with the weights of a file; other weights are drawn from torch's generator.
 
     Args:
@@ -32,16 +36,20 @@ def starting_network(spec: NetworkSpec, init: Path | None, member: int = 0) -> D
             ImageNet weights of a ResNet in torchvision's keys, or "imagenet", which torchvision downloads; the
             folder with Monodepth2's encoder.pth and depth.pth of the same ResNet.
         member: number in an ensemble; of a trained ensemble it starts from the same member.
+        module: the network of one's own that ``spec`` is about; copied. None = its checkpoint's.
 
     Raises:
         FileNotFoundError: there is no such file.
         CheckpointError: the file is damaged or does not fit.
         ValueError: the file contains another architecture than the spec's; the message names the options that fit.
     """
+    if init is None and spec.module is not None:
+        own = spec.module.build(weights=True) if module is None else copy.deepcopy(module)
+        return build_network(spec, build_backbone(spec, own), std=PRETRAINED_STD)
     if init is None:
         return build_network(spec)
     if init.suffix == ".safetensors" and _is_trained(init):
-        return _from_trained(spec, init, member)
+        return _from_trained(spec, init, member, module)
     if spec.architecture == "fastdepth":
         return build_network(spec, _from_onnx(spec, init), std=PRETRAINED_STD)
     return build_network(spec, _from_resnet(spec, init), std=PRETRAINED_STD)
@@ -56,16 +64,21 @@ def missing_start(spec: NetworkSpec, init: Path | None) -> str | None:
 
 
 def train_only(network: nn.Module, prefixes: Sequence[str]) -> int:
-    """Leave only the parameters whose names begin with one of ``prefixes`` to be trained, in place; the number of
-    trained weights. Raises ValueError: a prefix fits no parameter; the message names the network's parts."""
+    """Leave only the parameters whose names begin with one of ``prefixes``, or match it (``*.r``), to be trained, in
+    place; the number of trained weights. Raises ValueError: a prefix fits no parameter; the message names the network's
+    parts."""
     names = [name for name, _ in network.named_parameters()]
     for prefix in prefixes:
-        if not any(name.startswith(prefix) for name in names):
+        if not any(_fits(name, prefix) for name in names):
             parts = sorted({".".join(name.split(".")[:2]) for name in names})
             raise ValueError(f"trainable: no parameter begins with {prefix!r}; expected one of {', '.join(parts)}")
     for name, parameter in network.named_parameters():
-        parameter.requires_grad_(not prefixes or name.startswith(tuple(prefixes)))
+        parameter.requires_grad_(not prefixes or any(_fits(name, prefix) for prefix in prefixes))
     return sum(p.numel() for p in network.parameters() if p.requires_grad)
+
+
+def _fits(name: str, prefix: str) -> bool:
+    return name.startswith(prefix) or fnmatchcase(name, prefix)
 
 
 def _is_trained(path: Path) -> bool:
@@ -76,25 +89,25 @@ def _is_trained(path: Path) -> bool:
     return True
 
 
-def _from_trained(spec: NetworkSpec, path: Path, member: int) -> DepthNetwork:
+def _from_trained(spec: NetworkSpec, path: Path, member: int, module: nn.Module | None) -> DepthNetwork:
     """The whole network where the spec is the file's but for input and dropout, otherwise its backbone."""
     info = read_info(path)
     state, _ = read_safetensors(path, prefix=f"member.{member % info.networks}.")
-    source = build_network(info.spec)
+    source = build_network(info.spec, build_backbone(info.spec, copy.deepcopy(module)))
     fill(source, {k: v.float() if v.is_floating_point() else v for k, v in state.items()}, str(path))
-    shared = ("size", "preprocess", "dropout", "dropout_both", "method", "members")
+    shared = ("size", "preprocess", "dropout", "dropout_both", "method", "members", "module")
     adapted = replace(info.spec, **{name: getattr(spec, name) for name in shared})
     if adapted != spec:
         raise ValueError(f"init: {path} holds {info.spec}, which does not fit {spec}")
     # "mc_dropout" is an aleatoric network that samples at test time.
     trained, expected = ("aleatoric" if m == "mc_dropout" else m for m in (info.spec.method, spec.method))
     if (trained, info.spec.members) == (expected, spec.members):
-        network: DepthNetwork = build_network(spec)
+        network: DepthNetwork = build_network(spec, build_backbone(spec, copy.deepcopy(module)))
         fill(network, source.state_dict(), str(path))
         return network
     if info.spec.method == "batch_ensemble":
         raise ValueError(f"init: {path} holds a batch_ensemble, whose backbone is not one network's")
-    backbone = build_backbone(spec)
+    backbone = build_backbone(spec, copy.deepcopy(module))
     held: Any = source.backbone
     fill(backbone, held.state_dict(), str(path))
     return build_network(spec, backbone, std=PRETRAINED_STD)
@@ -117,7 +130,7 @@ def _from_resnet(spec: NetworkSpec, path: Path) -> Backbone:
     from ufmstar_torch.models.monodepth2 import MonodepthResNet
     from ufmstar_torch.models.monodepth2_import import load_monodepth2
 
-    backbone = build_backbone(spec)
+    backbone = None if spec.module is not None else build_backbone(spec)
     if not isinstance(backbone, MonodepthResNet):
         raise ValueError(f"init: {path} is no start for {spec.architecture}; expected {WAYS}")
     if path.is_dir():

@@ -132,7 +132,8 @@ class Checked:
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as plain nested values, ready for JSON."""
-        return asdict(self)
+        sections = {f.name: value for f in fields(self) if isinstance(value := getattr(self, f.name), Checked)}
+        return {**asdict(self), **{name: value.to_dict() for name, value in sections.items()}}
 
 
 def _rich(owner: type, name: str, value: Any) -> Any:

@@ -221,13 +221,13 @@ def load_members(
         if not path.is_file():
             raise FileNotFoundError(f"no such file: {path}")
     members: list[DepthNetwork] = []
-    how = ({} if spec is None else {"spec": spec}) | inference.options(model, device)
+    how = {} if spec is None else {"spec": spec}
     for path, member in named:
         if model == "trained" and not how:
             loaded = load_trained([path], offload=offload)
         else:
             try:
-                loaded = [load_network(model, path, **how)]
+                loaded = [load_network(model, path, **how, **inference.options(model, device))]
             except TypeError as error:
                 raise ValueError(f"model {model!r} does not take {sorted(how)}: {error}") from error
         if member is not None and member >= len(loaded):
@@ -255,6 +255,8 @@ def _label(model: str, file: Path, network: DepthNetwork) -> str:
     """ "FastDepth", "ResNet50-Monodepth2", "Depth Anything V2", or the name of the file with the (first) weights."""
     if model == "trained":
         spec = read_info(file).spec
+        if spec.module is not None:
+            return Path(spec.module.source).name
         return "FastDepth" if spec.architecture == "fastdepth" else f"ResNet{spec.layers}-Monodepth2"
     if model == "fastdepth":
         return "FastDepth"

@@ -96,7 +96,7 @@ def demo_explanation(summary: Mapping[str, Any]) -> str:
         "Better: a high delta1, a low NLL, ECE and AUSE, and a sigma that equals the RMSE beside it.",
     ]
     hints = {
-        SHEET: f"sigma and the error beside it share a scale, so that they can be compared; {unseen} rooms below",
+        SHEET: f"sigma and error share a logarithmic scale, so that they can be compared; {unseen} rooms below",
         CURVES: "nearer to the diagonal is better; on the left, a curve below it is over-confident",
         PLY: f"the mixture, brighter = views disagree more; for splat viewers ({ELLIPSOIDS}: MeshLab, Blender)",
     }

@@ -26,22 +26,27 @@ PERCENTILES = (1.0, 99.0)
 @dataclass(frozen=True)
 class ColourScale:
     """A matplotlib map and the values [m] at its dark and its bright end, low < high; values beyond an end get its
-    colour.
+    colour. ``logarithmic``: equal factors are equal steps of colour, and 0 < low.
     """
 
     low: float
     high: float
     colour_map: str
+    logarithmic: bool = False
 
     def __post_init__(self) -> None:
-        if not self.low < self.high:
-            raise ValueError(f"low must be less than high, got {self.low} and {self.high}")
+        if not self.low < self.high or (self.logarithmic and self.low <= 0):
+            least = " and above 0" if self.logarithmic else ""
+            raise ValueError(f"low must be less than high{least}, got {self.low} and {self.high}")
 
     def rgb(self, values: NDArray[Any]) -> NDArray[np.uint8]:
         """[..., 3] the colours of ``values`` [...] [m]; grey where not finite."""
         known = np.isfinite(values)
-        shown = np.where(known, values, self.low).astype(np.float64)
-        index = np.clip((shown - self.low) / (self.high - self.low), 0, 1) * 255
+        shown = np.clip(np.where(known, values, self.low).astype(np.float64), self.low, self.high)
+        low, high = self.low, self.high
+        if self.logarithmic:
+            shown, low, high = np.log(shown), np.log(low), np.log(high)
+        index = (shown - low) / (high - low) * 255
         colours = colour_table(self.colour_map)[np.rint(index).astype(np.intp)]
         return np.where(known[..., None], colours, np.uint8(INVALID_GREY))
 

@@ -153,17 +153,21 @@ def _draw_panel(axes: Any, panel: Panel) -> None:
 def draw_bar(axes: Any, bar: Bar) -> None:
     """A horizontal colour bar with its label in the axes; an arrow at each end but 0, beyond which nothing lies."""
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-    from matplotlib.ticker import MaxNLocator
+    from matplotlib.colors import LogNorm, Normalize
+    from matplotlib.ticker import LogLocator, MaxNLocator, StrMethodFormatter
 
+    scale = LogNorm if bar.scale.logarithmic else Normalize
+    linear = MaxNLocator(5 * bar.span, steps=[1, 2, 5, 10])
     drawn = axes.figure.colorbar(
-        ScalarMappable(Normalize(bar.scale.low, bar.scale.high), bar.scale.colour_map),
+        ScalarMappable(scale(bar.scale.low, bar.scale.high), bar.scale.colour_map),
         cax=axes,
         orientation="horizontal",
         extend="max" if bar.scale.low == 0 else "both",
         extendfrac=0.03,
-        ticks=MaxNLocator(5 * bar.span, steps=[1, 2, 5, 10]),
+        ticks=LogLocator(subs=(1, 2, 5)) if bar.scale.logarithmic else linear,
+        format=StrMethodFormatter("{x:g}") if bar.scale.logarithmic else None,
     )
+    drawn.ax.minorticks_off()
     drawn.ax.tick_params(labelsize=7.5, length=2.5, pad=2, color=INK, labelcolor=INK)
     drawn.outline.set_linewidth(0.5)
     drawn.set_label(bar.label, size=7.5, color=INK, labelpad=1)
@@ -178,10 +182,10 @@ MAPS = {
     "sigma": ("σ", "length"),
     "anchored": ("√B", "length"),
     "error": ("|error|", "length"),
-    # Of its own: beside the network's errors the posterior's would all be black.
-    "posterior_sigma": ("σ, posterior", "posterior length"),
-    "posterior_error": ("|error|, posterior", "posterior length"),
+    "posterior_sigma": ("σ, posterior", "length"),
+    "posterior_error": ("|error|, posterior", "length"),
 }
+_DECADES = 2  # of the logarithmic scale of lengths: beside the network's errors the posterior's would all be black
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,17 +243,15 @@ def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:
 
 
 def fit_scales(panels: Sequence[FramePanel]) -> dict[str, ColourScale]:
-    """The scales of ``MAPS`` over all panels: depths between their 1st and 99th percentile; a sigma and its error share
-    one, from 0 to the larger of their 99th percentiles, so that a sigma as large as the error has its colour."""
+    """The scales of ``MAPS`` over all panels: depths from their 1st to their 99th percentile; sigmas and errors on one
+    logarithmic scale up to the largest of their 99th percentiles, so that a sigma as large as the error has its colour.
+    """
     of = {name: [panel.maps[name] for panel in panels if name in panel.maps] for name in MAPS}
     depth = colours.robust_range([*of["depth"], *of["posterior"]], from_zero=False)
-
-    def length(*names: str) -> ColourScale:
-        high = max(colours.robust_range(of[name], from_zero=True)[1] for name in names if of[name] or name == names[0])
-        return ColourScale(0.0, high, colours.ERROR_MAP)
-
-    lengths = {"length": length("sigma", "error"), "posterior length": length("posterior_sigma", "posterior_error")}
-    return {"depth": ColourScale(*depth, colours.DEPTH_MAP), **lengths}
+    lengths = [of[name] for name in ("sigma", "error", "posterior_sigma", "posterior_error") if of[name]]
+    high = max(colours.robust_range(maps, from_zero=True)[1] for maps in lengths)
+    length = ColourScale(high / 10**_DECADES, high, colours.ERROR_MAP, logarithmic=True)
+    return {"depth": ColourScale(*depth, colours.DEPTH_MAP), "length": length}
 
 
 def contact_sheet(

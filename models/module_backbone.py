@@ -1,0 +1,187 @@
+"""Any network below an uncertainty head: an ``nn.Module`` that returns depth or features, or a depth model of
+``transformers``.
+
+The head reads two things: the features that go into the network's last convolution, and the depth.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ufmstar_torch.checked import Checked
+from ufmstar_torch.models.dropout import DecoderDropout
+from ufmstar_torch.models.heads import resized
+from ufmstar_torch.models.hugging_face import Checkpoint, HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
+from ufmstar_torch.models.monodepth2 import INITIAL_DEPTH
+from ufmstar_torch.models.network import Backbone
+from ufmstar_torch.models.outputs import as_map
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.prediction import DepthPrediction, takes_intrinsics
+
+_PROBE = (480, 640)  # [px] of the grey image on which a network is tried
+
+
+@dataclass(frozen=True)
+class ModuleSpec(Checked):
+    """A network below a head, apart from its weights; made by :meth:`of`.
+
+    Attributes:
+        source: its class, or the directory or hub name of its checkpoint.
+        preprocess: what its input needs.
+        part: dotted name of the part whose input the head reads; "" = the image; None = what the network returns, which
+            are features without a depth.
+        channels: of what the head reads.
+        checkpoint: config.json and preprocessor_config.json of ``transformers``; None: a module that only Python makes.
+        declared: about that checkpoint.
+    """
+
+    source: str
+    preprocess: Preprocess
+    part: str | None
+    channels: int
+    checkpoint: dict[str, Any] | None = None
+    declared: HuggingFaceSpec | None = None
+
+    @classmethod
+    def of(cls, network: nn.Module, preprocess: Preprocess, part: str | None = None, **about: Any) -> ModuleSpec:
+        """The specification of a network, found by one inference.
+
+        Args:
+            network: returns depth [B, 1, H, W] or [B, H, W] [m], of its input's size or smaller, a
+                ``DepthPrediction``, or features [B, C, h, w].
+            preprocess: what its input needs.
+            part: the part whose input the head reads; None = the last ``nn.Conv2d`` that runs.
+            about: other fields.
+
+        Raises:
+            ValueError: it returns something else, needs intrinsics, or has no such part.
+        """
+        if takes_intrinsics(network):
+            raise ValueError("backbone: a network that takes intrinsics cannot have a head")
+        named = {name: m for name, m in network.named_modules() if isinstance(m, nn.Conv2d) or name == part}
+        if part is not None and part not in named:
+            raise ValueError(
+                f"features: the network has no part {part!r}; it has {[n for n, _ in network.named_children()]}"
+            )
+        read: dict[str, int] = {}
+
+        def note(name: str, value: Any) -> None:
+            if part in (None, name) and isinstance(value, Tensor) and value.dim() == 4:
+                read.pop(name, None)  # the order is that of the last calls
+                read[name] = value.shape[1]
+
+        hooks = [m.register_forward_pre_hook(lambda _, x, name=n: note(name, x[0])) for n, m in named.items()]
+        modes = {module: module.training for module in network.modules()}
+        image = preprocess.apply_image(torch.full((1, 3, *_PROBE), 128, dtype=torch.uint8))
+        try:
+            with torch.no_grad():
+                first = next(network.parameters(), image)
+                output = network.eval()(image.to(first.device, first.dtype))
+        finally:
+            for hook in hooks:
+                hook.remove()
+            for module, mode in modes.items():
+                module.training = mode
+        source = about.pop("source", type(network).__name__)
+        if _is_features(output):
+            return cls(source, preprocess, None, output.shape[1], **about)
+        _depth_of(output)
+        if part is not None and not read:
+            raise ValueError(f"features: {part!r} gets no map [B, C, h, w]")
+        return cls(source, preprocess, *(list(read.items())[-1] if read else ("", 3)), **about)
+
+    def build(self, weights: bool = False) -> nn.Module:
+        """The network of a checkpoint, with its ``weights`` or random ones. Raises ValueError: Python has to make it;
+        others as ``from_hugging_face``."""
+        if self.checkpoint is None:
+            raise ValueError(
+                f"{self.source} is a network of your own, which only Python can make: "
+                "load_network('trained', FILE, backbone=NETWORK)"
+            )
+        declared = self.declared or HuggingFaceSpec()
+        read = read_checkpoint(self.source) if weights else Checkpoint(self.source, **self.checkpoint, options={})
+        network: nn.Module = HuggingFaceDepth.of_checkpoint(read, declared).aligned(declared.alignment)
+        return network
+
+
+class ModuleBackbone(Backbone):
+    """A network below a head; ``features`` are what its part reads, at the image's resolution, and the depth.
+
+    Args:
+        network: becomes a part of this one. While none of it is trained, it stays in eval mode.
+        spec: of it.
+        dropout: probability of dropout on what the part reads.
+    """
+
+    def __init__(self, network: nn.Module, spec: ModuleSpec, dropout: float = 0.0) -> None:
+        super().__init__()
+        self.network, self.part, self.preprocess = network, spec.part, spec.preprocess
+        self.dropout = DecoderDropout(dropout)
+        self.feature_channels = spec.channels + 1
+        if spec.part is None:
+            self.last = nn.Conv2d(spec.channels, 1, 3, padding=1)
+            assert self.last.bias is not None
+            nn.init.constant_(self.last.bias, math.log(math.expm1(INITIAL_DEPTH)))
+
+    @property
+    def wrapped(self) -> tuple[nn.Module]:
+        """The network."""
+        return (self.network,)
+
+    def train(self, mode: bool = True) -> ModuleBackbone:
+        """See ``nn.Module``; a network that is not trained stays in eval mode."""
+        super().train(mode)
+        if not any(p.requires_grad for p in self.network.parameters()):
+            self.network.eval()
+        return self
+
+    def features(self, image: Tensor) -> Tensor:
+        """[B, channels + 1, H, W] of ``image`` [B, 3, H, W]. Raises ValueError: the network returns something else than
+        its specification says."""
+        size, read = (image.shape[-2], image.shape[-1]), [image]
+
+        def replace(_: nn.Module, inputs: tuple[Any, ...]) -> tuple[Any, ...]:
+            read[0] = self.dropout(inputs[0])
+            return (read[0], *inputs[1:])
+
+        # For the length of a call: a copy of the network, or one of its layers, would take a lasting hook with it.
+        hooks = [self.network.get_submodule(self.part).register_forward_pre_hook(replace)] if self.part else []
+        try:
+            output = self.network(image)
+        finally:
+            for hook in hooks:
+                hook.remove()
+        if self.part is None:
+            if not _is_features(output):
+                raise ValueError("the network must return features [B, C, h, w], as when it was described")
+            read[0] = self.dropout(output)
+            depth = F.softplus(resized(self.last(read[0]), size))
+        else:
+            depth = resized(_depth_of(output)[:, None], size)
+        return torch.cat([resized(read[0], size).to(depth.dtype), depth], 1)
+
+    def depth(self, features: Tensor) -> Tensor:
+        """[B, H, W] [m]: the last channel of :meth:`features`."""
+        return features[:, -1]
+
+
+def _is_features(output: Any) -> bool:
+    return isinstance(output, Tensor) and output.dim() == 4 and output.shape[1] > 1 and output.shape[3] > 1
+
+
+def _depth_of(output: Any) -> Tensor:
+    """[B, H, W] of what a network returns."""
+    if isinstance(output, DepthPrediction):
+        return output.depth
+    if isinstance(output, Tensor):
+        return as_map(output, "the network's depth")
+    raise ValueError(
+        f"a network below a head must return depth, features [B, C, h, w] or a DepthPrediction, got "
+        f"{type(output).__name__}; declare its outputs by wrap_network(network, output=...)"
+    )

@@ -1,0 +1,144 @@
+"""Validation of a network's uncertainty on sequences, with the evaluation's loop, rows and metrics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from torch import nn
+
+from ufmstar_torch.anchors.landmarks import DENSE
+from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
+from ufmstar_torch.eval.engine.judge import METRICS
+from ufmstar_torch.eval.engine.networks import NetworkSource
+from ufmstar_torch.eval.methods.method import UFM_STAR, Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.report.figures_curves import write_curves
+from ufmstar_torch.eval.sequences import FrameSequence, open_sequence
+from ufmstar_torch.models.any_network import wrap_network
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.networks_in_turn import NetworksInTurn
+
+_BASE = "aleatoric"  # one network, with whatever variances it states
+ROWS: dict[str, Row] = {
+    "network": Row(Method(_BASE)),
+    "ufmstar": Row(Method(_BASE, UFM_STAR)),
+    "posterior": Row(Method(_BASE, UFM_STAR), Setting(anchors=DENSE, posterior=True)),
+}
+LOGGED = ("delta1", "nll", "ece_delta", "ece_q", "ause_rmse")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A row's figures and curves over all pixels of all sequences, by name; see ``SequenceMetrics``."""
+
+    figures: Mapping[str, float]
+    curves: Mapping[str, Any]
+
+
+def judge_network(
+    network: nn.Module,
+    sequences: Sequence[FrameSequence | str | Path],
+    *,
+    rows: Sequence[str] = tuple(ROWS),
+    preprocess: Preprocess | None = None,
+    frames: int | None = None,
+    device: torch.device | str = "cpu",
+) -> dict[str, Judged]:
+    """A network's uncertainty on sequences: its own, that of UfM*, and that of the posterior.
+
+    Args:
+        network: a ``DepthNetwork``, or a module as ``wrap_network`` takes it; left on ``device``, in the modes it has.
+        sequences: posed, with ground truth; opened, or as ``ufmstar run`` names them ("tour:7").
+        rows: of "network", "ufmstar" and "posterior".
+        preprocess: what the input of a module needs; None = images in [0, 1] as they are.
+        frames: of each sequence at most.
+        device: where everything runs.
+
+    Raises:
+        ValueError: no sequence, or no such row; others as ``evaluate_sequence``.
+    """
+    if not sequences or not rows or not set(rows) <= ROWS.keys():
+        expected = f"at least one sequence, and rows of {list(ROWS)}"
+        raise ValueError(f"sequences and rows must hold {expected}, got {len(sequences)} and {list(rows)}")
+    depth = network if isinstance(network, DepthNetwork) else wrap_network(network, preprocess=preprocess)
+    where, totals = torch.device(device), dict[str, SequenceMetrics]()
+    with _evaluated(depth), torch.no_grad():
+        source = NetworkSource(NetworksInTurn([depth], preprocess=depth.preprocess), where, {})
+        judge = Judge({_BASE: source}, where, limit=slice(frames))
+        for sequence in sequences:
+            opened = sequence if isinstance(sequence, FrameSequence) else open_sequence(sequence)
+            for name, result in zip(rows, evaluate_sequence(opened, [ROWS[n] for n in rows], judge), strict=True):
+                metrics = SequenceMetrics(with_variance="nll" in result.figures)
+                metrics.load_state_dict(result.sums[METRICS])
+                totals.setdefault(name, SequenceMetrics(with_variance=metrics.with_variance)).merge_state(metrics)
+    return {name: Judged(total.compute(), total.curves()) for name, total in totals.items()}
+
+
+class UncertaintyCallback(pl.Callback):
+    """Logs the uncertainty of a Lightning module's network on validation sequences after each validation.
+
+    Logged are delta1, NLL, ECE_delta, ECE_q and AUSE as "ROW/FIGURE"; reliability plots go to
+    ``uncertainty/epoch_N.png`` in the logger's folder, or the trainer's.
+
+    Args:
+        sequences, rows, preprocess, frames: as :func:`judge_network`.
+        network: the network of the Lightning module; default: its attribute ``network``.
+        every: validations from one evaluation to the next.
+
+    Raises:
+        ValueError: ``every`` is not positive.
+    """
+
+    def __init__(
+        self,
+        sequences: Sequence[FrameSequence | str | Path],
+        *,
+        network: Callable[[Any], nn.Module] = lambda module: module.network,
+        every: int = 1,
+        rows: Sequence[str] = tuple(ROWS),
+        preprocess: Preprocess | None = None,
+        frames: int | None = None,
+    ) -> None:
+        if every < 1:
+            raise ValueError(f"every must be at least 1, got {every}")
+        self._network, self._every, self._validations = network, every, 0
+        self._sequences = tuple(sequences)
+        self._how: dict[str, Any] = {"rows": rows, "preprocess": preprocess, "frames": frames}
+
+    def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Judge, log and draw; in the first process alone."""
+        self._validations += not trainer.sanity_checking
+        if trainer.sanity_checking or self._validations % self._every or not trainer.is_global_zero:
+            return
+        judged = judge_network(self._network(pl_module), self._sequences, device=pl_module.device, **self._how)
+        figures = {
+            f"{row}/{name}": one.figures[name] for row, one in judged.items() for name in LOGGED if name in one.figures
+        }
+        pl_module.log_dict(figures, rank_zero_only=True)
+        curves = {name: one.curves for name, one in judged.items() if "nll" in one.figures}
+        if curves:
+            folder = Path(trainer.log_dir or trainer.default_root_dir) / "uncertainty"
+            folder.mkdir(parents=True, exist_ok=True)
+            title = f"epoch {trainer.current_epoch}, step {trainer.global_step}"
+            write_curves(folder / f"epoch_{trainer.current_epoch}.png", curves, title=title)
+
+
+@contextmanager
+def _evaluated(network: nn.Module) -> Iterator[None]:
+    """The network in eval mode, and then each part in its own again."""
+    modes = {part: part.training for part in network.modules()}
+    network.eval()
+    try:
+        yield
+    finally:
+        for part, mode in modes.items():
+            part.training = mode
