@@ -58,14 +58,12 @@ def _log_frame(
 ) -> None:
     T, image = frame.T_world_cam, image_of(frame, sequence)
     stream.log(_CAMERA, rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-    for part, K, shape in (
-        ("image", None if image is None else image.intrinsics, () if image is None else np.shape(image.image)),
-        ("maps", frame.intrinsics, frame.depth.shape),
-    ):
-        if K is not None and shape:
-            stream.log(f"{_CAMERA}/{part}", rr.Pinhole(image_from_camera=K, resolution=[shape[1], shape[0]]))
     if image is not None and image.image is not None:
+        size = [image.image.shape[1], image.image.shape[0]]
+        stream.log(f"{_CAMERA}/image", rr.Pinhole(image_from_camera=image.intrinsics, resolution=size))
         stream.log(f"{_CAMERA}/image/rgb", rr.Image(image.image).compress(jpeg_quality=_JPEG))
+    size = [frame.depth.shape[1], frame.depth.shape[0]]
+    stream.log(f"{_CAMERA}/maps", rr.Pinhole(image_from_camera=frame.intrinsics, resolution=size))
     counts = np.nan_to_num(np.rint(frame.depth / unit), nan=0).clip(0, 65535).astype(np.uint16)
     stream.log(f"{_CAMERA}/maps/depth", rr.DepthImage(counts, meter=1 / unit))
     stream.log(f"{_CAMERA}/maps/sigma", rr.Image(scale.rgb(frame.sigma)).compress(jpeg_quality=_JPEG))
