@@ -21,6 +21,10 @@ PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
 _OF_FOLDER = ("variance", "depth_scale", "map_intrinsics")
 
 
+# Of UfM*'s settings, those that are off by default.
+_SECTIONS = ("anchors", "confidence", "posterior", "merge")
+
+
 @dataclass(frozen=True, kw_only=True)
 class NetworkOptions:
     """Depth from networks.
@@ -160,8 +164,7 @@ class RunOptions:
         """Return the options that define the result, as plain values of a configuration file."""
         started = ("resume", "overwrite", "debug")
         plain = {name: value for name, value in as_dict(self).items() if name not in started}
-        sections = ("anchors", "posterior", "merge")
-        ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in sections}
+        ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in _SECTIONS}
         return plain | {"ufm": ufm}
 
 
@@ -178,8 +181,7 @@ def read(words: Sequence[str]) -> RunOptions:
     if options.uncertainty.ufm_preset == "paper":
         paper = UfMStarConfig.paper()
         changed = flat(paper.to_dict()) | {"on_bad_frame": "skip"}
-        off = ("anchors", "posterior", "merge")
-        defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in off}
+        defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in _SECTIONS}
     if options.uncertainty.preset is not None:
         preset = SPGFConfig.preset(options.uncertainty.preset).to_dict()
         defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}

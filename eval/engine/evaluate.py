@@ -94,7 +94,7 @@ def evaluate_sequence(
     runners, judges = [], {}
     for row in rows:
         source = sources[row.method.base, row.setting.preprocess]
-        estimator = make_estimator(row, judge.device, source.max_depth)
+        estimator = make_estimator(row, judge.device, source)
         how: dict[str, Any] = {"every": row.method.every_member, "setting": row.setting, "device": judge.device}
         runners.append(RowRunner(row.slug, source, estimator, anchors=anchors.get(row), **how))
         named = {other.slug: other.method.name for other in references(row, rows)}

@@ -57,7 +57,7 @@ def make_job(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameS
         sequence=sequence,
         indices=indices,
         source=source,
-        config=config.within(source.max_depth),
+        config=config.within(source.max_depth, source.states_confidence),
         recalibration=_recalibration(options, config, source),
         device=torch.device(options["device"]),
         settings=options,
