@@ -93,6 +93,28 @@ class UfMOptions:
     recalibration: str | None = None
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
 
+    @property
+    def config(self) -> UfMStarConfig:
+        """The configuration. Raises ValueError: settings of anchors or posterior without them."""
+        sections: dict[str, Any] = {}
+        for name, used in (("anchors", self.anchors or self.posterior), ("posterior", self.posterior)):
+            if self.ufm[name] is not None and not used:
+                raise ValueError(f"--ufm.{name}.* needs --{name}")
+            sections[name] = (self.ufm[name] or {}) if used else None
+        return UfMStarConfig.from_dict(self.ufm | sections)
+
+    def preset_defaults(self) -> dict[str, Any]:
+        """Other defaults than the options' own, by their names, as ``preset`` and ``ufm_preset`` ask."""
+        defaults: dict[str, Any] = {}
+        if self.ufm_preset == "paper":
+            changed = flat(UfMStarConfig.paper().to_dict()) | {"on_bad_frame": "skip"}
+            off = ("anchors", "posterior", "merge")
+            defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in off}
+        if self.preset is not None:
+            preset = SPGFConfig.preset(self.preset).to_dict()
+            defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
+        return defaults
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
@@ -148,13 +170,7 @@ class RunOptions:
     @property
     def config(self) -> UfMStarConfig:
         """The configuration of UfM*."""
-        chosen = self.uncertainty
-        sections: dict[str, Any] = {}
-        for name, used in (("anchors", chosen.anchors or chosen.posterior), ("posterior", chosen.posterior)):
-            if chosen.ufm[name] is not None and not used:
-                raise ValueError(f"--ufm.{name}.* needs --{name}")
-            sections[name] = (chosen.ufm[name] or {}) if used else None
-        return UfMStarConfig.from_dict(chosen.ufm | sections)
+        return self.uncertainty.config
 
     def settings(self) -> dict[str, Any]:
         """Return the options that define the result, as plain values of a configuration file."""
@@ -174,15 +190,7 @@ def read(words: Sequence[str]) -> RunOptions:
     """
     prog = "ufmstar run"
     options = parse(RunOptions, words, prog)
-    defaults: dict[str, Any] = {}
-    if options.uncertainty.ufm_preset == "paper":
-        paper = UfMStarConfig.paper()
-        changed = flat(paper.to_dict()) | {"on_bad_frame": "skip"}
-        off = ("anchors", "posterior", "merge")
-        defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in off}
-    if options.uncertainty.preset is not None:
-        preset = SPGFConfig.preset(options.uncertainty.preset).to_dict()
-        defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
+    defaults = options.uncertainty.preset_defaults()
     return parse(RunOptions, words, prog, defaults) if defaults else options
 
 

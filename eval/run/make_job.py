@@ -58,7 +58,7 @@ def make_job(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameS
         indices=indices,
         source=source,
         config=config.within(source.max_depth),
-        recalibration=_recalibration(options, config, source),
+        recalibration=recalibration_of(options, config, source),
         device=torch.device(options["device"]),
         settings=options,
         every=options["model"] is not None and options["mode"] == "full",
@@ -69,7 +69,7 @@ def make_job(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameS
     )
 
 
-def _recalibration(options: Mapping[str, Any], config: UfMStarConfig, source: DepthSource) -> Recalibration | None:
+def recalibration_of(options: Mapping[str, Any], config: UfMStarConfig, source: DepthSource) -> Recalibration | None:
     """The map that is named or lies beside the weights; None = none.
 
     Raises:
