@@ -15,8 +15,8 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from ufmstar_torch.eval.commands.opening import SequenceOptions
-from ufmstar_torch.eval.commands.options import UsageError, as_dict, parse, positional
-from ufmstar_torch.eval.commands.run import NetworkOptions, UfMOptions
+from ufmstar_torch.eval.commands.options import UsageError, as_dict, positional
+from ufmstar_torch.eval.commands.run import NetworkOptions, UfMOptions, read_ufm
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 
 if TYPE_CHECKING:
@@ -100,10 +100,8 @@ class LiveOptions:
 
 
 def read(words: Sequence[str]) -> LiveOptions:
-    """The options of a command line; errors as :func:`parse`."""
-    options = parse(LiveOptions, words, "ufmstar live")
-    defaults = options.uncertainty.preset_defaults()
-    return parse(LiveOptions, words, "ufmstar live", defaults) if defaults else options
+    """The options of a command line; errors as :func:`read_ufm`."""
+    return read_ufm(LiveOptions, words, "ufmstar live", {})
 
 
 def main(options: LiveOptions) -> int:

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.opening import SequenceOptions
-from ufmstar_torch.eval.commands.options import UsageError, as_dict, fields_of, option, parse, positional
+from ufmstar_torch.eval.commands.options import T, UsageError, as_dict, fields_of, option, parse, positional
 from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.stateful import flat
 
 if TYPE_CHECKING:
+    from ufmstar_torch.eval.engine.predictions import DepthSource
     from ufmstar_torch.eval.run.job import RunJob
 
 PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
@@ -188,10 +189,16 @@ def read(words: Sequence[str]) -> RunOptions:
         ValueError: an unknown option, or values that are impossible or contradict each other.
         SystemExit: help was asked for.
     """
-    prog = "ufmstar run"
-    options = parse(RunOptions, words, prog)
-    defaults = options.uncertainty.preset_defaults()
-    return parse(RunOptions, words, prog, defaults) if defaults else options
+    return read_ufm(RunOptions, words, "ufmstar run", {})
+
+
+def read_ufm(kind: type[T], words: Sequence[str], prog: str, own: Mapping[str, Any]) -> T:
+    """The options of a command with :class:`UfMOptions`, whose presets are defaults; ``own`` are the command's, by
+    name. Errors as :func:`read`."""
+    options = parse(kind, words, prog, own)
+    chosen: UfMOptions = options.uncertainty  # type: ignore[attr-defined]
+    defaults = chosen.preset_defaults()
+    return parse(kind, words, prog, {**defaults, **own}) if defaults else options
 
 
 def main(options: RunOptions) -> int:
@@ -216,13 +223,14 @@ def main(options: RunOptions) -> int:
     return _report(summary, options.out)
 
 
-def job_from(options: RunOptions) -> RunJob:
-    """Open the sequence, and make the job that the options describe; errors as ``open_sequence`` and ``make_job``."""
+def job_from(options: RunOptions, networks: DepthSource | None = None) -> RunJob:
+    """Open the sequence, and make the job that the options describe, with the networks of an earlier one; errors as
+    ``open_sequence`` and ``make_job``."""
     from ufmstar_torch.eval.run.make_job import make_job
     from ufmstar_torch.eval.sequences.open import open_sequence
 
     sequence = open_sequence(options.sequence, **options.opening.given())
-    return make_job(options.settings(), options.config, sequence)
+    return make_job(options.settings(), options.config, sequence, networks)
 
 
 def _report(summary: Mapping[str, Any], out: str) -> int:
