@@ -55,7 +55,6 @@ MISTAKES = {
     "processes": (["{}", "--processes", "0"], "--processes must be at least 1"),
     "threads": (["{}", "--threads", "0"], "--threads must be at least 1"),
     "sequences": (["{}", "--sequences", "0"], "--sequences must be at least 1"),
-    "confident": (["{}", "--confident", "2"], "--confident must be a share"),
     "list of nothing": (["{}", "--sequence-list", "/nowhere.txt"], "/nowhere.txt"),
     "unknown option": (["{}", "--etaa", "1"], "--etaa"),
     "device": (["{}", "--device", "abacus"], "--device abacus is not available"),
@@ -85,7 +84,7 @@ def test_an_evaluation_ends_with_its_table_and_report(ufmstar, rooms, tmp_path):
     assert (out / "tables" / "main.md").is_file()
     assert err.count("rooms/") == 3
     about = json.loads((out / "eval.json").read_text())
-    assert about["settings"] == {"frames": [0, 2, None], "confident": 0.5}
+    assert about["settings"] == {"frames": [0, 2, None]}
     code, _, err = ufmstar(*words_for(rooms, out, "--frames", "0:2"))
     assert (code, "--resume goes on with it" in err) == (2, True)
     code, _, err = ufmstar(*words_for(rooms, out, "--resume"))

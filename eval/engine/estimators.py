@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.engine.predictions import Predicted
+from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured
@@ -70,14 +70,14 @@ class Estimator(ABC):
 
 
 def make_estimator(
-    row: Row, device: torch.device, max_depth: float | None = None, own: Mapping[str, Any] = MappingProxyType({})
+    row: Row, device: torch.device, source: DepthSource | None = None, own: Mapping[str, Any] = MappingProxyType({})
 ) -> Estimator:
     """The estimator of a row, in its initial state.
 
     Args:
         row: method and setting.
         device: where it runs.
-        max_depth: [m] the largest depth that the row's networks can predict, None where it is not known.
+        source: of its depth, which states a largest depth and a confidence; None: neither.
         own: methods of one's own (``sequences.plugins``), by name.
 
     Raises:
@@ -96,7 +96,8 @@ def make_estimator(
         estimator: Estimator = own[method.fusion](row, device)
         return estimator
     fitted = Recalibration.from_json(setting.recalibration) if setting.recalibration else None
-    config = ufm_star_config(row).within(max_depth)
+    config = ufm_star_config(row)
+    config = config if source is None else config.within(source.max_depth, source.states_confidence)
     return Gaussians(config, device, setting, uses_variances=method.uses_aleatoric, recalibration=fitted)
 
 
@@ -206,4 +207,5 @@ class Gaussians(Estimator):
 
 def _used(predicted: Predicted, uses_variances: bool) -> DepthPrediction:
     """The prediction, without A and E unless the row uses them."""
-    return predicted.maps if uses_variances else DepthPrediction(predicted.maps.depth)
+    maps = predicted.maps
+    return maps if uses_variances else DepthPrediction(maps.depth, confidence=maps.confidence)
