@@ -7,7 +7,7 @@ same, from the same weights and with as many steps; views of the same rooms from
 
     python examples/active_learning.py --out results.json
 
-`ufmstar_torch.train` trains networks; `examples/pool_to_csv.py` scores your own images.
+`ufmstar_torch.train` trains networks; `ufmstar rank` scores your own images.
 """
 
 from __future__ import annotations

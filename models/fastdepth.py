@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -25,8 +26,10 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_file
 from ufmstar_torch.models.dropout import DecoderDropout
-from ufmstar_torch.models.network import Backbone, require_image
+from ufmstar_torch.models.network import Backbone, DepthNetwork, require_image
+from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec, load_onnx, providers_for
 from ufmstar_torch.models.onnx_weights import read_convolutions
+from ufmstar_torch.models.outputs import METRIC, OutputSpec, ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 
 MULTIPLE = 32  # [px] five halvings
@@ -274,15 +277,42 @@ class FastDepth(Backbone):
 
 
 def load_fastdepth(
-    weights: Path, size: tuple[int, int] = (224, 224), dropout: float = 0.0, positive: str = "relu"
-) -> FastDepth:
-    """The network in an ONNX export or a state_dict file, with the widths of the file. Raises ValueError: the file does
-    not fit, or ``positive`` contradicts an ONNX export, which ends in a ReLU; FileNotFoundError, ModuleNotFoundError:
-    as :meth:`FastDepth.from_onnx` and ``load_state_dict_file``."""
+    weights: Path,
+    size: tuple[int, int] = (224, 224),
+    dropout: float = 0.0,
+    positive: str = "relu",
+    *,
+    runtime: str = "auto",
+    threads: int | None = None,
+    device: torch.device | str = "cpu",
+) -> DepthNetwork:
+    """The network in an ONNX export, a .tflite file or a state_dict file, with the widths of the file.
+
+    Args:
+        weights: the file.
+        size, dropout, positive: as in :class:`FastDepth`.
+        runtime: "auto": an ONNX export without dropout runs in ONNX Runtime, where that is installed and has a provider
+            for the device; "onnx": it has to, where it can; "torch": as a :class:`FastDepth`, which can be trained.
+        threads: of ONNX Runtime or LiteRT; None: as many as torch uses.
+        device: where it will run.
+
+    Raises:
+        ValueError: the file does not fit, ``runtime`` is unknown, or ``positive`` contradicts an ONNX export, which
+            ends in a ReLU.
+        FileNotFoundError, ModuleNotFoundError: as :meth:`FastDepth.from_onnx` and ``load_state_dict_file``.
+    """
+    if runtime not in ("auto", "onnx", "torch"):
+        raise ValueError(f"runtime must be 'auto', 'onnx' or 'torch', got {runtime!r}")
+    threads = threads or torch.get_num_threads()
+    if weights.suffix == ".tflite":
+        from ufmstar_torch.models.litert_network import LiteRTNetwork
+
+        return LiteRTNetwork(weights, ProgramSpec(OutputSpec(METRIC), Preprocess.nyu(size)), threads=threads)
     if weights.suffix == ".onnx":
         if positive != "relu":
             raise ValueError(f"an ONNX export of FastDepth ends in a ReLU, got positive={positive!r}")
-        return FastDepth.from_onnx(weights, dropout=dropout, size=size)
+        network = FastDepth.from_onnx(weights, dropout=dropout, size=size)
+        return _graph(network, weights, runtime, threads, torch.device(device)) or network
     state = load_state_dict_file(weights)
     try:
         widths = FastDepthWidths.of_state_dict(state)
@@ -294,12 +324,43 @@ def load_fastdepth(
     return network
 
 
+def _graph(network: FastDepth, weights: Path, runtime: str, threads: int, device: torch.device) -> OnnxNetwork | None:
+    """The file in ONNX Runtime, where that can replace the network that was read from it."""
+    if network.dropout or runtime == "torch" or (runtime == "auto" and find_spec("onnxruntime") is None):
+        return None
+    providers = providers_for(device)
+    if runtime == "auto" and device.type != "cpu" and len(providers) == 1:
+        return None
+    graph = OnnxNetwork(weights, OnnxSpec(OutputSpec(METRIC)), threads=threads, providers=providers)
+    if any(own not in (None, side) for own, side in zip(graph.size, network.size, strict=True)):
+        return None
+    graph.preprocess = network.preprocess
+    return graph
+
+
+def load_graph(
+    weights: Path, spec: OnnxSpec | Mapping[str, Any] | str | Path | None = None, **options: Any
+) -> OnnxNetwork:
+    """Any ONNX network, as ``load_onnx``; a FastDepth whose spec has no ``preprocess`` gets FastDepth's own crop,
+    instead of an image that is stretched."""
+    declared = OnnxSpec.required(spec)
+    network = load_onnx(weights, declared, **options)
+    if declared.preprocess is None and find_spec("onnx") is not None and _is_fastdepth(weights):
+        network.preprocess = Preprocess.nyu(network.preprocess.size or (224, 224))
+    return network
+
+
+def _is_fastdepth(weights: Path) -> bool:
+    try:
+        FastDepth.from_onnx(weights)
+    except ValueError:
+        return False
+    return True
+
+
 def _require_same_function(network: FastDepth, path: str | Path) -> None:
     """Raises ValueError where ONNX Runtime returns another depth than the network, on an image of large noise, which
     reaches both ends of the activations."""
-    from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
-    from ufmstar_torch.models.outputs import METRIC, OutputSpec
-
     if find_spec("onnxruntime") is None:
         warnings.warn(
             f"without onnxruntime, {path} runs in torch, more slowly, and is not compared with its graph: "

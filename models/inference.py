@@ -1,8 +1,9 @@
 """Loaded networks as they run fastest where nothing is trained: ONNX Runtime, or torch's better form of them.
 
 Weights that come as an ONNX file run in ONNX Runtime on the processor, and on a GPU where it has its
-provider. Everything else runs in torch: ``Backbone`` networks with channels last, FastDepth with its batch norms folded
-(docs/results/speed.md has the times). The results equal those of the loaded network up to rounding.
+provider; a .tflite file in LiteRT. Everything else runs in torch: ``Backbone`` networks with channels last, FastDepth
+with its batch norms folded (docs/results/speed.md has the times). The results equal those of the loaded network up to
+rounding.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,9 @@ from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.fastdepth import FastDepth
 from ufmstar_torch.models.heads import UncertaintyNetwork
+from ufmstar_torch.models.litert_network import LiteRTNetwork
 from ufmstar_torch.models.network import Backbone, DepthNetwork
-from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec, providers_for
-from ufmstar_torch.models.outputs import METRIC, OutputSpec
+from ufmstar_torch.models.onnx_network import OnnxNetwork, providers_for
 
 ONNX, TORCH = "onnx", "torch"
 BF16 = "bf16"
@@ -54,9 +54,12 @@ class Inference(Checked):
 
     def options(self, model: str, device: torch.device) -> dict[str, Any]:
         """Further arguments of ``load_network`` for a model of that name."""
-        if model != "onnx":
-            return {}
-        return {"threads": self.threads or torch.get_num_threads(), "providers": providers_for(device)}
+        threads = {"threads": self.threads or torch.get_num_threads()}
+        if model == "onnx":
+            return {**threads, "providers": providers_for(device)}
+        if model == "fastdepth":
+            return {**threads, "runtime": TORCH if self._torch_only else self.runtime, "device": device}
+        return threads if model == "litert" else {}
 
     def ready(self, network: DepthNetwork, weights: Path, device: torch.device) -> DepthNetwork:
         """The network in the form in which it runs on ``device``; the one given stays as it is.
@@ -68,15 +71,13 @@ class Inference(Checked):
 
         Raises:
             ValueError: the runtime or the precision is not one for these weights.
-            ModuleNotFoundError: ``onnxruntime`` is asked for and not installed (extra ``models``).
         """
-        if isinstance(network, OnnxNetwork):
-            if self._torch_only:
+        if isinstance(network, OnnxNetwork | LiteRTNetwork):
+            name = "ONNX Runtime" if isinstance(network, OnnxNetwork) else "LiteRT"
+            if self._torch_only or (self.runtime == ONNX and name == "LiteRT"):
                 asked = f"runtime {self.runtime} in {self.precision}"
-                raise ValueError(f"{weights} is a graph that only ONNX Runtime runs, not {asked}")
+                raise ValueError(f"{weights} is a graph that only {name} runs, not {asked}")
             return network
-        if (graph := self._graph(network, weights, device)) is not None:
-            return graph
         if self.runtime == ONNX:
             raise ValueError(
                 "runtime onnx needs weights in an ONNX file, of the input's size and without dropout that samples, "
@@ -88,27 +89,15 @@ class Inference(Checked):
     def _torch_only(self) -> bool:
         return self.runtime == TORCH or self.precision == BF16
 
-    def _graph(self, network: DepthNetwork, weights: Path, device: torch.device) -> OnnxNetwork | None:
-        """The file in ONNX Runtime, where that can replace the torch network of ours that was read from it."""
-        if weights.suffix != ".onnx" or not isinstance(network, FastDepth) or network.dropout:
-            return None
-        if self.runtime != ONNX:
-            if self._torch_only or find_spec("onnxruntime") is None:
-                return None
-            if device.type != "cpu" and len(providers_for(device)) == 1:
-                return None
-        graph = OnnxNetwork(weights, OnnxSpec(OutputSpec(METRIC)), **self.options("onnx", device))
-        if any(own not in (None, side) for own, side in zip(graph.size, network.size, strict=True)):
-            return None
-        graph.preprocess = network.preprocess
-        return graph
-
 
 def runtime_of(network: nn.Module, precision: str) -> dict[str, Any]:
     """The runtime of a network, for the record: name, version, threads, provider (ONNX Runtime) and precision."""
     if isinstance(network, OnnxNetwork):
         own = {"provider": network.session.get_providers()[0], "threads": network.threads or None}
         return {"name": "onnxruntime", "version": version("onnxruntime"), **own, "precision": "as in the file"}
+    if isinstance(network, LiteRTNetwork):
+        own = {"version": version("ai-edge-litert"), "threads": network.threads or None}
+        return {"name": "litert", **own, "precision": "as in the file"}
     return {"name": "torch", "version": torch.__version__, "threads": torch.get_num_threads(), "precision": precision}
 
 

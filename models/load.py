@@ -14,8 +14,9 @@ _LOADERS = {
     "exported": ("any_network", "load_exported"),
     "fastdepth": ("fastdepth", "load_fastdepth"),
     "huggingface": ("hugging_face", "load_hugging_face"),
+    "litert": ("litert_network", "load_litert"),
     "monodepth2": ("monodepth2_import", "load_monodepth_resnet"),
-    "onnx": ("onnx_network", "load_onnx"),
+    "onnx": ("fastdepth", "load_graph"),
     "torchscript": ("any_network", "load_torchscript"),
     "trained": ("trained", "load_ensemble"),
 }
@@ -35,14 +36,16 @@ def load_network(name: str, weights: str | Path | None = None, **options: Any) -
         name: one of :func:`network_names`.
         weights: the file it is loaded from.
         options: what the network of that name takes:
-            fastdepth: ``size``, ``dropout``, and ``positive`` with a state_dict. ``weights``: an ONNX export, or a
-                state_dict (.pth, .pt, .safetensors).
+            fastdepth: ``size``, ``dropout``, ``positive`` with a state_dict, ``runtime``, ``threads`` and ``device``.
+                ``weights``: an ONNX export, which runs in ONNX Runtime (``runtime="torch"``: in torch), a .tflite file,
+                or a state_dict (.pth, .pt, .safetensors).
             monodepth2: ``strides`` ("v1.5" or "v1"), ``size``, ``dropout``. ``weights``: a state_dict. Or a folder with
                 Monodepth2's published encoder.pth and depth.pth, and ``spec`` (see ``PublishedSpec``).
             trained: ``backbone``, of a head on a module of one's own. ``weights``: a file of ``save_trained``; where
                 it has several members, all of them as one network (``Ensemble``). ``load_trained`` gives them one by
                 one, and takes several files.
             onnx: ``spec`` (an ``OnnxSpec``, a dict or a JSON file), ``threads``, ``providers``.
+            litert: ``spec`` (a ``ProgramSpec``, a dict or a JSON file), ``threads``. ``weights``: a .tflite file.
             depth_anything: ``spec`` with "size", "keep_aspect" and, for a relative checkpoint, "alignment" (a dict or
                 a JSON file). ``weights``: a directory or hub name of ``transformers``.
             huggingface: ``spec`` with "kind" and what else ``from_hugging_face`` takes. ``weights`` as above.

@@ -1,4 +1,4 @@
-"""Tiny copies of layouts that calibrate their cameras themselves: COLMAP, transforms.json, EuRoC."""
+"""Tiny copies of layouts that calibrate their cameras themselves: COLMAP, transforms.json, EuRoC, ARKit."""
 
 from __future__ import annotations
 
@@ -119,4 +119,44 @@ def write_euroc(root, frames=6, coefficients=(0.0, 0.0, 0.0, 0.0), model="radial
         f"resolution: [{W}, {H}]\ncamera_model: pinhole\nintrinsics: {focal_and_centre(0)}\n"
         f"distortion_model: {model}\ndistortion_coefficients: {list(coefficients)}\n"
     )
+    return path, scene
+
+
+def write_stray(root, frames=6, *, per_frame=False):
+    """A phone's folder: a video (lossless here), depth of half its size, of which row 0 has no confidence."""
+    path, scene = root / "4f3a2b", layouts.truth(K, frames)
+    path.mkdir(parents=True)
+    layouts.write_video(path / "rgb.mkv", scene.images)
+    (path / "rgb.mkv").rename(path / "rgb.mp4")
+    rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw" + ", fx, fy, cx, cy" * per_frame]
+    for i, T in enumerate(scene.T_world_cam):
+        camera = f" {' '.join(map(str, focal_and_centre(0)))}" * per_frame
+        values = f"{100 + i / 60} {i:06d} {layouts.quaternion_line(T)}{camera}"
+        rows.append(", ".join(values.split()))
+        layouts.write_depth_png(path / "depth" / f"{i:06d}.png", scene.depths[i][::2, ::2], 1000)
+        confidence = np.full((H // 2, W // 2), 2, np.uint8)
+        confidence[0] = 0
+        layouts.write_image(path / "confidence" / f"{i:06d}.png", confidence)
+    (path / "odometry.csv").write_text("\n".join(rows))
+    matrix = np.eye(3) if per_frame else scene.K
+    (path / "camera_matrix.csv").write_text("\n".join(", ".join(f"{x:.17g}" for x in row) for row in matrix))
+    return path, scene
+
+
+def write_arkitscenes(root, frames=6):
+    """Images at 10 Hz; the trajectory's times have more digits than the files' names."""
+    path, scene = root / "41048190", layouts.truth(K, frames)
+    inside, lines = path / "41048190_frames", []
+    for name in ("lowres_wide", "lowres_depth", "lowres_wide_intrinsics"):
+        (inside / name).mkdir(parents=True)
+    for i, T in enumerate(scene.T_world_cam):
+        stem = f"41048190_{3377.181 + i / 10:.3f}"
+        layouts.write_image(inside / "lowres_wide" / f"{stem}.png", scene.images[i])
+        layouts.write_depth_png(inside / "lowres_depth" / f"{stem}.png", scene.depths[i], 1000)
+        values = [W, H, *focal_and_centre(0)]
+        (inside / "lowres_wide_intrinsics" / f"{stem}.pincam").write_text(" ".join(f"{x:.17g}" for x in values))
+        inverse = np.linalg.inv(T)
+        rotation = Rotation.from_matrix(inverse[:3, :3]).as_rotvec()
+        lines.append(" ".join(f"{x:.12g}" for x in (3377.18127 + i / 10, *rotation, *inverse[:3, 3])))
+    (inside / "lowres_wide.traj").write_text("\n".join(lines))
     return path, scene

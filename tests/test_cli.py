@@ -99,7 +99,7 @@ def test_help_loads_nothing_beyond_the_package():
 
 # The words behind ``ufmstar run SEQUENCE --out OUT``, or a whole line, and what the message contains.
 MISTAKES = {
-    "unknown command": ("ufmstar walk", "no command 'walk', there are demo, run, eval,"),
+    "unknown command": ("ufmstar walk", "no command 'walk', there are demo, run, rank, eval,"),
     "no sequence": ("ufmstar run", "sequence"),
     "no out": ("ufmstar run {path} --depth self", "out"),
     "no such sequence": ("ufmstar run /nowhere --depth self --out {out}", "no such file or folder: /nowhere"),
@@ -154,15 +154,6 @@ def test_debug_shows_the_traceback(ufmstar, tmp_path):
     code, _, err = ufmstar("run", "/nowhere", "--depth", "self", "--out", tmp_path / "out", "--debug")
     assert code == 2
     assert "Traceback" in err
-
-
-def test_an_unknown_key_in_a_file_is_reported(ufmstar, path, tmp_path):
-    for text, expected in (('{"ufm": {"etaa": 0.3}}', "etaa"), ('{"modell": "fastdepth"}', "modell")):
-        (tmp_path / "c.json").write_text(text)
-        words = ("run", path, "--depth", "self", "--config", tmp_path / "c.json", "--out", tmp_path / "out")
-        code, _, err = ufmstar(*words)
-        assert (code, err.count("\n")) == (2, 1)
-        assert expected in err
 
 
 # ---- options ----

@@ -111,7 +111,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: wrap_network(lambda x: 3.0)(IMAGE), "got float"),
     (lambda: load_network("fast", "w.pth"), "'fast', expected one of"),
     (lambda: load_network("fastdepth"), "'fastdepth' needs weights"),
-    (lambda: load_network("fastdepth", "w.pth", threads=3), "threads"),
+    (lambda: load_network("fastdepth", "w.pth", strides=3), "strides"),
     (lambda: load_network("onnx", "n"), "needs a spec"),
     (lambda: load_network("exported", "n", spec=METRIC), r"no \['kind'\]"),
     (lambda: small_network()(torch.zeros(1, 3, 240, 320)), "image .*multiples of 32"),

@@ -15,6 +15,7 @@ import train_own_head as example
 EXAMPLE = Path(example.__file__)
 
 
+@pytest.mark.slow
 def test_its_table_has_every_row(tmp_path, capsys, monkeypatch):
     few = {"tours": 1, "validation_tours": 1, "tour_frames": 4, "batch_size": 4, "cache": str(tmp_path)}
     monkeypatch.setattr(example, "DATA", replace(example.DATA, **few))

@@ -1,4 +1,4 @@
-"""COLMAP, transforms.json and EuRoC: what is read equals what was written; lenses; truncated and hostile files."""
+"""COLMAP, transforms.json, EuRoC, ARKit: what is read equals what was written; lenses; truncated and hostile files."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from ufmstar_torch.eval.engine.maps import own_depth
 from ufmstar_torch.eval.run.scale import network_scale, require_metric
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.colmap import read_landmarks
+from ufmstar_torch.eval.sequences.intrinsics import scale_intrinsics
 from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
 from ufmstar_torch.eval.suite.work_items import WorkItem
 
@@ -35,6 +36,9 @@ WRITERS = {
     "transforms": written.write_transforms,
     "transforms-per-frame": lambda root: written.write_transforms(root, per_frame=True),
     "euroc": written.write_euroc,
+    "stray": written.write_stray,
+    "stray-per-frame": lambda root: written.write_stray(root, per_frame=True),
+    "arkitscenes": written.write_arkitscenes,
 }
 
 
@@ -52,6 +56,11 @@ def test_what_is_read_is_what_was_written(tmp_path, kind):
         if sequence.layout == "euroc":
             assert frame.depth is None
             assert frame.timestamp == pytest.approx(1403715273.262142976 + 0.05 * i, abs=1e-6)
+        elif sequence.layout == "stray":
+            assert frame.timestamp == pytest.approx(100 + i / 60)
+            assert not frame.depth[0].any()
+            np.testing.assert_allclose(frame.depth[1:], truth.depths[i][2::2, ::2], atol=5e-4 + 1e-6)
+            np.testing.assert_allclose(frame.depth_intrinsics, scale_intrinsics(truth.K, (48, 64), (24, 32)))
         else:
             np.testing.assert_allclose(frame.depth, truth.depths[i], atol=5e-4 + 1e-6)
 
@@ -234,7 +243,7 @@ def test_damaged_files_are_named_or_their_frames_skipped(tmp_path, kind):
     file."""
     path, truth, *_ = WRITERS[kind](tmp_path / "good")
     rng, messages = random.Random(0), []
-    suffixes = (".bin", ".txt", ".json", ".csv", ".yaml")
+    suffixes = (".bin", ".txt", ".json", ".csv", ".yaml", ".traj", ".pincam")
     for file in sorted(f for f in path.rglob("*") if f.suffix in suffixes and "points3D" not in f.name):
         whole = file.read_bytes()
         cuts = [whole[: rng.randrange(len(whole))] for _ in range(12)]
@@ -321,3 +330,41 @@ def test_euroc_without_truth_and_with_a_trajectory(tmp_path):
         np.testing.assert_allclose(
             open_sequence(place, trajectory=trajectory)[4].T_world_cam, truth.T_world_cam[4], atol=1e-9
         )
+
+
+def test_hostile_arkit_folders(tmp_path):
+    path, truth = written.write_stray(tmp_path)
+    good = (path / "odometry.csv").read_text()
+    lines = good.splitlines()
+    for text, message in (
+        (good.replace(" qw", " q"), "must name the column 'qw'"),
+        ("\n".join([lines[0], lines[1] + ", 1"]), "odometry.csv:2: expected 9 numbers as in the first line, got 10"),
+        (good.replace("000003", "3.5"), "odometry.csv:5: the frame must be a number from 0 on, got 3.5"),
+        (lines[0], "has no usable frame"),
+    ):
+        (path / "odometry.csv").write_text(text)
+        with pytest.raises(ValueError, match=message):
+            open_sequence(path)
+    (path / "odometry.csv").write_text(good.replace("000005", "000077"))
+    layouts.truncate(path / "depth" / "000001.png")
+    layouts.write_image(path / "confidence" / "000002.png", np.ones((3, 3), np.uint8))
+    sequence, errors = open_sequence(path), []
+    assert [frame.index for frame in sequence.readable(errors.append)] == [0, 3, 4]
+    assert [(skipped.name, skipped.reason) for skipped in sequence.skipped] == [
+        ("000077", "beyond the end of the video")
+    ]
+    assert [error.path.parent.name for error in errors] == ["depth", "confidence"]
+    layouts.truncate(path / "rgb.mp4", 0.01)
+    with pytest.raises(ValueError, match=r"rgb\.mp4"):
+        open_sequence(path)
+
+    path, truth = written.write_arkitscenes(tmp_path)
+    cameras = sorted((path / "41048190_frames" / "lowres_wide_intrinsics").iterdir())
+    cameras[0].rename(cameras[0].with_name("41048190_3377.182.pincam"))  # rounded otherwise
+    cameras[1].unlink()
+    sequence = open_sequence(path / "41048190_frames")
+    assert [skipped.reason for skipped in sequence.skipped] == ["no camera at its time"]
+    np.testing.assert_allclose(sequence[0].T_world_cam, truth.T_world_cam[0], atol=1e-9)
+    cameras[2].write_text("64 48 50 -50 31 23")
+    with pytest.raises(ValueError, match="expected width height fx fy cx cy"):
+        open_sequence(path)

@@ -15,7 +15,7 @@ from ufmstar_torch.eval.sequences.frame import parse_slice
 
 PRESETS = ("paper", "default")
 # Options that a job has under their names.
-_OF_JOB = ("device", "confident", "bins", "examples", "samples", "runtime", "precision")
+_OF_JOB = ("device", "bins", "examples", "samples", "runtime", "precision")
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.suite.job import EvalJob
@@ -80,7 +80,6 @@ class EvalOutputOptions:
         overwrite: replace the evaluation in --out; predictions in its cache are kept
         cache: folder of the networks' predictions; default: OUT/cache
         examples: number of sequences of each data set of which some frames are kept for pictures
-        confident: share of a frame's pixels of which a method counts as confident
         bins: of the calibration errors: ours (10 bins, 10 levels) or authors (100 bins, 101 levels); default: ours
         no_report: no tables and figures at the end; ufmstar report OUT makes them
     """
@@ -90,7 +89,6 @@ class EvalOutputOptions:
     overwrite: bool = False
     cache: str | None = None
     examples: int = 3
-    confident: float = 0.5
     bins: str = option("ours", choices=("ours", "authors"))
     no_report: bool = False
 
@@ -140,8 +138,6 @@ class EvalOptions:
         for name, least in least_of.items():
             if values[name] is not None and values[name] < least:
                 raise ValueError(f"--{name} must be at least {least}, got {values[name]}")
-        if not 0 < self.output.confident <= 1:
-            raise ValueError(f"--confident must be a share in (0, 1], got {self.output.confident}")
         if self.output.resume and self.output.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
         if self.shard and self.slurm:

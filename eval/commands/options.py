@@ -228,7 +228,7 @@ def _form(f: Field[Any], hint: Any) -> tuple[list[str], dict[str, Any]]:
         kind = reduce(or_, (part for part in parts if part is not types.NoneType))
     if get_origin(kind) is tuple and get_args(kind)[-1] is Ellipsis:
         kind = get_args(kind)[0]
-        how |= {"nargs": "+", "default": list(default)}
+        how |= {"nargs": "+"} | ({} if default is MISSING else {"default": list(default)})
         if f.metadata.get("repeat"):
             how["action"] = "extend"
     elif "const" in f.metadata:

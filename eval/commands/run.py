@@ -9,16 +9,21 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.opening import SequenceOptions
-from ufmstar_torch.eval.commands.options import UsageError, as_dict, fields_of, option, parse, positional
+from ufmstar_torch.eval.commands.options import T, UsageError, as_dict, fields_of, option, parse, positional
 from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.stateful import flat
 
 if TYPE_CHECKING:
+    from ufmstar_torch.eval.engine.predictions import DepthSource
     from ufmstar_torch.eval.run.job import RunJob
 
 PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
 _OF_FOLDER = ("variance", "depth_scale", "map_intrinsics")
+
+
+# Of UfM*'s settings, those that are off by default.
+_SECTIONS = ("anchors", "confidence", "posterior", "merge")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +31,8 @@ class NetworkOptions:
     """Depth from networks.
 
     Attributes:
-        model: kind of network: fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, torchscript or
-            exported
+        model: kind of network: fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, litert, torchscript
+            or exported
         weights: file (depth_anything, huggingface: directory); several are the members of an ensemble
         mode: of an ensemble: one member per image in turn, or all on every image
         samples: passes per image of an mc_dropout network in mode full; default: 10
@@ -93,6 +98,27 @@ class UfMOptions:
     recalibration: str | None = None
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
 
+    @property
+    def config(self) -> UfMStarConfig:
+        """The configuration. Raises ValueError: settings of anchors or posterior without them."""
+        sections: dict[str, Any] = {}
+        for name, used in (("anchors", self.anchors or self.posterior), ("posterior", self.posterior)):
+            if self.ufm[name] is not None and not used:
+                raise ValueError(f"--ufm.{name}.* needs --{name}")
+            sections[name] = (self.ufm[name] or {}) if used else None
+        return UfMStarConfig.from_dict(self.ufm | sections)
+
+    def preset_defaults(self) -> dict[str, Any]:
+        """Other defaults than the options' own, by their names, as ``preset`` and ``ufm_preset`` ask."""
+        defaults: dict[str, Any] = {}
+        if self.ufm_preset == "paper":
+            changed = flat(UfMStarConfig.paper().to_dict()) | {"on_bad_frame": "skip"}
+            defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in _SECTIONS}
+        if self.preset is not None:
+            preset = SPGFConfig.preset(self.preset).to_dict()
+            defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
+        return defaults
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
@@ -148,20 +174,13 @@ class RunOptions:
     @property
     def config(self) -> UfMStarConfig:
         """The configuration of UfM*."""
-        chosen = self.uncertainty
-        sections: dict[str, Any] = {}
-        for name, used in (("anchors", chosen.anchors or chosen.posterior), ("posterior", chosen.posterior)):
-            if chosen.ufm[name] is not None and not used:
-                raise ValueError(f"--ufm.{name}.* needs --{name}")
-            sections[name] = (chosen.ufm[name] or {}) if used else None
-        return UfMStarConfig.from_dict(chosen.ufm | sections)
+        return self.uncertainty.config
 
     def settings(self) -> dict[str, Any]:
         """Return the options that define the result, as plain values of a configuration file."""
         started = ("resume", "overwrite", "debug")
         plain = {name: value for name, value in as_dict(self).items() if name not in started}
-        sections = ("anchors", "posterior", "merge")
-        ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in sections}
+        ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in _SECTIONS}
         return plain | {"ufm": ufm}
 
 
@@ -172,18 +191,16 @@ def read(words: Sequence[str]) -> RunOptions:
         ValueError: an unknown option, or values that are impossible or contradict each other.
         SystemExit: help was asked for.
     """
-    prog = "ufmstar run"
-    options = parse(RunOptions, words, prog)
-    defaults: dict[str, Any] = {}
-    if options.uncertainty.ufm_preset == "paper":
-        paper = UfMStarConfig.paper()
-        changed = flat(paper.to_dict()) | {"on_bad_frame": "skip"}
-        off = ("anchors", "posterior", "merge")
-        defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in off}
-    if options.uncertainty.preset is not None:
-        preset = SPGFConfig.preset(options.uncertainty.preset).to_dict()
-        defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
-    return parse(RunOptions, words, prog, defaults) if defaults else options
+    return read_ufm(RunOptions, words, "ufmstar run", {})
+
+
+def read_ufm(kind: type[T], words: Sequence[str], prog: str, own: Mapping[str, Any]) -> T:
+    """The options of a command with :class:`UfMOptions`, whose presets are defaults; ``own`` are the command's, by
+    name. Errors as :func:`read`."""
+    options = parse(kind, words, prog, own)
+    chosen: UfMOptions = options.uncertainty  # type: ignore[attr-defined]
+    defaults = chosen.preset_defaults()
+    return parse(kind, words, prog, {**defaults, **own}) if defaults else options
 
 
 def main(options: RunOptions) -> int:
@@ -208,13 +225,14 @@ def main(options: RunOptions) -> int:
     return _report(summary, options.out)
 
 
-def job_from(options: RunOptions) -> RunJob:
-    """Open the sequence, and make the job that the options describe; errors as ``open_sequence`` and ``make_job``."""
+def job_from(options: RunOptions, networks: DepthSource | None = None) -> RunJob:
+    """Open the sequence, and make the job that the options describe, with the networks of an earlier one; errors as
+    ``open_sequence`` and ``make_job``."""
     from ufmstar_torch.eval.run.make_job import make_job
     from ufmstar_torch.eval.sequences.open import open_sequence
 
     sequence = open_sequence(options.sequence, **options.opening.given())
-    return make_job(options.settings(), options.config, sequence)
+    return make_job(options.settings(), options.config, sequence, networks)
 
 
 def _report(summary: Mapping[str, Any], out: str) -> int:

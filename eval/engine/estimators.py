@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.engine.predictions import Predicted
+from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
 from ufmstar_torch.eval.methods.method import ALONE, UFM
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured
@@ -68,13 +68,13 @@ class Estimator(ABC):
             raise ValueError(f"the saved state lacks {result.missing_keys} and has {result.unexpected_keys} too many")
 
 
-def make_estimator(row: Row, device: torch.device, max_depth: float | None = None) -> Estimator:
+def make_estimator(row: Row, device: torch.device, source: DepthSource | None = None) -> Estimator:
     """The estimator of a row, in its initial state.
 
     Args:
         row: method and setting.
         device: where it runs.
-        max_depth: [m] the largest depth that the row's networks can predict, None where it is not known.
+        source: of its depth, which states a largest depth and a confidence; None: neither.
 
     Raises:
         ValueError: a recalibration that was fitted under other settings.
@@ -87,7 +87,8 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
         points = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
         return Pointwise(points, uses_variances=method.uses_aleatoric)
     fitted = Recalibration.from_json(setting.recalibration) if setting.recalibration else None
-    config = ufm_star_config(row).within(max_depth)
+    config = ufm_star_config(row)
+    config = config if source is None else config.within(source.max_depth, source.states_confidence)
     return Gaussians(config, device, setting, uses_variances=method.uses_aleatoric, recalibration=fitted)
 
 
@@ -197,4 +198,5 @@ class Gaussians(Estimator):
 
 def _used(predicted: Predicted, uses_variances: bool) -> DepthPrediction:
     """The prediction, without A and E unless the row uses them."""
-    return predicted.maps if uses_variances else DepthPrediction(predicted.maps.depth)
+    maps = predicted.maps
+    return maps if uses_variances else DepthPrediction(maps.depth, confidence=maps.confidence)

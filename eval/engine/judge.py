@@ -1,8 +1,8 @@
 """Figures against ground truth, as sinks of a stream: of a run, and of the rows of an evaluation.
 
 For the figure of NLL by error, the paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is
-confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, the share ``confident``
-of the reference's pixels with the smallest variance, of every frame. All rows on the same frames are judged on the same
+confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, the half of
+the reference's pixels with the smallest variance, of every frame. All rows on the same frames are judged on the same
 pixels.
 """
 
@@ -182,11 +182,10 @@ class RowJudge:
 
 
 class RowJudges(FrameSink):
-    """Judges every row of an evaluation, by key; of the pixels of a frame, a reference counts the share ``confident``
-    as confident."""
+    """Judges every row of an evaluation, by key."""
 
-    def __init__(self, judges: Mapping[str, RowJudge], confident: float) -> None:
-        self._judges, self._confident = judges, confident
+    def __init__(self, judges: Mapping[str, RowJudge]) -> None:
+        self._judges = judges
 
     def begin(self, stream: FrameStream) -> None:
         self._estimators = {row.key: row.estimator for row in stream.rows}
@@ -197,7 +196,7 @@ class RowJudges(FrameSink):
             self._judges[key].reasons[reason] += 1
         judged = [key for key, row in result.rows.items() if row.truth is not None]
         expected = {other for key in judged for other in self._judges[key].named}
-        masks = {other: confident_pixels(result.rows[other], self._confident) for other in expected}
+        masks = {other: confident_pixels(result.rows[other]) for other in expected}
         for key, row in result.rows.items():
             self._judges[key].add(row, self._estimators[key].memory(), masks)
 
@@ -225,14 +224,11 @@ def references(row: Row, rows: Sequence[Row]) -> list[Row]:
     return chosen
 
 
-def confident_pixels(row: RowResult, share: float) -> Tensor:
-    """[h, w] bool, True where there is ground truth and the variance is at or below the frame's ``share`` quantile,
-    in (0, 1]."""
+def confident_pixels(row: RowResult) -> Tensor:
+    """[h, w] bool, True where there is ground truth and the variance is at or below the frame's median."""
     assert row.variance is not None
     assert row.truth is not None
     judged = row.valid & torch.from_numpy(row.truth > 0)
-    values = row.variance[judged]
-    if not len(values):
+    if not judged.any():
         return judged
-    threshold = values.kthvalue(max(1, math.ceil(share * len(values)))).values
-    return judged & (torch.where(judged, row.variance, torch.inf) <= threshold)
+    return judged & (torch.where(judged, row.variance, torch.inf) <= row.variance[judged].median())

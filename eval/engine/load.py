@@ -222,13 +222,13 @@ def load_members(
         if not path.is_file() and not (model == "monodepth2" and path.is_dir()):
             raise FileNotFoundError(f"no such file: {path}")
     members: list[DepthNetwork] = []
-    how = ({} if spec is None else {"spec": spec}) | inference.options(model, device)
+    how = {} if spec is None else {"spec": spec}
     for path, member in named:
         if model == "trained" and not how:
             loaded = load_trained([path], offload=offload)
         else:
             try:
-                loaded = [load_network(model, path, **how)]
+                loaded = [load_network(model, path, **how, **inference.options(model, device))]
             except TypeError as error:
                 raise ValueError(f"model {model!r} does not take {sorted(how)}: {error}") from error
         if member is not None and member >= len(loaded):

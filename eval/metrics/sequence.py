@@ -30,13 +30,9 @@ class SequenceMetrics(nn.Module):
         with_variance: False for a network that predicts depth alone.
         ranking: with AUSE, AURG and Spearman's correlation.
         bins: of the calibration errors: "ours", 10 of the confidence and 10 levels, or "authors", 100 and 101.
-        sync_on_compute: add up the sums of all processes of ``torch.distributed`` at ``compute``. Off,
-            since evaluation gives every process sequences of its own.
     """
 
-    def __init__(
-        self, *, with_variance: bool = True, ranking: bool = True, bins: str = OURS, sync_on_compute: bool = False
-    ) -> None:
+    def __init__(self, *, with_variance: bool = True, ranking: bool = True, bins: str = OURS) -> None:
         super().__init__()
         if bins not in BINS:
             raise ValueError(f"bins must be one of {', '.join(BINS)}, got {bins!r}")
@@ -46,7 +42,7 @@ class SequenceMetrics(nn.Module):
             kinds += [NLL, ECEDelta, ECEQuantile, EntropyHistogram]
             kinds += [Sparsification, SpearmanCorrelation] if ranking else []
         finer = _AUTHORS if bins == AUTHORS else {}
-        made = {kind.__name__: kind(**finer.get(kind, {}), sync_on_compute=sync_on_compute) for kind in kinds}
+        made = {kind.__name__: kind(**finer.get(kind, {}), sync_on_compute=False) for kind in kinds}
         self.metrics = nn.ModuleDict(made)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:

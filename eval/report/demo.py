@@ -16,10 +16,9 @@ from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.report.figures_curves import write_curves
-from ufmstar_torch.eval.run.colours import known_where
 from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.run.panels import FramePanel, contact_sheet
-from ufmstar_torch.eval.run.pictures import ELLIPSOIDS, NPZ, PLY, SHEET, absolute_error, mixture_writers
+from ufmstar_torch.eval.run.pictures import ELLIPSOIDS, NPZ, PLY, SHEET, mixture_writers, panel_of
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.tour import Tour
@@ -62,7 +61,9 @@ class DemoFrames(FrameSink):
             self._add(name, row, result)
         if result.index in self._shown:
             note = list(KINDS.values())[self._unfamiliar[result.index]]
-            self._panels[result.index] = panel(f"frame {result.index}", note, result.frame, rows)
+            assert result.frame is not None
+            shown = panel_of(f"frame {result.index}", note, result.frame, rows[UFM_STAR], rows[POSTERIOR])
+            self._panels[result.index] = shown
 
     def _add(self, name: str, row: RowResult, result: FrameResult) -> None:
         assert row.variance is not None
@@ -129,20 +130,6 @@ def sheet_rows(unfamiliar: list[bool], rows: int = SHEET_ROWS) -> list[int]:
         spread = np.linspace(0, len(group) - 1, rows // len(present) + 1).round().astype(int)[1:]
         chosen += [group[position] for position in sorted(set(spread.tolist()))]
     return chosen
-
-
-def panel(name: str, note: str, frame: Any, rows: Mapping[str, Any]) -> FramePanel:
-    """One row of the sheet: depth, sigma and true error, of UfM* and of the posterior, for a frame (with an image and
-    ground truth) and the results of the demo's rows; ``note`` is the kind of room."""
-    star = rows[UFM_STAR]
-    valid, maps = star.valid.numpy(), {}
-    for prefix, row in (("", star), ("posterior_", rows[POSTERIOR])):
-        depth = row.depth.float().numpy()
-        maps[prefix.rstrip("_") or "depth"] = depth
-        maps[f"{prefix}sigma"] = row.variance.float().sqrt().numpy()
-        maps[f"{prefix}error"] = absolute_error(depth, star.truth)
-    maps["measured"] = star.measured.float().numpy()
-    return FramePanel(name, frame.image, {key: known_where(valid, values) for key, values in maps.items()}, note)
 
 
 def write_pictures(

@@ -144,11 +144,6 @@ def setting_label(values: Mapping[str, Any]) -> str:
     )
 
 
-def row_label(row: Row) -> str:
-    """A row for people: its own title, or "UfM*-Ensemble, rotation noise 2°"."""
-    return row.title or ", ".join(filter(None, (row.name, setting_label(row.changed))))
-
-
 def row_labels(rows: Iterable[Row]) -> dict[Row, str]:
     """The labels of a table's rows: without the preprocessing that all of them share (:func:`shared_words`), and with
     "our defaults" where the same method stands there with the paper's settings as well."""

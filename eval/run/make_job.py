@@ -27,13 +27,16 @@ from ufmstar_torch.recalibrate import Recalibration, beside
 _OWN_DEPTH = ("self", "ground-truth")
 
 
-def make_job(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameSequence) -> RunJob:
+def make_job(
+    options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameSequence, networks: DepthSource | None = None
+) -> RunJob:
     """Load networks or maps, and make the job.
 
     Args:
         options: of ``ufmstar run`` by name, as plain values; kept in the summary.
         config: of UfM*.
         sequence: the frames.
+        networks: those of an earlier job with the same options; None = they are loaded.
 
     Raises:
         ValueError: options that contradict each other, files that do not fit, no frame selected.
@@ -48,7 +51,8 @@ def make_job(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameS
     scale = None
     if options["scale_from"] is None:
         require_metric(sequence)
-    source = _source(options, sequence, indices)
+    known = networks is not None and networks.needs_image
+    source = networks if networks is not None and known else _source(options, sequence, indices)
     if options["scale_from"] is not None:
         scale = network_scale(sequence, source, indices)
         sequence = scale_poses(sequence, scale.metres)
@@ -57,8 +61,8 @@ def make_job(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameS
         sequence=sequence,
         indices=indices,
         source=source,
-        config=config.within(source.max_depth),
-        recalibration=_recalibration(options, config, source),
+        config=config.within(source.max_depth, source.states_confidence),
+        recalibration=recalibration_of(options, config, source),
         device=torch.device(options["device"]),
         settings=options,
         every=options["model"] is not None and options["mode"] == "full",
@@ -69,7 +73,7 @@ def make_job(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameS
     )
 
 
-def _recalibration(options: Mapping[str, Any], config: UfMStarConfig, source: DepthSource) -> Recalibration | None:
+def recalibration_of(options: Mapping[str, Any], config: UfMStarConfig, source: DepthSource) -> Recalibration | None:
     """The map that is named or lies beside the weights; None = none.
 
     Raises:

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.run.colours import INVALID_GREY, known_where
 from ufmstar_torch.eval.run.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.run.panels import FramePanel, MapColumn, contact_sheet, map_columns
@@ -86,6 +87,25 @@ class Finished:
         if len(known) < 2 or len(known) < len(times) or not np.median(np.diff(known)) > 0:
             return DEFAULT_FPS
         return float(np.clip(1 / np.median(np.diff(known)), *FPS_RANGE))
+
+
+def panel_of(name: str, note: str, frame: Frame, row: RowResult, posterior: RowResult | None = None) -> FramePanel:
+    """Depth, sigma and, with ground truth, true error of a row, and of a row of its posterior, beside the image."""
+    if frame.image is None:
+        raise ValueError(f"frame {name} has no image to show")
+    valid, maps = row.valid.numpy(), dict[str, NDArray[Any]]()
+    for prefix, one in (("", row), ("posterior_", posterior)):
+        if one is None or one.variance is None:
+            continue
+        depth = one.depth.float().numpy()
+        maps[prefix.rstrip("_") or "depth"] = depth
+        maps[f"{prefix}sigma"] = one.variance.float().sqrt().numpy()
+        if row.truth is not None:
+            maps[f"{prefix}error"] = absolute_error(depth, row.truth)
+    if row.measured is not None:
+        maps["measured"] = row.measured.float().numpy()
+    image = field_of_view(frame.image, frame.intrinsics, row.intrinsics, row.size)
+    return FramePanel(name, image, {key: known_where(valid, values) for key, values in maps.items()}, note)
 
 
 def common_columns(finished: Finished) -> list[MapColumn]:

@@ -76,16 +76,21 @@ def run(
 
 def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
     """The frames that are left."""
+    warm_up_job(job, progress)
+    row, metrics = job.row(folder.checkpoint), RunMetrics(UFM, folder.checkpoint.metrics)
+    stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=folder.checkpoint.position)
+    with WriterThread([metrics, FrameRecorder(job, folder, metrics)]) as writer:
+        stream.drive([writer, ProgressSink(progress, _skipped(folder))], stop=stop)
+
+
+def warm_up_job(job: RunJob, progress: Callable[[Progress], None]) -> None:
+    """Compile what a job needs before its first frame."""
 
     def compiling(done: int, total: int) -> None:
         progress(Progress("kernels", done, total))
 
     dense = job.config.anchors is not None and isinstance(job.landmarks(), DenseEvidence)
     warm_up_command(job.config, job.device, compiling, images=job.source.needs_image, dense=dense)
-    row, metrics = job.row(folder.checkpoint), RunMetrics(UFM, folder.checkpoint.metrics)
-    stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=folder.checkpoint.position)
-    with WriterThread([metrics, FrameRecorder(job, folder, metrics)]) as writer:
-        stream.drive([writer, ProgressSink(progress, _skipped(folder))], stop=stop)
 
 
 def _ending(job: RunJob, folder: RunFolder) -> tuple[str, str]:

@@ -19,7 +19,7 @@ from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipp
 from ufmstar_torch.eval.sequences.images import first_image_size, read_color
 from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens, sequence_of_lenses
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_quaternions
+from ufmstar_torch.eval.sequences.poses import csv_numbers, csv_rows, poses_from_quaternions
 from ufmstar_torch.trajectory import Trajectory
 
 LOOKED_FOR = "mav0/cam0/data.csv and sensor.yaml (also in mav0, or in a camera's folder itself)"
@@ -43,12 +43,12 @@ def read(path: Path, options: Options) -> FrameSequence:
     """
     folder = _camera_folder(path)
     assert folder is not None
-    rows = _rows(folder / "data.csv")
+    rows = csv_rows(folder / "data.csv")
     frames: list[Entry | Skipped] = []
     times = []
     for words, where in rows:
         image = folder / "data" / (words[1] if len(words) > 1 else f"{words[0]}.png")
-        times.append(_numbers(words[:1], where)[0] * _NANOSECOND)
+        times.append(csv_numbers(words[:1], where)[0] * _NANOSECOND)
         if image.is_file():
             frames.append(Entry(image.stem, UNKNOWN, partial(read_color, image), timestamp=times[-1]))
         else:
@@ -74,7 +74,7 @@ def _trajectory(camera: Path) -> Trajectory:
     truth = next((camera.parent / name for name in _TRUTHS if (camera.parent / name / "data.csv").is_file()), None)
     if truth is None:
         raise ValueError(f"{camera.parent}: none of {', '.join(_TRUTHS)} holds poses; pass trajectory")
-    rows = [(_numbers(words[:8], where), where) for words, where in _rows(truth / "data.csv")]
+    rows = [(csv_numbers(words[:8], where), where) for words, where in csv_rows(truth / "data.csv")]
     for values, where in rows:
         if len(values) < 8:
             raise ValueError(f"{where}: expected a time [ns], x y z [m] and qw qx qy qz; pass trajectory")
@@ -128,20 +128,3 @@ def _yaml(file: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"{file}: expected a sensor's YAML of names and values, below {_LARGEST_YAML:,} bytes")
     return content
-
-
-def _rows(file: Path) -> list[tuple[list[str], str]]:
-    """The words of each line that has any, and FILE:LINE of each; ``#`` starts a comment line."""
-    lines = ((text.strip(), f"{file}:{number}") for number, text in numbered_lines(file))
-    return [
-        ([word.strip() for word in text.replace(";", ",").split(",")], where)
-        for text, where in lines
-        if text and not text.startswith("#")
-    ]
-
-
-def _numbers(words: list[str], where: str) -> list[float]:
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        raise ValueError(f"{where}: expected numbers separated by commas, got {','.join(words)[:60]!r}") from None

@@ -7,6 +7,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from ufmstar_torch.eval.sequences import (
+    arkitscenes,
     bag,
     colmap,
     euroc,
@@ -16,6 +17,7 @@ from ufmstar_torch.eval.sequences import (
     scannet,
     sens,
     seven_scenes,
+    stray,
     tartanair,
     transforms,
     tum,
@@ -34,6 +36,8 @@ READERS: dict[str, ModuleType] = {
     "transforms": transforms,
     "euroc": euroc,
     "bag": bag,
+    "stray": stray,
+    "arkitscenes": arkitscenes,
     "generic": generic,
 }
 LAYOUTS = ("auto", *READERS)

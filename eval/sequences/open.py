@@ -31,6 +31,8 @@ _REFUSED = {
     "transforms": "images depth depth_intrinsics T_color_depth distortion",
     "euroc": "images depth depth_intrinsics T_color_depth distortion",
     "bag": "images depth depth_intrinsics T_color_depth distortion",
+    "stray": "images depth depth_intrinsics T_color_depth distortion",
+    "arkitscenes": "images depth depth_intrinsics T_color_depth distortion",
     "generic": "T_color_depth",
 }
 
@@ -41,7 +43,8 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
     Args:
         path: the sequence's folder, a video file, or ``tour:SEED`` with the options of a rendered tour in its name.
         layout: ``auto``, ``tum``, ``7scenes``, ``scannet``, ``sens``, ``tartanair``, ``kitti360``, ``nyu``, ``colmap``,
-            ``transforms``, ``euroc``, ``bag`` or ``generic``.
+            ``transforms``, ``euroc``, ``bag``, ``stray``, ``arkitscenes`` or
+            ``generic``.
         poses: how they are written: ``camera-to-world`` (x right, y down, z forward), ``world-to-camera``, ``ned``
             (camera-to-world, x forward, y right, z down) or ``opengl`` (x right, y up, z backward); what is
             customary for a layout (TartanAir's NED) is known.

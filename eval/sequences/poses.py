@@ -84,12 +84,24 @@ def read_trajectory(path: str | Path) -> Trajectory:
         bad = np.flatnonzero(~np.isfinite(timestamps))
         if bad.size:
             raise ValueError(f"{lines[bad[0]]}: the timestamp must be finite, got {timestamps[bad[0]]}")
-    T_world_cam = _poses_from_columns(values, lines)
+    T_world_cam = poses_from_columns(values, lines)
     if timestamps is not None:
         stamps, first, same = np.unique(timestamps, return_index=True, return_inverse=True)
         _require_consistent(T_world_cam, first, same, lines)
         timestamps, T_world_cam = stamps, T_world_cam[first]
     return Trajectory(timestamps, T_world_cam)
+
+
+def parse_pose(text: str, where: str) -> tuple[float, np.ndarray] | None:
+    """Timestamp and pose [4, 4] of one line with 8, 13 or 17 numbers; all NaN if an entry of the pose is not finite;
+    None for a comment or an empty line. Raises ValueError: something else; ``where`` names the line."""
+    tokens = _tokens(text)
+    if not tokens:
+        return None
+    row = np.array([_number(token, where) for token in tokens])
+    if len(row) not in (8, 13, 17) or not np.isfinite(row[0]):
+        raise ValueError(f"{where}: expected a timestamp and a pose of 7, 12 or 16 numbers, got {text.strip()!r:.60}")
+    return float(row[0]), poses_from_columns(row[None, 1:], [where])[0]
 
 
 def associate(first: np.ndarray, second: np.ndarray, max_difference: float) -> dict[int, int]:
@@ -130,7 +142,7 @@ def read_pose(path: str | Path) -> np.ndarray:
     T = read_matrix(path)
     if T.shape != (4, 4):
         raise ValueError(f"{path}: expected a 4x4 matrix, got {' x '.join(map(str, T.shape))} numbers")
-    return _poses_from_columns(T.reshape(1, 16), [str(path)])[0]
+    return poses_from_columns(T.reshape(1, 16), [str(path)])[0]
 
 
 def poses_from_quaternions(position: np.ndarray, quaternion_xyzw: np.ndarray) -> np.ndarray:
@@ -149,8 +161,28 @@ def numbered_lines(path: str | Path) -> list[tuple[int, str]]:
         raise ValueError(f"{path}: expected a text file, got bytes that are none: {error.reason}") from error
 
 
-def _poses_from_columns(values: np.ndarray, lines: list[str]) -> np.ndarray:
-    """[N, 4, 4] from rows of 7 (position, quaternion), 12 or 16 numbers; non-finite rows become NaN."""
+def csv_rows(path: str | Path) -> list[tuple[list[str], str]]:
+    """The words of each line that has any, and FILE:LINE of each, of a table with commas; ``#`` starts a comment line.
+    Raises ValueError: it is no text file."""
+    lines = ((text.strip(), f"{path}:{number}") for number, text in numbered_lines(path))
+    return [
+        ([word.strip() for word in text.replace(";", ",").split(",")], where)
+        for text, where in lines
+        if text and not text.startswith("#")
+    ]
+
+
+def csv_numbers(words: list[str], where: str) -> list[float]:
+    """The words of :func:`csv_rows` as numbers. Raises ValueError: one is none."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        raise ValueError(f"{where}: expected numbers separated by commas, got {','.join(words)[:60]!r}") from None
+
+
+def poses_from_columns(values: np.ndarray, lines: list[str]) -> np.ndarray:
+    """[N, 4, 4] from rows of 7 (position, quaternion), 12 or 16 numbers; non-finite rows become NaN. Raises ValueError:
+    no rotation in a row, whose FILE:LINE is in ``lines``."""
     T = np.full((len(values), 4, 4), np.nan)
     finite = np.isfinite(values).all(axis=1)
     if values.shape[1] == 7:
@@ -201,11 +233,16 @@ def _numbers(path: str | Path) -> tuple[list[list[float]], list[str]]:
     comment."""
     rows, lines = [], []
     for number, text in numbered_lines(path):
-        tokens, where = re.split(r"(?:^|\s)#", text, maxsplit=1)[0].split(), f"{path}:{number}"
+        tokens, where = _tokens(text), f"{path}:{number}"
         if tokens:
             rows.append([_number(token, where) for token in tokens])
             lines.append(where)
     return rows, lines
+
+
+def _tokens(text: str) -> list[str]:
+    """The words of a line before its comment."""
+    return re.split(r"(?:^|\s)#", text, maxsplit=1)[0].split()
 
 
 def _number(token: str, where: str) -> float:
@@ -214,4 +251,4 @@ def _number(token: str, where: str) -> float:
     try:
         return float(token)
     except ValueError:
-        raise ValueError(f"{where}: expected a number, got {token!r}") from None
+        raise ValueError(f"{where}: expected a number, got {token[:60]!r}") from None

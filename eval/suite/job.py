@@ -35,7 +35,6 @@ class EvalJob:
     frames: slice = field(default_factory=lambda: slice(None))  # which of each sequence
     cache: Path | None = None  # folder of predictions; None = in ``out``
     device: str = "cpu"  # "cpu", "cuda", "cuda:1"
-    confident: float = 0.5  # share of a frame's pixels of which a reference method counts as confident
     bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
     examples: int = 3  # of each data set, sequences of which a few frames are stored for pictures
     samples: int | None = None  # passes of MC-Dropout
@@ -61,7 +60,7 @@ class EvalJob:
         """How sequences are judged by the loaded networks. Raises CacheError: the folder of predictions cannot be
         written."""
         store = PredictionCache(self.cache or self.out / CACHE)
-        return Judge(networks, device, store, self.frames, self.confident, self.bins)
+        return Judge(networks, device, store, self.frames, self.bins)
 
     def about(self, networks: Mapping[str, DepthSource]) -> dict[str, Any]:
         """The content of eval.json."""
@@ -77,7 +76,7 @@ class EvalJob:
             "datasets": sorted({item.dataset for item in self.items}),
             "sequences": [{"dataset": item.dataset, "sequence": item.sequence} for item in self.items],
             "missing_bases": list(self.missing_bases),
-            "settings": {"frames": [f.start, f.stop, f.step], "confident": self.confident, **bins, **opening},
+            "settings": {"frames": [f.start, f.stop, f.step], **bins, **opening},
             "versions": versions(),
             "machine": hardware(),
         }

@@ -1,0 +1,151 @@
+"""``ufmstar rank``: its options, and the table of scores."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from ufmstar_torch.eval.commands.opening import SequenceOptions
+from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, positional
+from ufmstar_torch.eval.commands.run import MapOptions, NetworkOptions, RunOptions, UfMOptions, job_from, read_ufm
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.run.rank import ImageScores
+
+SCORES, SETTINGS = "scores.csv", "rank.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RankOptions:
+    """Which images are worth a label: every image's uncertainty, and the order in which to label them.
+
+    Writes scores.csv, the images to label first, and a contact sheet of the least and the most certain images.
+    Sequences are streamed one after another, with a fresh state each.
+
+    Attributes:
+        sequences: as of `ufmstar run`
+        out: folder for everything that is written
+        by: rank by the mean of V, M, A, E or B (docs/active_learning.md)
+        diverse: of images that look at the same place from nearly the same side, take one
+        count: number of images to rank; default: all
+        measured: images with a smaller share of pixels seen in two views get no rank by total or disagreement
+        frames: START:STOP:STEP, which frames of each sequence
+        overwrite: replace the ranking in --out
+        device: cpu, cuda or cuda:N
+        threads: number of CPU threads; default: all cores but one
+        debug: show tracebacks
+    """
+
+    USAGE: ClassVar[str] = "ufmstar rank SEQUENCE... (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
+
+    sequences: tuple[str, ...] = positional()
+    out: str
+    by: str = option("total", choices=("total", "disagreement", "aleatoric", "epistemic", "anchored"))
+    diverse: bool = False
+    count: int | None = None
+    measured: float = 0.5
+    frames: str | None = None
+    overwrite: bool = False
+    device: str = "cpu"
+    threads: int | None = None
+    debug: bool = False
+    opening: SequenceOptions
+    network: NetworkOptions
+    maps: MapOptions
+    uncertainty: UfMOptions
+
+    def __post_init__(self) -> None:
+        _ = self.of(self.sequences[0])  # checks the options that it shares with a run
+        if self.count is not None and self.count < 1:
+            raise ValueError(f"--count must be at least 1, got {self.count}")
+        if not 0 <= self.measured <= 1:
+            raise ValueError(f"--measured must be a share from 0 to 1, got {self.measured}")
+        if self.maps.depth not in (None, "self") and len(self.sequences) > 1:
+            raise ValueError("--depth DIR goes with one sequence: rank each by itself")
+
+    def of(self, sequence: str) -> RunOptions:
+        """The options of a run of one sequence."""
+        shared = ("out", "frames", "device", "threads", "opening", "network", "maps", "uncertainty")
+        return RunOptions(sequence=sequence, **{name: getattr(self, name) for name in shared})
+
+
+def read(words: Sequence[str]) -> RankOptions:
+    """The options of a command line; errors as ``commands.run.read``. M is the frame's alone, at measured pixels."""
+    return read_ufm(RankOptions, words, "ufmstar rank", {"ufm.unmeasured": "nan", "ufm.ema_alpha": 1.0})
+
+
+def main(options: RankOptions) -> int:
+    """Score the sequences, and write table and pictures; the exit code."""
+    from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
+    from ufmstar_torch.eval.run.machine import share_threads
+    from ufmstar_torch.eval.run.pictures import SHEET
+
+    if options.threads is None:
+        share_threads()
+    kind = FolderKind("ufmstar rank", "ranking", SETTINGS, remover(SCORES, SHEET))
+    try:
+        kind.earlier(Path(options.out), resume=False, overwrite=options.overwrite)
+        scores = _scores(options)
+        OutputFolder.open(Path(options.out), kind, {}, overwrite=options.overwrite).close()
+    except FolderError as error:
+        raise UsageError(error) from error
+    return _write(options, scores)
+
+
+def _scores(options: RankOptions) -> ImageScores:
+    """Stream the sequences. Raises UsageError: one cannot be opened, or the network does not state what ranks them."""
+    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.engine.progress import ProgressSink
+    from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
+    from ufmstar_torch.eval.run.rank import ImageScores
+    from ufmstar_torch.eval.run.run import warm_up_job
+    from ufmstar_torch.eval.run.run_folder import Checkpoint
+
+    scores, source = ImageScores(options.by, options.measured), None
+    with Bars() as bars, stop_signals(bars.say) as stop:
+        for path in options.sequences:
+            try:
+                job = job_from(options.of(path), source)
+            except (ImportError, OSError, ValueError) as error:
+                raise UsageError(error) from error
+            if source is None:
+                warm_up_job(job, bars.show)
+            source, scores.sequence = job.source, path
+            stream = FrameStream(job.sequence, job.indices, [job.row(Checkpoint())], device=job.device)
+            try:
+                stream.drive([scores, ProgressSink(bars.show)], stop=stop)
+            except Stopped:
+                raise KeyboardInterrupt from None
+    return scores
+
+
+def _write(options: RankOptions, scores: ImageScores) -> int:
+    """Write scores.csv, the contact sheet and rank.json, and print the first images; the exit code."""
+    import pandas as pd
+
+    from ufmstar_torch.eval.report.table import csv_text
+    from ufmstar_torch.eval.report.text import aligned
+    from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+    from ufmstar_torch.eval.run.panels import contact_sheet
+    from ufmstar_torch.eval.run.pictures import SHEET
+
+    out, chosen = Path(options.out), scores.chosen(options.count, diverse=options.diverse)
+    rest = sorted(set(range(len(scores.images))) - set(chosen))
+    lines = [{"rank": n, **scores.images[i].line} for n, i in enumerate(chosen, start=1)]
+    lines += [{"rank": None, **scores.images[i].line} for i in rest]
+    table = pd.DataFrame(lines, dtype=object).map(csv_text).to_csv(index=False, lineterminator="\n")
+    write_atomic(out / SCORES, lambda file: file.write(table.encode()))
+    write_json_atomic(out / SETTINGS, {"program": "ufmstar rank", "settings": as_dict(options), "images": len(lines)})
+    files = [SCORES]
+    if panels := scores.panels():
+        contact_sheet(panels, out / SHEET, title=f"the least and the most certain of {len(lines)} images")
+        files.append(SHEET)
+    shown = [["rank", "sequence", "frame", f"{options.by} [m²]", "measured"]]
+    mean = f"{options.by}_mean_m2"
+    shown += [[*(str(line[k]) for k in ("rank", "sequence", "frame")), *(f"{line[k]:.3g}" for k in (mean, "measured"))]
+              for line in lines[: min(len(chosen), 10)]]  # fmt: skip
+    print("\n".join(aligned(shown)))
+    print(f"{out}: {', '.join(files)}; {len(lines)} images, {len(chosen)} with a rank")
+    return 0 if chosen else 1

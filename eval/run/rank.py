@@ -1,0 +1,111 @@
+"""``ufmstar rank``: statistics of every image's variance and its parts, and pictures of both ends of the ranking."""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ufmstar_torch.choose import choose
+from ufmstar_torch.eval.engine.judge import UFM
+from ufmstar_torch.eval.engine.rows import RowResult
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink
+from ufmstar_torch.eval.run.panels import FramePanel
+from ufmstar_torch.eval.run.pictures import panel_of
+from ufmstar_torch.regress import sample_statistics
+
+# By what images are ranked: V, M, A, E or B, and the map of ``RowResult`` that has it.
+PARTS = {
+    "total": "variance", "disagreement": "disagreement", "aleatoric": "aleatoric", "epistemic": "epistemic",
+    "anchored": "anchored",
+}  # fmt: skip
+_COMPARED = ("total", "disagreement")  # they rest on other views
+_PICTURES = 3  # at each end of the ranking
+_UNITS = {"mean": "m2", "variance": "m4", "median": "m2", "maximum": "m2"}
+
+
+@dataclass(frozen=True, eq=False)
+class RankedImage:
+    """An image: its line of scores.csv but for the rank, its score [m^2] (NaN = none), pose [4, 4] and median depth
+    [m]."""
+
+    line: dict[str, Any]
+    score: float
+    T_world_cam: NDArray[np.float64]
+    depth: float
+
+
+@dataclass(order=True)
+class _Shown:
+    score: float
+    number: int
+    panel: FramePanel = field(compare=False)
+
+
+class ImageScores(FrameSink):
+    """Scores the images of sequences, one after the other.
+
+    Args:
+        by: a name of ``PARTS``, whose mean over the pixels is the score. It is that of the measured pixels for V and M
+            where the config has ``unmeasured="nan"``.
+        measured: least share of pixels that two views compared, for an image to be ranked by V or M.
+
+    Attributes:
+        images: in the order in which they came.
+        sequence: the present one, as scores.csv names it.
+    """
+
+    sequence = ""
+
+    def __init__(self, by: str, measured: float) -> None:
+        self._by, self._measured = by, measured if by in _COMPARED else 0.0
+        self.images: list[RankedImage] = []
+        self._shown: list[_Shown] = []
+
+    def take(self, result: FrameResult) -> None:
+        """Score an image. Raises ValueError: the network does not state the part that ranks the images."""
+        row = result.rows.get(UFM)
+        if row is None or result.frame is None:
+            return
+        parts = {name: _statistics(getattr(row, of), row) for name, of in PARTS.items() if getattr(row, of) is not None}
+        if self._by not in parts:
+            raise ValueError(f"--by {self._by}: there is none here, only {', '.join(parts)}")
+        assert row.measured is not None
+        share = float((row.measured >= 0.5)[row.valid].float().mean())
+        score = parts[self._by]["mean"] if share >= self._measured else float("nan")
+        columns = {f"{n}_{key}_{unit}": one[key] for n, one in parts.items() for key, unit in _UNITS.items()}
+        line = {"sequence": self.sequence, "frame": result.name, "measured": share, **columns}
+        depth = float(row.depth[row.valid].median()) if bool(row.valid.any()) else float("nan")
+        self.images.append(RankedImage(line, score, row.T_world_cam, depth))
+        if score == score and result.frame.image is not None:
+            note = f"{Path(self.sequence).name[-20:]}, {self._by}, {score**0.5:.3g} m"
+            insort(self._shown, _Shown(score, len(self.images), panel_of(result.name, note, result.frame, row)))
+            if len(self._shown) > 2 * _PICTURES:
+                del self._shown[_PICTURES]
+
+    def chosen(self, count: int | None, *, diverse: bool) -> list[int]:
+        """Numbers of the images to label, the first one first (``ufmstar_torch.choose``)."""
+        score = torch.tensor([image.score for image in self.images], dtype=torch.float64)
+        count = None if count is None else min(count, len(score))
+        if not diverse or not len(score):
+            return choose(score, count)
+        poses = torch.from_numpy(np.stack([image.T_world_cam for image in self.images]))
+        distance = float(np.nanmedian([image.depth for image in self.images]))
+        sequences = [image.line["sequence"] for image in self.images]
+        return choose(score, count, poses=poses, distance=distance, sequences=sequences)
+
+    def panels(self) -> Sequence[FramePanel]:
+        """The most certain images and the least certain ones, the latter first."""
+        return [one.panel for one in reversed(self._shown)]
+
+
+def _statistics(values: torch.Tensor, row: RowResult) -> dict[str, float]:
+    """Mean, variance, median and maximum over the valid pixels."""
+    statistics = sample_statistics(torch.where(row.valid, values, torch.nan).flatten()[None])
+    return {name: float(value) for name, value in asdict(statistics).items()}

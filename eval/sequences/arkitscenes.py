@@ -1,0 +1,99 @@
+"""ARKitScenes: ``lowres_wide/, lowres_wide_intrinsics/*.pincam, lowres_wide.traj, lowres_depth/``, by a frame's time.
+
+A line of the .traj is a time [s], an axis times an angle [rad] and a translation [m], world-to-camera; poses are
+interpolated at the images' times. Files are VIDEO_TIME.png, and a camera's numbers w h fx fy cx cy.
+https://github.com/apple/ARKitScenes/blob/main/DATA.md
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped
+from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, depth_loader, list_files, list_images, read_color
+from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.poses import associate, read_matrix
+from ufmstar_torch.trajectory import Trajectory
+
+_IMAGES, _CAMERAS, _DEPTHS, _POSES = "lowres_wide", "lowres_wide_intrinsics", "lowres_depth", "lowres_wide.traj"
+LOOKED_FOR = f"{_IMAGES}/, {_CAMERAS}/ and {_POSES}, also in VIDEO_frames/"
+_PINCAM = (".pincam",)
+_SAME_FRAME = 2e-3  # [s] names of one frame's files are rounded to 1 ms
+
+
+def detect(path: Path) -> bool:
+    """Whether the folder, or one VIDEO_frames in it, has this layout."""
+    return _root(path) is not None
+
+
+def _root(path: Path) -> Path | None:
+    for folder in (path, *(sorted(path.glob("*_frames")) if path.is_dir() else ())):
+        if (folder / _POSES).is_file() and all((folder / name).is_dir() for name in (_IMAGES, _CAMERAS)):
+            return folder
+    return None
+
+
+def read(path: Path, options: Options) -> FrameSequence:
+    """Opens the low-resolution images of a video.
+
+    Raises:
+        ValueError: a malformed file (named), a file that is not called by its time, or no usable frame.
+    """
+    root = _root(path)
+    assert root is not None
+    images, cameras = list_images(root / _IMAGES), list_files(root / _CAMERAS, _PINCAM)
+    depths = list_files(root / _DEPTHS, DEPTH_SUFFIXES) if (root / _DEPTHS).is_dir() else []
+    times = _times(images)
+    camera_of = associate(times, _times(cameras), _SAME_FRAME)
+    depth_of = associate(times, _times(depths), _SAME_FRAME)
+    frames: list[Entry | Skipped] = []
+    lenses = {}
+    for number, image in enumerate(images):
+        if number not in camera_of:
+            frames.append(Skipped(image.stem, "no camera at its time"))
+            continue
+        lenses[image.stem] = _lens(cameras[camera_of[number]])
+        depth = depths[depth_of[number]] if number in depth_of else None
+        load_depth = depth_loader(depth, options.depth_scale)
+        frames.append(Entry(image.stem, UNKNOWN, partial(read_color, image), load_depth, float(times[number])))
+    if options.trajectory is None and frames:
+        frames = attach(frames, times + options.time_offset, _trajectory(root / _POSES), options)
+    name = path.resolve().name
+    return sequence_of_lenses(name, "arkitscenes", frames, lenses, path, options, times=times)
+
+
+def _times(files: list[Path]) -> np.ndarray:
+    """[N] of files VIDEO_TIME [s]."""
+    try:
+        return np.array([float(file.stem.rpartition("_")[2]) for file in files])
+    except ValueError as error:
+        raise ValueError(f"{files[0].parent}: files must be called VIDEO_TIME: {error}") from None
+
+
+def _lens(file: Path) -> Lens:
+    values = read_matrix(file).ravel()
+    if len(values) != 6 or not np.isfinite(values).all() or min(values) <= 0:
+        raise ValueError(f"{file}: expected width height fx fy cx cy [px], got {values.tolist()}")
+    width, height, fx, fy, cx, cy = values.tolist()
+    return Lens((fx, fy, cx, cy), (int(height), int(width)))
+
+
+def _trajectory(file: Path) -> Trajectory:
+    """Camera-to-world. Raises ValueError: the lines have not 7 numbers."""
+    table = read_matrix(file)
+    if table.ndim != 2 or table.shape[1] != 7:
+        raise ValueError(f"{file}: expected lines of 7 numbers: time [s], rotation vector [rad], translation [m]")
+    table = table[np.isfinite(table).all(axis=1)]
+    stamps, first = np.unique(table[:, 0], return_index=True)
+    if not stamps.size:
+        raise ValueError(f"{file}: no pose with finite values")
+    T = np.tile(np.eye(4), (len(stamps), 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec(table[first, 1:4]).as_matrix()
+    T[:, :3, 3] = table[first, 4:]
+    return Trajectory(stamps, np.linalg.inv(T))

@@ -1,0 +1,123 @@
+"""A depth network in a TensorFlow Lite file, run by LiteRT: integers in, integers out, as small computers like it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ufmstar_torch.models.network import DepthNetwork, require_image
+from ufmstar_torch.models.outputs import ProgramSpec
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.optional import optional
+from ufmstar_torch.prediction import DepthPrediction
+
+
+class LiteRTNetwork(DepthNetwork):
+    """A .tflite file as a module, on the CPU and without gradients; quantised tensors are converted by the scale and
+    zero point in the file.
+
+    Args:
+        path: the .tflite file, with one image [1, H, W, 3] or [1, 3, H, W] as input.
+        spec: declares what the file does not state. Without ``preprocess``, the image in [0, 1] is stretched to H x W.
+        threads: of the CPU; 0 leaves it to LiteRT.
+
+    Raises:
+        ModuleNotFoundError: ``ai-edge-litert`` is not installed (extra ``litert``).
+        FileNotFoundError: there is no such file.
+        ValueError: the file is broken, or spec and file do not fit.
+    """
+
+    def __init__(self, path: str | Path, spec: ProgramSpec, *, threads: int = 0) -> None:
+        super().__init__()
+        self.path, self.spec, self.threads = str(path), spec, threads
+        self._open()
+        preprocess = spec.preprocess or Preprocess()
+        if preprocess.size not in (None, self.size):
+            raise ValueError(f"{path}: the input has {self.size} px, the spec's preprocess.size {preprocess.size}")
+        self.preprocess = replace(preprocess, size=self.size)
+
+    def _open(self) -> None:
+        """Start an interpreter, and find the input and the declared outputs."""
+        runtime = optional(
+            "ai_edge_litert.interpreter", "a .tflite file needs the package ai-edge-litert", "'ufmstar-torch[litert]'"
+        )
+        if not Path(self.path).is_file():
+            raise FileNotFoundError(f"no .tflite file {self.path}")
+        try:
+            self.interpreter = runtime.Interpreter(self.path, num_threads=self.threads or None)
+            self.interpreter.allocate_tensors()
+        except (ValueError, RuntimeError) as error:
+            raise ValueError(f"{self.path} is not a file that LiteRT can run: {error}") from error
+        inputs = self.interpreter.get_input_details()
+        shape = tuple(int(side) for side in inputs[0]["shape"])
+        self.channels_last = shape[-1] == 3
+        if len(inputs) != 1 or len(shape) != 4 or shape[0] != 1 or 3 not in (shape[1], shape[3]):
+            expected = "one input [1, H, W, 3] or [1, 3, H, W]"
+            raise ValueError(f"{self.path}: expected {expected}, got {len(inputs)} of {shape}")
+        self.input = inputs[0]
+        self.size = (shape[1], shape[2]) if self.channels_last else (shape[2], shape[3])
+        self.outputs = {one["name"]: one for one in self.interpreter.get_output_details()}
+        declared = [str(name) for name in self.spec.outputs.names()]
+        if absent := [name for name in declared if name not in self.outputs]:
+            raise ValueError(f"{self.path}: the outputs are {list(self.outputs)}; it has no {absent}")
+        if self.spec.takes_intrinsics:
+            raise ValueError(f"{self.path}: takes_intrinsics is not supported for .tflite files")
+
+    @property
+    def takes_intrinsics(self) -> bool:
+        """Whether the unit of its depth depends on the focal length."""
+        return self.spec.outputs.focal is not None
+
+    @property
+    def max_depth(self) -> float | None:
+        """[m] As declared."""
+        return self.spec.outputs.max_depth
+
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
+        """Depth [B, H, W] [m], on the image's device, of ``image`` [B, 3, H, W] as ``preprocess`` returns it. Raises
+        ValueError: another size, or an output is not as declared."""
+        if require_image(image) != self.size:
+            raise ValueError(f"{self.path}: the input has {self.size} px, got {tuple(image.shape[-2:])}")
+        array = image.detach().cpu().float()
+        array = array.permute(0, 2, 3, 1) if self.channels_last else array
+        runs = [self._run(one) for one in array.numpy()]
+        maps = {name: torch.cat([run[name] for run in runs]).to(image.device) for name in self.outputs}
+        return self.spec.outputs.prediction(maps, self.size, intrinsics)
+
+    def _run(self, image: NDArray[np.float32]) -> dict[str | int, Tensor]:
+        scale, zero = self.input["quantization"]
+        dtype = np.dtype(self.input["dtype"])
+        if scale:
+            limits = np.iinfo(dtype)
+            image = (image / scale + zero).round().clip(limits.min, limits.max)
+        self.interpreter.set_tensor(self.input["index"], image[None].astype(dtype))
+        self.interpreter.invoke()
+        found: dict[str | int, Tensor] = {}
+        for name, about in self.outputs.items():
+            value = torch.from_numpy(self.interpreter.get_tensor(about["index"])).float()
+            scale, zero = about["quantization"]
+            found[name] = (value - zero) * scale if scale else value
+        return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        # An interpreter cannot be copied or pickled; the copy opens its own from the same file.
+        own = ("interpreter", "input", "outputs")
+        return {key: value for key, value in self.__dict__.items() if key not in own}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._open()
+
+
+def load_litert(
+    weights: Path, spec: ProgramSpec | Mapping[str, Any] | str | Path | None = None, threads: int = 0
+) -> LiteRTNetwork:
+    """A .tflite network from a spec, its plain values or a JSON file; errors as :class:`LiteRTNetwork`."""
+    return LiteRTNetwork(weights, ProgramSpec.required(spec), threads=threads)

@@ -1,0 +1,200 @@
+"""Choosing images: ``ufmstar rank``, the order of choice, and the sampler of a training loop."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+import scenes
+from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.choose import UncertaintySampler, choose
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.models import NetworkSpec, build_network, save_trained
+
+SPEC = NetworkSpec(widths=0.1, positive="softplus", size=(64, 96), preprocess="resize")
+DEPTHS, POSES, K = scenes.sequence(4, 48, 64, 0.05)
+TOURS = ["tour:5?frames=3&size=64x96", "tour:6?frames=3&size=64x96"]
+
+
+def means(**config):
+    ufm, read = UfMStar(UfMStarConfig(**config)), []
+    for depth, pose in zip(DEPTHS, POSES, strict=True):
+        read.append(ufm.mean_uncertainty(torch.tensor(depth)[None], torch.tensor(pose), torch.tensor(K), pixels=900))
+    return read
+
+
+# ---- what an image's mean says ----
+
+
+def test_a_mean_tells_how_much_of_it_was_measured():
+    plain, strict = means(unmeasured="paper"), means(unmeasured="nan")
+    dense = UfMStar(UfMStarConfig(unmeasured="nan", ema_alpha=1.0))
+    assert [float(plain[0].measured), float(strict[0].measured)] == [0, 0]
+    assert (float(plain[0].mean), int(plain[0].pixels)) == (0.0, 900)
+    assert math.isnan(float(strict[0].mean))
+    assert int(strict[0].pixels) == 0
+    for i in range(1, 4):
+        assert 0.2 < float(plain[i].measured) < 1
+        assert int(strict[i].pixels) == round(float(strict[i].measured) * 900) < 900
+        assert float(strict[i].mean) > float(plain[i].mean)
+        assert int(plain[i].statistics.unmeasured) == 900 - int(strict[i].pixels)
+    for depth, pose in zip(DEPTHS, POSES, strict=True):
+        out = dense(torch.tensor(depth)[None], torch.tensor(pose), torch.tensor(K))
+    whole = float(out.variance.nanmean())
+    assert abs(float(strict[3].mean) - whole) < 5 * float(strict[3].standard_error)
+    assert "measured=" in repr(plain[1])
+
+
+def test_parts_have_their_own_statistics():
+    ufm, dense = (UfMStar(UfMStarConfig(unmeasured="nan", ema_alpha=1.0)) for _ in range(2))
+    for depth, pose in zip(DEPTHS, POSES, strict=True):
+        d = torch.tensor(depth)[None]
+        frame = d, torch.tensor(pose), torch.tensor(K), 0.01 * d**2, 0.02 * d
+        out, mean = dense(*frame), ufm.mean_uncertainty(*frame, fraction=1.0)
+    maps = {"total": out.variance, "disagreement": out.disagreement, "aleatoric": frame[3], "epistemic": frame[4]}
+    for name, values in (maps | {"depth": d}).items():
+        part, known = getattr(mean, name), values[out.valid & ~values.isnan()].double()
+        assert int(part.pixels) == len(known)
+        expected = known.mean(), known.var(), known.median(), known.max()
+        actual = part.mean, part.variance, part.median, part.maximum
+        torch.testing.assert_close(torch.cat(actual).double(), torch.stack(expected), rtol=1e-4, atol=0)
+    assert mean.anchored is None
+
+
+# ---- the order of choice ----
+
+
+def along(positions, angle=0.0):
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(positions), 1, 1)
+    poses[:, 0, 3] = torch.tensor(positions)
+    poses[-1, :3, 2] = torch.tensor([math.sin(angle), 0, math.cos(angle)])
+    return poses
+
+
+def test_the_best_come_first():
+    assert choose([1.0, 3.0, math.nan, 3.0, 2.0]) == [1, 3, 4, 0]
+    assert choose([1.0, 3.0, math.nan, 3.0, 2.0], 2) == [1, 3]
+    assert choose([]) == []
+
+
+def test_a_diverse_choice_leaves_out_neighbours():
+    scores = [1.0, 0.9, 0.8, 0.5]
+    poses = along([0.0, 0.1, 0.2, 3.0])
+    assert choose(scores, poses=poses) == [0, 3, 2, 1], "a fifth of .8 is less than .5, and more than a tenth of .9"
+    assert choose(scores, 2, poses=poses, distance=0.1) == [0, 1], "what is near cannot be seen from 10 cm beside"
+    assert choose(scores, 2, poses=poses, sequences=["a", "b", "b", "b"]) == [0, 1], "another sequence is elsewhere"
+    turned = along([0.0, 0.0, 0.0, 0.0], angle=1.0)
+    assert choose(scores, poses=turned)[:2] == [0, 3], "the same place, another direction"
+    assert choose([1.0, math.nan, 0.8, 0.5], poses=poses) == [0, 3, 2]
+
+
+def test_choices_that_make_no_sense_are_refused():
+    with pytest.raises(ValueError, match=r"scores must be \[N\]"):
+        choose(torch.ones(2, 2))
+    with pytest.raises(ValueError, match="count must lie in 0 to the number of images 2"):
+        choose([1.0, 2.0], 3)
+    with pytest.raises(ValueError, match=r"poses must be \[2, 4, 4\]"):
+        choose([1.0, 2.0], poses=torch.eye(4)[None])
+    with pytest.raises(ValueError, match="scores of at least 0"):
+        choose([1.0, -2.0], poses=along([0.0, 1.0]))
+
+
+def test_a_sampler_follows_the_scores():
+    sampler = UncertaintySampler([0.0, 1.0, math.nan, 3.0], 4000)
+    drawn = torch.cat(list(DataLoader(range(4), batch_size=100, sampler=sampler)))
+    counts = torch.bincount(drawn, minlength=4).tolist()
+    assert (counts[0], counts[2], len(drawn)) == (0, 0, 4000)
+    assert counts[3] == pytest.approx(3000, abs=5 * math.sqrt(4000 * 0.75 * 0.25))
+    assert list(sampler) != drawn.tolist(), "another epoch"
+    sampler.update([1.0, 0.0, 0.0, 0.0])
+    assert set(sampler) == {0}
+    best = UncertaintySampler([1.0, 5.0, 3.0, 4.0], 2, top=True)
+    assert sorted(best) == [1, 3]
+    for scores, count, message in (([-1.0, 2.0], 1, "at least 0"), ([math.nan], 1, "some above"), ([1.0], 0, "count")):
+        with pytest.raises(ValueError, match=message):
+            UncertaintySampler(scores, count)
+    with pytest.raises(ValueError, match="at most the 1 scored"):
+        UncertaintySampler([1.0, 0.0], 2, top=True)
+
+
+# ---- the command ----
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    torch.manual_seed(0)
+    file = tmp_path_factory.mktemp("net") / "net.safetensors"
+    save_trained(file, build_network(SPEC).eval(), SPEC)
+    return file
+
+
+def test_a_pool_of_two_sequences(ufmstar, tmp_path, weights):
+    words = ("rank", *TOURS, "--model", "trained", "--weights", weights, "--measured", "0.1", "--out", tmp_path / "out")
+    code, out, err = ufmstar(*words)
+    assert code == 0, err
+    assert "6 images, " in out
+    assert (tmp_path / "out" / "contact_sheet.png").stat().st_size > 1000
+    with (tmp_path / "out" / "scores.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["sequence"] for row in rows} == set(TOURS)
+    first = [row for row in rows if row["frame"] == "000000"]
+    assert all(row["rank"] == "" and float(row["measured"]) == 0 for row in first), "a fresh state each"
+    ranked = [float(row["total_mean_m2"]) for row in rows if row["rank"]]
+    assert ranked == sorted(ranked, reverse=True)
+    assert len(ranked) >= 2
+    assert json.loads((tmp_path / "out" / "rank.json").read_text())["settings"]["by"] == "total"
+    assert np.isfinite([float(row["aleatoric_median_m2"]) for row in rows]).all()
+    assert ufmstar(*words)[0] == 2, "an earlier ranking is not overwritten"
+
+
+def test_scores_are_those_of_mean_uncertainty(ufmstar, tmp_path):
+    """With the sequence's own depth; ranked by M, diverse, and the best alone."""
+    words = (
+        "rank",
+        TOURS[0],
+        "--depth",
+        "self",
+        "--by",
+        "disagreement",
+        "--measured",
+        "0",
+        "--diverse",
+        "--count",
+        "1",
+    )
+    assert ufmstar(*words, "--out", tmp_path / "out")[0] == 0
+    with (tmp_path / "out" / "scores.csv").open() as file:
+        rows = {row["frame"]: row for row in csv.DictReader(file)}
+    ufm, best = UfMStar(UfMStarConfig(unmeasured="nan")), {}
+    for frame in open_sequence(TOURS[0]):
+        depth = torch.from_numpy(frame.depth)[None]
+        result = ufm.mean_uncertainty(depth, frame.T_world_cam, frame.intrinsics, fraction=1.0)
+        best[frame.name], row = float(result.mean), rows[frame.name]
+        if int(result.pixels):
+            for key, value in (("mean_m2", result.mean), ("median_m2", result.total.median)):
+                assert float(row[f"disagreement_{key}"]) == pytest.approx(float(value), rel=1e-4)
+    most = max(best, key=lambda name: np.nan_to_num(best[name]))
+    assert [name for name, row in rows.items() if row["rank"] == "1"] == [most]
+    assert sum(row["rank"] != "" for row in rows.values()) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--depth", "self", "--by", "epistemic"), "--by epistemic: there is none here, only total, disagreement"),
+        (("--depth", "self", "--count", "0"), "--count must be at least 1"),
+        (("--depth", "self", "--measured", "2"), "--measured must be a share"),
+        ((TOURS[1], "--depth", "a"), "--depth DIR goes with one sequence"),
+        (("--model", "trained"), "needs --weights FILE"),
+    ],
+)
+def test_mistakes_are_named(ufmstar, tmp_path, words, message):
+    code, _, err = ufmstar("rank", TOURS[0], *words, "--out", tmp_path / "out")
+    assert code in (1, 2)
+    assert message in err

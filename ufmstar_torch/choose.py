@@ -1,0 +1,112 @@
+"""Which images to label or to train on, by a score of every image, as ``UfMStar.mean_uncertainty`` states it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import torch
+from torch import Tensor
+from torch.utils.data import Sampler
+
+
+def choose(
+    scores: Tensor | Sequence[float],
+    count: int | None = None,
+    *,
+    poses: Tensor | None = None,
+    distance: float = 1.0,
+    sequences: Sequence[object] | None = None,
+) -> list[int]:
+    """The images with the highest scores, best first; of equal ones the earlier. NaN = no score: never chosen.
+
+    With ``poses`` the choice is diverse, a greedy farthest-point choice weighted by the scores: the next image is the
+    one with the largest s_i min(1, min_j d_ij) over the chosen j, where d_ij = |t_i - t_j| / distance + the angle
+    between the viewing directions [rad]. Beyond d = 1 two views share little, and the score alone decides.
+
+    Args:
+        scores: [N], with ``poses`` not negative.
+        count: None = all that have a score.
+        poses: [N, 4, 4] camera-to-world [m].
+        distance: to what the camera sees, its median depth, say [m].
+        sequences: which sequence each image is of; views of different ones are as far as can be. None = one.
+
+    Raises:
+        ValueError: shapes that disagree, a negative score or distance with poses, or a count out of range.
+    """
+    score = torch.as_tensor(scores, dtype=torch.float64)
+    if score.dim() != 1:
+        raise ValueError(f"scores must be [N], got {tuple(score.shape)}")
+    known = int((~score.isnan()).sum())
+    if count is not None and not 0 <= count <= len(score):
+        raise ValueError(f"count must lie in 0 to the number of images {len(score)}, got {count}")
+    left = torch.where(score.isnan(), -torch.inf, score)
+    count = known if count is None else min(count, known)
+    if poses is None:
+        order: list[int] = left.argsort(descending=True, stable=True)[:count].tolist()
+        return order
+    if poses.shape != (len(score), 4, 4) or (sequences is not None and len(sequences) != len(score)):
+        raise ValueError(f"poses must be [{len(score)}, 4, 4], one of each score, and sequences as many")
+    if bool((score < 0).any()) or not distance > 0:
+        raise ValueError(f"a diverse choice needs scores of at least 0 and a positive distance, got {distance}")
+    position, direction = poses[:, :3, 3].double(), poses[:, :3, 2].double()
+    names = {name: number for number, name in enumerate(dict.fromkeys(sequences or ()))}
+    sequence = torch.tensor([names[name] for name in sequences]) if sequences is not None else torch.zeros(len(score))
+    nearest, chosen = torch.ones_like(score), list[int]()
+    for _ in range(count):
+        best = int(torch.where(left.isfinite(), left * nearest, left).argmax())
+        chosen.append(best)
+        cosine = (direction * direction[best]).sum(-1)
+        d = (position - position[best]).norm(dim=-1) / distance + cosine.clamp(-1, 1).acos()
+        nearest = torch.where(sequence == sequence[best], torch.minimum(nearest, d), nearest)
+        left[best] = -math.inf
+    return chosen
+
+
+class UncertaintySampler(Sampler[int]):
+    """The images of an epoch of a ``DataLoader``, by their scores.
+
+    Args:
+        scores: [N] of every image of the data set, at least 0 [m^2]; NaN = no score: not taken.
+        count: images of an epoch.
+        top: take the ``count`` images with the highest scores, each once and in a random order. Else they are drawn
+            with replacement, with a probability in proportion to the score.
+        seed: of the random draws, which differ from epoch to epoch.
+
+    Example::
+
+        sampler = UncertaintySampler(scores, count=64)
+        for epoch in range(10):
+            for batch in DataLoader(images, batch_size=4, sampler=sampler):
+                ...
+            sampler.update([float(model.mean_uncertainty(*frame).mean) for frame in pool])  # under the new weights
+    """
+
+    def __init__(self, scores: Tensor | Sequence[float], count: int, *, top: bool = False, seed: int = 0) -> None:
+        self.count, self.top = count, top
+        self._generator = torch.Generator().manual_seed(seed)
+        self.update(scores)
+
+    def update(self, scores: Tensor | Sequence[float]) -> None:
+        """Take other scores [N] from the next epoch on.
+
+        Raises:
+            ValueError: not [N], a negative or infinite score, none above 0, or with ``top`` fewer than ``count``.
+        """
+        score = torch.as_tensor(scores, dtype=torch.float64).nan_to_num(0.0, torch.inf, -torch.inf)
+        taken = int((score > 0).sum())
+        if score.dim() != 1 or not bool((score.isfinite() & (score >= 0)).all()) or not taken:
+            raise ValueError(f"scores must be [N] of at least 0, some above, or NaN, got {tuple(score.shape)}")
+        if self.count < 1 or (self.top and self.count > taken):
+            raise ValueError(f"count must be at least 1, with top at most the {taken} scored images, got {self.count}")
+        self.scores = score
+
+    def __iter__(self) -> Iterator[int]:
+        if self.top:
+            best = self.scores.argsort(descending=True, stable=True)[: self.count]
+            yield from best[torch.randperm(self.count, generator=self._generator)].tolist()
+        else:
+            yield from torch.multinomial(self.scores, self.count, True, generator=self._generator).tolist()
+
+    def __len__(self) -> int:
+        return self.count
