@@ -156,15 +156,6 @@ def test_debug_shows_the_traceback(ufmstar, tmp_path):
     assert "Traceback" in err
 
 
-def test_an_unknown_key_in_a_file_is_reported(ufmstar, path, tmp_path):
-    for text, expected in (('{"ufm": {"etaa": 0.3}}', "etaa"), ('{"modell": "fastdepth"}', "modell")):
-        (tmp_path / "c.json").write_text(text)
-        words = ("run", path, "--depth", "self", "--config", tmp_path / "c.json", "--out", tmp_path / "out")
-        code, _, err = ufmstar(*words)
-        assert (code, err.count("\n")) == (2, 1)
-        assert expected in err
-
-
 # ---- options ----
 
 

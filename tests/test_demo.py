@@ -14,7 +14,7 @@ import torch
 from demo_networks import SIZE, SPEC, members, write_members
 from runs import Recorder, read_summary
 
-from ufmstar_torch import UncertainDepth, cli
+from ufmstar_torch import cli
 from ufmstar_torch.eval.commands import demo
 from ufmstar_torch.eval.commands.demo import DemoOptions
 from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
@@ -22,7 +22,6 @@ from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.engine.stream import FrameSink
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.methods.suite import suite_named
-from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.report.demo import (
     DEMO_FILES,
     ENSEMBLE,
@@ -156,42 +155,6 @@ def walked(networks, frames, count=FRAMES, sinks=(), names=ROWS):
     judge = Judge({"aleatoric": source, "ensemble": source}, CPU, limit=slice(count))
     evaluate_sequence(frames, rows, judge, sinks=[collected, *sinks])
     return [(r.frame, {NAMES[slug]: row for slug, row in r.rows.items()}) for r in collected.results]
-
-
-@pytest.fixture(scope="module")
-def compared(sequence):
-    return walked(members(), sequence)
-
-
-def inputs(frame):
-    image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
-    return image, torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None]
-
-
-def test_the_rows_are_one_member_in_turn_ufm_ufm_star_and_all_members(compared):
-    networks, ufm, added = members(), UfM(), 0.0
-    pipeline = UncertainDepth(networks, preprocess=networks[0].preprocess)
-    for index, (frame, got) in enumerate(compared):
-        image, pose, K = inputs(frame)
-        want = pipeline(image, pose, K)
-        for method in (NETWORK, UFM, UFM_STAR):
-            assert got[method].member == want.member == index % 3
-            assert torch.equal(got[method].depth, want.depth[0])
-        star, alone = got[UFM_STAR].variance, got[NETWORK].variance
-        assert torch.equal(star.nan_to_num(-1), want.variance[0].nan_to_num(-1))
-        assert torch.equal(alone, want.prediction.variance[0])
-        added += float((star - alone).nanmean())
-        with torch.no_grad():
-            x, K = networks[0].preprocess(image, K)
-            predictions = [network(x) for network in networks]
-        points = ufm(want.depth, pose, K, predictions[index % 3].aleatoric_variance)
-        assert torch.equal(got[UFM].variance, points.variance[0])
-        d = torch.stack([p.depth[0] for p in predictions]).double()
-        a = torch.stack([p.aleatoric_variance[0] for p in predictions]).double()
-        mixed = got[ENSEMBLE]
-        assert torch.allclose(mixed.depth.double(), d.mean(0), atol=1e-6)
-        assert torch.allclose(mixed.variance.double(), a.mean(0) + d.var(0, correction=0), rtol=1e-5)
-    assert added > 0, "the members disagree"
 
 
 # ---- the figures by kind of room ----

@@ -57,24 +57,6 @@ def test_100k_points_of_ufm_are_4_megabytes_and_the_smoothing_map_a_fifth():
     assert star["bytes_end"] == 64 * star["count_end"] > 0
 
 
-def test_fastdepth_has_the_papers_weights():
-    full = FastDepth()
-    assert f"{sum(p.nbytes for p in full.parameters()) / 1e6:.1f}" == "15.8"
-    # Beside its weights it holds the statistics of its batch norms.
-    assert weight_bytes(full) == sum(p.nbytes for p in full.parameters()) + sum(b.nbytes for b in full.buffers())
-
-
-def test_resnet50_monodepth2_is_the_papers_but_for_the_classifier():
-    pytest.importorskip("torchvision")
-    from ufmstar_torch.models.monodepth2 import MonodepthResNet
-
-    with torch.device("meta"):
-        weights = sum(p.nbytes for p in MonodepthResNet(50).parameters())
-    classifier = 4 * (2048 * 1000 + 1000)
-    assert f"{(weights + classifier) / 1e6:.1f}" == "138.3"
-    assert f"{weights / 1e6:.1f}" == "130.1"
-
-
 def test_ten_members_are_90_percent():
     members = [network(offset=0.1 * n) for n in range(10)]
     memory = TimedNetwork("ensemble", members, "Linear").memory()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import layouts
 import numpy as np
@@ -13,6 +15,7 @@ from ufmstar_torch import cli
 from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence, read_trajectory
+from ufmstar_torch.eval.sequences.bag import Bag
 
 
 @pytest.fixture(scope="module")
@@ -117,3 +120,64 @@ def test_what_is_no_run_is_named(finished, tmp_path, capfd):
     assert cli.main(["export", str(finished[0]), "--to", "cloud", "--voxel", "0"]) == 2
     assert "--voxel must be positive" in capfd.readouterr().err
     assert cli.main(["export", str(finished[0]), "--to", "mesh"]) == 2
+
+
+def test_a_bag_is_read_back(finished):
+    out, _, truth = finished
+    for _ in range(2):  # the second replaces the first
+        assert cli.main(["export", str(out), "--to", "mcap", "--max-sigma", "0.9"]) == 0
+    again = open_sequence(out / "export" / "bag")
+    assert (again.layout, len(again), again.skipped) == ("bag", 6, ())
+    for i, frame in enumerate(again):
+        assert frame.timestamp == 7 + i
+        np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-7)
+        np.testing.assert_allclose(frame.intrinsics, truth.K, atol=1e-9)
+        np.testing.assert_array_equal(frame.image, truth.images[i])
+        np.testing.assert_allclose(frame.depth[20:], truth.depths[i][20:], atol=1e-3)
+        assert not frame.depth[:20].any()
+    sigma = open_sequence(out / "export" / "bag", topics=["/camera/sigma"])
+    np.testing.assert_allclose(sigma[2].depth[20:], 0.02 * truth.depths[2][20:], atol=1e-4)
+    bag = Bag(out / "export" / "bag")
+    _, cloud = next(bag.messages(["/camera/points"]))
+    assert [field.name for field in cloud.fields] == ["x", "y", "z", "variance"]
+    points = cloud.data.view("<f4").reshape(-1, 4)
+    assert len(points) == cloud.width == 28 * 64
+    x, y, z, variance = points.T
+    u, v, _ = truth.K @ np.stack([x, y, z]) / z
+    rows, columns = np.rint(v).astype(int), np.rint(u).astype(int)
+    np.testing.assert_allclose(np.hypot(v - rows, u - columns), 0, atol=1e-4)
+    np.testing.assert_allclose(z, truth.depths[0][rows, columns], atol=1e-3)
+    np.testing.assert_allclose(variance, np.square(0.02 * z), rtol=1e-3)
+
+
+def test_a_bag_without_the_recording_has_the_maps_own_pixels(finished, tmp_path):
+    from ufmstar_torch.eval.run.export import gated_frames
+    from ufmstar_torch.eval.run.export_bag import export_bag
+
+    out, _, truth = finished
+    export_bag(gated_frames(out, np.inf, np.inf), tmp_path, None)
+    with pytest.raises(ValueError, match="has no topic of colour images, but /camera/camera_info"):
+        open_sequence(tmp_path / "export" / "bag")
+    _, info = next(Bag(tmp_path / "export" / "bag").messages(["/camera/camera_info"]))
+    np.testing.assert_allclose(info.k.reshape(3, 3), truth.K, atol=1e-9)
+
+
+def test_a_rerun_recording(finished):
+    """Its own program reads it: every entity of a frame is there six times, the Gaussians and the blueprint once."""
+    pytest.importorskip("rerun")
+    out, _, _ = finished
+    assert cli.main(["export", str(out), "--to", "rrd", "--max-sigma", "0.9"]) == 0
+    file = out / "export" / "run.rrd"
+    words = [sys.executable, "-m", "rerun", "rrd", "print", "-v", str(file)]
+    text = subprocess.run(words, check=True, capture_output=True, text=True, timeout=100).stdout
+    for entity in ("camera/image/rgb", "camera/maps/depth", "camera/maps/sigma", "camera/points", "gaussians"):
+        assert f"/world/{entity}" in text
+    assert "/plots/mean_disagreement" in text
+    assert "Blueprint" in text
+    assert file.stat().st_size < 2e6
+
+
+def test_rerun_is_named_where_it_is_missing(finished, monkeypatch, capfd):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert cli.main(["export", str(finished[0]), "--to", "rrd"]) == 1
+    assert "pip install 'ufmstar-torch[viz3d]'" in capfd.readouterr().err

@@ -66,7 +66,7 @@ class TestRanking:
         assert float(worst["aurg_rmse"]) < 0
 
     @pytest.mark.parametrize("kind", ["many", "rounded", "narrow", "zeros"])
-    def test_spearman_is_scipys_within_its_bound(self, kind: str) -> None:
+    def test_spearman_is_scipys(self, kind: str) -> None:
         d, v, g = maps(300, 400)
         if kind == "rounded":
             v = (v.sqrt() * 10).round().div(10).square().clamp(min=1e-3)
@@ -76,18 +76,7 @@ class TestRanking:
             v = torch.where(torch.arange(400) < 200, 0.0, v)
         got = figures(SpearmanCorrelation(), d, v, g)
         exact = stats.spearmanr(v.numpy().ravel(), ((d - g) ** 2).numpy().ravel()).statistic
-        rho, bound = float(got["spearman"]), float(got["spearman_bound"])
-        assert abs(rho - exact) <= bound
-        assert abs(rho - exact) < 2e-3
-        if kind == "many":
-            assert bound < 0.05
-
-    def test_spearman_bound_admits_a_variance_too_narrow_for_the_bins(self) -> None:
-        d, v, g = maps(100, 100)
-        narrow = 0.04 * (1 + 0.02 * v)
-        got = figures(SpearmanCorrelation(), d, narrow, g)
-        exact = stats.spearmanr(narrow.numpy().ravel(), ((d - g) ** 2).numpy().ravel()).statistic
-        assert not abs(float(got["spearman"]) - exact) > float(got["spearman_bound"])  # NaN or within
+        assert abs(float(got["spearman"]) - exact) < 2e-3
 
     def test_spearman_of_monotone_relation(self) -> None:
         g, e = torch.full((5000,), 500.0), torch.logspace(-2, 1.5, 5000, dtype=torch.float64)

@@ -180,7 +180,7 @@ def test_the_command_has_networks_and_what_was_chosen() -> None:
     begin += "--network aleatoric=trained:DIR/m0.safetensors,DIR/m.safetensors#0"
     for settings, words in (
         ({}, ""),
-        ({"frames": [None, None, None], "confident": 0.5}, " --confident 0.5"),
+        ({"frames": [None, None, None], "bins": "authors"}, " --bins authors"),
         ({"frames": [0, 8, None], "trajectory": "slam.txt", "depth_scale": 0.001},
          " --frames 0:8: --trajectory slam.txt --depth-scale 0.001"),
     ):  # fmt: skip

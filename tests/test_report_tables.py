@@ -39,7 +39,7 @@ from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.data import Results, ResultsError, load_results, setting_of
 from ufmstar_torch.eval.report.efficiency import paper_efficiency_tables
 from ufmstar_torch.eval.report.means import Mean, difference, has_variance, mean_of, references
-from ufmstar_torch.eval.report.names import NLL, SPEARMAN, row_label
+from ufmstar_torch.eval.report.names import NLL, SPEARMAN, row_labels
 from ufmstar_torch.eval.report.paper import paper_tables
 from ufmstar_torch.eval.report.table import (
     Cell,
@@ -283,9 +283,9 @@ class TestLoading:
 
     @pytest.mark.parametrize("name", names())
     def test_settings_survive_their_dict(self, name):
-        for row in suite_named(name).rows:
+        for row, label in row_labels(suite_named(name).rows).items():
             assert setting_of(json.loads(json.dumps(row.setting.to_dict()))) == row.setting
-            assert row_label(row).startswith(row.name)
+            assert label.startswith(row.name)
             assert row.name.replace("-Anchored", "").replace("-Posterior", "") == row.method.name
 
     @pytest.mark.parametrize(

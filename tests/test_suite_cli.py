@@ -7,9 +7,8 @@ import logging
 import signal
 
 import pytest
-from tiny_suite import TRUTH, Stub, rows_of, write_rooms
+from tiny_suite import TRUTH, Stub, rows_of
 
-from ufmstar_torch import cli
 from ufmstar_torch.eval.bench import measure as measurement
 from ufmstar_torch.eval.commands import dry_run as dry
 from ufmstar_torch.eval.commands.evaluate import job_from, read
@@ -38,21 +37,6 @@ def test_list_names_every_suite(ufmstar):
     assert "Table 4: every member on every image" in out
 
 
-def test_help_names_every_option(capfd):
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["eval", "--help"])
-    assert ended.value.code == 0
-    text = capfd.readouterr().out
-    for option in ("suite", "root", "network", "out", "shard", "resume", "processes", "slurm", "cache", "dry-run"):
-        assert f"--{option}" in text
-    assert "\n  eval    " in _main_help(capfd)
-
-
-def _main_help(capfd):
-    cli.main(["--help"])
-    return capfd.readouterr().out
-
-
 MISTAKES = {
     "nothing": ([], "--suite is missing"),
     "no network": (["--suite", "depth-only", "--root", "x", "--out", "o"], "--network is missing"),
@@ -71,7 +55,6 @@ MISTAKES = {
     "processes": (["{}", "--processes", "0"], "--processes must be at least 1"),
     "threads": (["{}", "--threads", "0"], "--threads must be at least 1"),
     "sequences": (["{}", "--sequences", "0"], "--sequences must be at least 1"),
-    "confident": (["{}", "--confident", "2"], "--confident must be a share"),
     "list of nothing": (["{}", "--sequence-list", "/nowhere.txt"], "/nowhere.txt"),
     "unknown option": (["{}", "--etaa", "1"], "--etaa"),
     "device": (["{}", "--device", "abacus"], "--device abacus is not available"),
@@ -101,26 +84,12 @@ def test_an_evaluation_ends_with_its_table_and_report(ufmstar, rooms, tmp_path):
     assert (out / "tables" / "main.md").is_file()
     assert err.count("rooms/") == 3
     about = json.loads((out / "eval.json").read_text())
-    assert about["settings"] == {"frames": [0, 2, None], "confident": 0.5}
+    assert about["settings"] == {"frames": [0, 2, None]}
     code, _, err = ufmstar(*words_for(rooms, out, "--frames", "0:2"))
     assert (code, "--resume goes on with it" in err) == (2, True)
     code, _, err = ufmstar(*words_for(rooms, out, "--resume"))
     assert code == 2
     assert "settings.frames was [0, 2, null], now [null, null, null]" in err
-
-
-@pytest.mark.usefixtures("stubbed")
-def test_a_broken_sequence_is_listed_at_the_end(ufmstar, tmp_path):
-    root = write_rooms(tmp_path / "own")
-    (root / "birch" / "poses.txt").write_text("x")
-    code, text, err = ufmstar(*words_for(root, tmp_path / "out", "--no-report"))
-    assert code == 1
-    assert "2 sequences" in text
-    assert err.splitlines()[-2].startswith("ufmstar eval: rooms/birch failed: ")
-    assert "--resume tries the rest again" in err.splitlines()[-1]
-    assert not (tmp_path / "out" / "tables").exists()
-    write_rooms(root, ["birch"])
-    assert ufmstar(*words_for(root, tmp_path / "out", "--resume", "--no-report"))[0] == 0
 
 
 @pytest.mark.usefixtures("stubbed")

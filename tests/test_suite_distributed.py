@@ -145,8 +145,8 @@ def test_shards_may_begin_in_any_order_and_share_a_folder(rooms, tmp_path, whole
     outcomes = [go(job, evaluate_sequence, shard=Shard(number, 2))[0] for number in (2, 1)]
     assert [(outcome.finished, outcome.complete) for outcome in outcomes] == [(True, False), (True, True)]
     assert kept(job.out) == whole
-    with pytest.raises(FolderError, match=r"other input: settings\.confident was 0\.5"):
-        go(replace(job, confident=0.1), shard=Shard(1, 2))
+    with pytest.raises(FolderError, match=r"other input: settings\.bins was null"):
+        go(replace(job, bins="authors"), shard=Shard(1, 2))
     with pytest.raises(ValueError, match="--overwrite goes without shards"):
         go(job, shard=Shard(1, 2), overwrite=True)
     assert kept(job.out) == whole

@@ -21,7 +21,7 @@ from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import Gaussians, ufm_star_config
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.predictions import Predicted
-from ufmstar_torch.eval.methods.perturb import perturbed, rotation
+from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.models import Preprocess
@@ -97,12 +97,6 @@ def test_fixed_param_takes_the_thresholds_as_they_stand_for_224():
 
 
 # ---- noise and overlap ----
-
-
-@given(st.lists(st.floats(-4, 4), min_size=3, max_size=3))
-def test_rodrigues_formula(w):
-    expected = Rotation.from_rotvec(w).as_matrix()
-    np.testing.assert_allclose(rotation(np.array(w)), expected, atol=1e-14)
 
 
 def noise(setting, indices):

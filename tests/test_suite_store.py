@@ -107,7 +107,7 @@ def test_the_digest_tells_other_poses(tmp_path):
 ABOUT = {
     "suite": "x", "title": "", "sweep": [], "networks": {"aleatoric": {"sha256": "a" * 64}}, "rows": [{"method": "A"}],
     "datasets": ["d"], "sequences": [{"dataset": "d", "sequence": "s"}], "missing_bases": ["ensemble"],
-    "settings": {"frames": [None, None, 2], "confident": 0.5},
+    "settings": {"frames": [None, None, 2]},
 }  # fmt: skip
 
 
@@ -166,8 +166,8 @@ def test_a_shard_is_evaluated_by_one_process_and_not_overwritten_meanwhile(tmp_p
     [
         ({"suite": "y"}, 'suite was "x", now "y"'),
         ({"networks": {"aleatoric": {"sha256": "b" * 64}}}, r"networks.aleatoric.sha256 was \"aaaaaaaa.*, now \"bbbb"),
-        ({"settings": {"frames": [None, 9, 2], "confident": 0.5}}, "settings.frames was"),
-        ({"settings": {"frames": [None, None, 2], "confident": 0.2}}, "settings.confident was 0.5, now 0.2"),
+        ({"settings": {"frames": [None, 9, 2]}}, "settings.frames was"),
+        ({"settings": {"frames": [None, None, 2], "bins": "authors"}}, 'settings.bins was null, now "authors"'),
     ],
 )
 def test_resuming_something_else_is_refused_by_name(tmp_path, changed, told):

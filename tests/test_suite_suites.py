@@ -15,7 +15,7 @@ from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.methods.setting import configured, default_of
 from ufmstar_torch.eval.methods.suite import Suite, names, suite_named
 from ufmstar_torch.eval.report.data import listed_rows
-from ufmstar_torch.eval.report.names import row_label, row_labels
+from ufmstar_torch.eval.report.names import row_labels
 
 # The rows of the paper's tables, written off.
 TABLE_1 = """
@@ -185,11 +185,11 @@ methods = ["Ensemble"]
     (tmp_path / "own.toml").write_text(rows)
     suite = suite_named(str(tmp_path / "own.toml"))
     expected = ["UfM*-Ensemble, as we deploy it", "UfM-Ensemble-100K, as we deploy it", "loose", "Ensemble"]
-    assert list(row_labels(suite.rows).values()) == [row_label(row) for row in suite.rows] == expected
+    assert list(row_labels(suite.rows).values()) == expected
     again = pickle.loads(pickle.dumps(suite))
     assert [row.title for row in again.rows] == [*expected[:3], ""]
     listed = listed_rows({"rows": [row.to_dict() for row in suite.rows]})
-    assert [row_label(row) for row in listed] == expected
+    assert list(row_labels(listed).values()) == expected
     assert listed[2] == Row(suite.rows[2].method, suite.rows[2].setting), "a label makes no other row"
     for wrong in ("each = { eta = [0.1, 0.2] }\nlabel = 'x'", "label = 'x'"):
         (tmp_path / "own.toml").write_text(f"[[rows]]\nmethods = ['UfM*-Ensemble', 'Ensemble']\n{wrong}")

@@ -102,12 +102,6 @@ def test_numba_has_the_private_parts_that_are_used(owner, names):
     assert not missing, f"numba changed: {owner.__name__} has no {missing}; mend ufmstar_torch/kernels/compile_cpu.py"
 
 
-def test_a_kept_kernel_says_in_its_stamp_what_it_depends_on():
-    from ufmstar_torch.kernels.regress_tiles_cpu import exact
-
-    assert exact._cache._cache_file._source_stamp[-1] == compile_cpu._SOURCES
-
-
 def test_no_garbage_is_collected_while_kernels_are_compiled():
     during: list[bool] = []
     for enabled in (True, False):

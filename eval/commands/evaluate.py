@@ -15,7 +15,7 @@ from ufmstar_torch.eval.sequences.frame import parse_slice
 
 PRESETS = ("paper", "default")
 # Options that a job has under their names.
-_OF_JOB = ("device", "confident", "bins", "examples", "samples", "runtime", "precision")
+_OF_JOB = ("device", "bins", "examples", "samples", "runtime", "precision")
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.suite.job import EvalJob
@@ -80,7 +80,6 @@ class EvalOutputOptions:
         overwrite: replace the evaluation in --out; predictions in its cache are kept
         cache: folder of the networks' predictions; default: OUT/cache
         examples: number of sequences of each data set of which some frames are kept for pictures
-        confident: share of a frame's pixels of which a method counts as confident
         bins: of the calibration errors: ours (10 bins, 10 levels) or authors (100 bins, 101 levels); default: ours
         no_report: no tables and figures at the end; ufmstar report OUT makes them
     """
@@ -90,7 +89,6 @@ class EvalOutputOptions:
     overwrite: bool = False
     cache: str | None = None
     examples: int = 3
-    confident: float = 0.5
     bins: str = option("ours", choices=("ours", "authors"))
     no_report: bool = False
 
@@ -140,8 +138,6 @@ class EvalOptions:
         for name, least in least_of.items():
             if values[name] is not None and values[name] < least:
                 raise ValueError(f"--{name} must be at least {least}, got {values[name]}")
-        if not 0 < self.output.confident <= 1:
-            raise ValueError(f"--confident must be a share in (0, 1], got {self.output.confident}")
         if self.output.resume and self.output.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
         if self.shard and self.slurm:
@@ -174,11 +170,12 @@ def job_from(options: EvalOptions) -> EvalJob:
     from ufmstar_torch.eval.engine.load import NetworkChoice
     from ufmstar_torch.eval.methods.suite import suite_named
     from ufmstar_torch.eval.sequences.options import Options
-    from ufmstar_torch.eval.suite.job import EvalJob, with_recalibrations
+    from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
     from ufmstar_torch.eval.suite.work_items import find_work, read_names
 
     what, data, output, values = options.what, options.data, options.output, as_dict(options)
     suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), what.recalibration)
+    require_methods(suite, options.opening.plugin)
     architectures: list[dict[str, NetworkChoice]] = [{}]
     for choice in map(NetworkChoice.parse, what.network):  # a base's n-th network belongs to the n-th architecture
         number = sum(choice.base in known for known in architectures)
@@ -191,7 +188,8 @@ def job_from(options: EvalOptions) -> EvalJob:
     opening = {name: value for name, value in options.opening.given().items() if name != "layout"}
     Options(**{name: value for name, value in opening.items() if name != "poses"})  # raises for impossible values
     only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
-    items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, layout=options.opening.layout)
+    where: dict[str, Any] = {"layout": options.opening.layout, "plugin": options.opening.plugin}
+    items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, **where)
     return EvalJob(
         suite=suite.with_bases(networks),
         networks=networks,
@@ -201,6 +199,7 @@ def job_from(options: EvalOptions) -> EvalJob:
         missing_bases=tuple(base for base in suite.bases if base not in networks),
         frames=parse_slice(data.frames),
         cache=None if output.cache is None else Path(output.cache),
+        plugin=options.opening.plugin,
         **{name: values[name] for name in _OF_JOB},
     )
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from ufmstar_torch.eval.commands.opening import SequenceOptions
 from ufmstar_torch.eval.commands.options import UsageError, option, parse, positional
 from ufmstar_torch.eval.sequences.frame import FrameSequence
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.run.export import Gated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,17 +24,17 @@ class ExportOptions:
     Attributes:
         out: folder of `ufmstar run`
         to: depth: maps [m] as .npy, NaN where left out; cloud: cloud.ply with sigma and colour; tum: trajectory.txt;
-            transforms: images, depth, sigma and poses for nerfstudio
+            transforms: images, depth, sigma and poses for nerfstudio; mcap: a ROS 2 bag; rrd: a rerun recording
         max_sigma: largest standard deviation of a pixel [m]
         max_relative_sigma: largest standard deviation of a pixel, as a share of its depth
         voxel: side of the cloud's voxels [m], each of which has one point
         debug: show tracebacks
     """
 
-    USAGE: ClassVar[str] = "ufmstar export OUT --to depth|cloud|tum|transforms [options]"
+    USAGE: ClassVar[str] = "ufmstar export OUT --to depth|cloud|tum|transforms|mcap|rrd [options]"
 
     out: Path = positional()
-    to: str = option(choices=("depth", "cloud", "tum", "transforms"))
+    to: str = option(choices=("depth", "cloud", "tum", "transforms", "mcap", "rrd"))
     max_sigma: float = float("inf")
     max_relative_sigma: float = float("inf")
     voxel: float = 0.02
@@ -62,15 +65,26 @@ def main(options: ExportOptions) -> int:
         elif options.to == "transforms":
             print(export.export_transforms(frames, out, _sequence(out)))
         else:
-            try:
-                sequence: FrameSequence | None = _sequence(out)
-            except (OSError, ValueError) as error:
-                print(f"no colours: {error}")
-                sequence = None
-            print(export.export_cloud(frames, out, options.voxel, sequence))
+            print(_with_images(options, frames))
     except (FileNotFoundError, ValueError) as error:
         raise UsageError(error) from error
     return 0
+
+
+def _with_images(options: ExportOptions, frames: Iterator[Gated]) -> str:
+    """Export to a format that has the recording's images where they can be read; what was written."""
+    from ufmstar_torch.eval.run.export import export_cloud
+    from ufmstar_torch.eval.run.export_bag import export_bag
+    from ufmstar_torch.eval.run.export_rerun import export_rerun
+
+    try:
+        sequence: FrameSequence | None = _sequence(options.out)
+    except (OSError, ValueError) as error:
+        print(f"no colours: {error}")
+        sequence = None
+    if options.to == "cloud":
+        return export_cloud(frames, options.out, options.voxel, sequence)
+    return (export_bag if options.to == "mcap" else export_rerun)(frames, options.out, sequence)
 
 
 def _sequence(out: Path) -> FrameSequence:

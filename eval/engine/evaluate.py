@@ -28,6 +28,7 @@ from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.plugins import Plugins
 from ufmstar_torch.frame import FRAME_FAULTS, check_frame
 
 _TOLERANCE = UfMStarConfig().rotation_tolerance
@@ -39,22 +40,14 @@ BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """How sequences are judged.
-
-    Raises:
-        ValueError: a share of confident pixels out of range.
-    """
+    """How sequences are judged."""
 
     networks: Mapping[str, DepthSource]  # by base
     device: torch.device  # where UfM and UfM* run
     store: PredictionStore | None = None  # of predictions; None = all are computed
     limit: slice = field(default_factory=lambda: slice(None))  # which frames, before a setting's skip
-    confident: float = 0.5  # of the pixels of a frame, the share of which a reference method counts as confident
     bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
-
-    def __post_init__(self) -> None:
-        if not 0 < self.confident <= 1:
-            raise ValueError(f"confident must lie in (0, 1], got {self.confident}")
+    plugins: Plugins = field(default_factory=Plugins)  # methods and metrics of one's own
 
 
 def evaluate_sequence(
@@ -94,15 +87,15 @@ def evaluate_sequence(
     runners, judges = [], {}
     for row in rows:
         source = sources[row.method.base, row.setting.preprocess]
-        estimator = make_estimator(row, judge.device, source.max_depth)
+        estimator = make_estimator(row, judge.device, source, judge.plugins.methods)
         how: dict[str, Any] = {"every": row.method.every_member, "setting": row.setting, "device": judge.device}
         runners.append(RowRunner(row.slug, source, estimator, anchors=anchors.get(row), **how))
         named = {other.slug: other.method.name for other in references(row, rows)}
-        judges[row.slug] = RowJudge(row, named, judge.bins)
+        judges[row.slug] = RowJudge(row, named, judge.bins, judge.plugins.metrics)
     tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)
     check = partial(_check_frame, sources=sources.values(), tracked=tracked)
     stream = FrameStream(sequence, indices, runners, store=judge.store, device=judge.device, check=check)
-    stream.drive([RowJudges(judges, judge.confident), *sinks, ProgressSink(progress)], stop=stop)
+    stream.drive([RowJudges(judges), *sinks, ProgressSink(progress)], stop=stop)
     opened = dict(sorted(Counter(skipped.reason for skipped in sequence.skipped).items()))
     figures = [judges[row.slug].figures() for row in rows]
     return [replace(one, frames={**one.frames, "left_out_on_opening": opened}) for one in figures]

@@ -1,8 +1,8 @@
 """Figures against ground truth, as sinks of a stream: of a run, and of the rows of an evaluation.
 
 For the figure of NLL by error, the paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is
-confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, the share ``confident``
-of the reference's pixels with the smallest variance, of every frame. All rows on the same frames are judged on the same
+confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, the half of
+the reference's pixels with the smallest variance, of every frame. All rows on the same frames are judged on the same
 pixels.
 """
 
@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 from time import perf_counter
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -31,6 +32,9 @@ if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence with
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Names of a row's sums.
 METRICS, BY_ERROR = "metrics", "nll_by_error"
+# Metrics of one's own by name (``sequences.plugins``).
+Own = Mapping[str, Any]
+NONE: Own = MappingProxyType({})
 
 
 class SequenceError(Exception):
@@ -51,11 +55,11 @@ class RunMetrics(FrameSink):
     All are of the pixels that the row uses; the others are masked. ``sums`` are those of an earlier part of the run.
     Its time is added to ``FrameResult.ms`` as "metrics" [ms]."""
 
-    def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]]) -> None:
-        self._key = key
+    def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]], own: Own = NONE) -> None:
+        self._key, self._own = key, own
         self._metrics: dict[str, SequenceMetrics] = {}
         for name, state in sums.items():
-            metrics_of(self._metrics, name).load_state_dict(dict(state))
+            metrics_of(self._metrics, name, own=own).load_state_dict(dict(state))
 
     def sums(self) -> dict[str, dict[str, Tensor]]:
         """By name. They are exchanged by updates, never changed in place."""
@@ -82,7 +86,7 @@ class RunMetrics(FrameSink):
         if row.posterior_depth is not None:
             maps[POSTERIOR] = row.posterior_depth, row.posterior_variance
         for name, (depth, variance) in maps.items():
-            metrics_of(self._metrics, name).update(depth, variance, target, row.valid)
+            metrics_of(self._metrics, name, own=self._own).update(depth, variance, target, row.valid)
 
 
 @dataclass(frozen=True)
@@ -105,8 +109,8 @@ class RowJudge:
     """Collects counts, metrics, times and memory of one row over a sequence; ``named`` are the references by whose
     confident pixels its NLL is binned by error: their names by key."""
 
-    def __init__(self, row: Row, named: Mapping[str, str], bins: str) -> None:
-        self.row, self.named, self._bins = row, named, bins
+    def __init__(self, row: Row, named: Mapping[str, str], bins: str, own: Own = NONE) -> None:
+        self.row, self.named, self._bins, self._own = row, named, bins, own
         self._metrics: dict[str, SequenceMetrics] = {}
         self._by_error: dict[str, NLLByError] = {}
         self._judged, self.reasons, self._idle = 0, Counter[str](), Counter[str]()
@@ -135,7 +139,7 @@ class RowJudge:
         depth, variance, target = (
             torch.where(result.valid, result.depth, torch.nan), result.variance, torch.from_numpy(result.truth)
         )  # fmt: skip
-        how = {"with_variance": variance is not None, "bins": self._bins}
+        how = {"with_variance": variance is not None, "bins": self._bins, "own": self._own}
         metrics_of(self._metrics, METRICS, **how).update(depth, variance, target)
         if variance is None:
             return
@@ -182,11 +186,10 @@ class RowJudge:
 
 
 class RowJudges(FrameSink):
-    """Judges every row of an evaluation, by key; of the pixels of a frame, a reference counts the share ``confident``
-    as confident."""
+    """Judges every row of an evaluation, by key."""
 
-    def __init__(self, judges: Mapping[str, RowJudge], confident: float) -> None:
-        self._judges, self._confident = judges, confident
+    def __init__(self, judges: Mapping[str, RowJudge]) -> None:
+        self._judges = judges
 
     def begin(self, stream: FrameStream) -> None:
         self._estimators = {row.key: row.estimator for row in stream.rows}
@@ -197,7 +200,7 @@ class RowJudges(FrameSink):
             self._judges[key].reasons[reason] += 1
         judged = [key for key, row in result.rows.items() if row.truth is not None]
         expected = {other for key in judged for other in self._judges[key].named}
-        masks = {other: confident_pixels(result.rows[other], self._confident) for other in expected}
+        masks = {other: confident_pixels(result.rows[other]) for other in expected}
         for key, row in result.rows.items():
             self._judges[key].add(row, self._estimators[key].memory(), masks)
 
@@ -225,14 +228,11 @@ def references(row: Row, rows: Sequence[Row]) -> list[Row]:
     return chosen
 
 
-def confident_pixels(row: RowResult, share: float) -> Tensor:
-    """[h, w] bool, True where there is ground truth and the variance is at or below the frame's ``share`` quantile,
-    in (0, 1]."""
+def confident_pixels(row: RowResult) -> Tensor:
+    """[h, w] bool, True where there is ground truth and the variance is at or below the frame's median."""
     assert row.variance is not None
     assert row.truth is not None
     judged = row.valid & torch.from_numpy(row.truth > 0)
-    values = row.variance[judged]
-    if not len(values):
+    if not judged.any():
         return judged
-    threshold = values.kthvalue(max(1, math.ceil(share * len(values)))).values
-    return judged & (torch.where(judged, row.variance, torch.inf) <= threshold)
+    return judged & (torch.where(judged, row.variance, torch.inf) <= row.variance[judged].median())

@@ -109,10 +109,7 @@ class Drift:
 
 
 def rotation(w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[3, 3] exp([w]x) of a rotation vector [3] [rad], by Rodrigues' formula."""
-    angle = float(np.linalg.norm(w))
-    if angle == 0:
-        return np.eye(3)
-    x, y, z = w / angle
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * (K @ K)
+    """[3, 3] exp([w]x) of a rotation vector [3] [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(w).as_matrix())

@@ -167,6 +167,5 @@ class UfM:
         taken = [take_in(cloud, View(*view), self.config.max_points) for cloud, *view in observed]
         self.clouds, self.T_world_first = [one.cloud for one in taken], first
         counts = torch.tensor([[len(one.cloud.count), one.fused, one.new, one.dropped] for one in taken], device=device)
-        return torch.stack([one.variance for one in taken]), UfMStatistics(
-            counts[:, 0], counts[:, 1], counts[:, 2], counts[:, 3], frame.fault
-        )
+        points, fused, new, dropped = counts.unbind(1)
+        return torch.stack([one.variance for one in taken]), UfMStatistics(points, fused, new, dropped, frame.fault)

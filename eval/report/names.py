@@ -70,6 +70,7 @@ EXTRA = (
     NETWORK_MS,
     UNCERTAINTY_MS,
 )
+OWN = "own"  # the group of figures of a user's metrics
 # Figures of which differences between rows are shown.
 DIFFERENCES = (NLL, ECE_DELTA, ECE_Q, AUSE, SPEARMAN)
 
@@ -121,6 +122,11 @@ _WORDS = {
 _VALUES = {"tracked": "tracked corners", "dense": "dense evidence", "truth": "ground truth"}
 
 
+def own_quantities(figures: Iterable[str]) -> list[Quantity]:
+    """The columns of a user's metrics among the names of figures, each once."""
+    return [Quantity(key, key.partition(".")[2], 3) for key in dict.fromkeys(figures) if key.startswith(f"{OWN}.")]
+
+
 def setting_name(name: str) -> str:
     """A setting's name for people; the config's own where it has none."""
     return SETTINGS.get(name, (name.rpartition(".")[2].replace("_", " "), ""))[0]
@@ -142,11 +148,6 @@ def setting_label(values: Mapping[str, Any]) -> str:
         _WORDS.get((name, value)) or f"{setting_name(name)} {setting_value(name, value)}"
         for name, value in shown.items()
     )
-
-
-def row_label(row: Row) -> str:
-    """A row for people: its own title, or "UfM*-Ensemble, rotation noise 2°"."""
-    return row.title or ", ".join(filter(None, (row.name, setting_label(row.changed))))
 
 
 def row_labels(rows: Iterable[Row]) -> dict[Row, str]:

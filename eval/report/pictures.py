@@ -18,7 +18,7 @@ from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.examples import Example, find_examples
-from ufmstar_torch.eval.report.names import row_label
+from ufmstar_torch.eval.report.names import row_labels
 from ufmstar_torch.eval.report.rooms import Snapshot, choose_times, draw_room, find_rooms
 from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.panels import Bar, Box, GridRow, Panel, draw_grid
@@ -85,7 +85,7 @@ def strip_rows(rows: Sequence[Row], base: str) -> list[Row]:
 
 
 def _of_frames(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Drawing]:
-    labels = {slug: row_label(row) for slug, row in rows.items()}
+    labels = {row.slug: label for row, label in row_labels(rows.values()).items()}
     examples = [
         replace(example, dataset=dataset, sequence=sequence)
         for dataset, sequence in results.sequences()
@@ -120,7 +120,7 @@ def _of_rooms(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[
         if any(len(snapshot.mean) for snapshot in snapshots):
             drawn += 1
             name = file_name(ROOM, dataset, sequence, slug)
-            label = row_label(rows[slug])
+            label = row_labels([rows[slug]])[rows[slug]]
             yield f"{sequence}: room", partial(_room, folder, name, label, sequence, snapshots)
 
 

@@ -76,7 +76,7 @@ def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iter
 
 def export_depth(frames: Iterator[Gated], out: Path) -> str:
     """NAME.npy [h, w] float32 [m], NaN where left out."""
-    folder, count = _folder(out, "depth"), 0
+    folder, count = export_folder(out, "depth"), 0
     for count, frame in enumerate(frames, start=1):  # noqa: B007
         write_atomic(folder / f"{frame.name}.npy", partial(_save, frame.depth))
     return f"{folder}: {count} maps"
@@ -91,7 +91,7 @@ def export_trajectory(frames: Iterator[Gated], out: Path) -> str:
         time = float(frame.index) if frame.timestamp is None else frame.timestamp
         quaternion = Rotation.from_matrix(frame.T_world_cam[:3, :3]).as_quat()
         lines.append(" ".join([f"{time:.9f}", *(f"{x:.9g}" for x in (*frame.T_world_cam[:3, 3], *quaternion))]))
-    file = _folder(out) / "trajectory.txt"
+    file = export_folder(out) / "trajectory.txt"
     write_atomic(file, lambda opened: opened.write("\n".join([*lines, ""]).encode()))
     return f"{file}: {len(lines) - 1} poses"
 
@@ -110,7 +110,7 @@ def export_cloud(frames: Iterator[Gated], out: Path, voxel: float, sequence: Fra
     keys, sums = np.zeros(0, np.int64), np.zeros((0, 8))
     waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
     for frame in frames:
-        waiting.append(_voxels(frame, voxel, _image(frame, sequence)))
+        waiting.append(_voxels(frame, voxel, image_of(frame, sequence)))
         if sum(len(part) for part, _ in waiting) > _FOLD:
             keys, sums = _merged([(keys, sums), *waiting])
             waiting = []
@@ -121,18 +121,18 @@ def export_cloud(frames: Iterator[Gated], out: Path, voxel: float, sequence: Fra
     if sequence is not None:
         kinds |= dict.fromkeys(("red", "green", "blue"), "|u1")
         columns.append(np.rint(colour))
-    file = _folder(out) / "cloud.ply"
+    file = export_folder(out) / "cloud.ply"
     write_ply(file, {"vertex": vertex_table(kinds, *columns)}, ["x y z sigma [m], world of the poses"])
     return f"{file}: {len(keys)} points"
 
 
 def export_transforms(frames: Iterator[Gated], out: Path, sequence: FrameSequence) -> str:
     """transforms.json with images as they are, and depth and sigma at their pixels (16 bits, 0 = left out)."""
-    folder, unit, listed = _folder(out, "transforms"), None, []
+    folder, unit, listed = export_folder(out, "transforms"), None, []
     for name in ("images", "depth", "sigma"):
-        _folder(out, "transforms", name)
+        export_folder(out, "transforms", name)
     for frame in frames:
-        image = _image(frame, sequence)
+        image = image_of(frame, sequence)
         if image is None or image.image is None:
             continue
         K, size = image.intrinsics, (image.image.shape[0], image.image.shape[1])
@@ -167,15 +167,20 @@ def run_settings(out: Path) -> dict[str, Any]:
         raise ValueError(f"{out}/summary.json is not that of a run: {error}") from error
 
 
+def points_in_camera(frame: Gated) -> tuple[NDArray[np.float64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """[P, 3] the points of the pixels that are kept, in the camera's axes [m], and those pixels' rows and columns."""
+    v, u = np.nonzero(np.isfinite(frame.depth))
+    z, K = frame.depth[v, u].astype(np.float64), frame.intrinsics
+    y = (v - K[1, 2]) / K[1, 1]
+    return np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1), (v, u)
+
+
 def _voxels(frame: Gated, voxel: float, image: Frame | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """[P] the number of each pixel's voxel, and [P, 8] its weight w, w x, w y, w z, w r, w g, w b, and 1."""
-    v, u = np.nonzero(np.isfinite(frame.depth))
-    z, sigma = frame.depth[v, u].astype(np.float64), np.maximum(frame.sigma[v, u], _LEAST_SIGMA)
-    K, T = frame.intrinsics, frame.T_world_cam
-    y = (v - K[1, 2]) / K[1, 1]
-    in_camera = np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1)
+    in_camera, (v, u) = points_in_camera(frame)
+    sigma, K, T = np.maximum(frame.sigma[v, u], _LEAST_SIGMA), frame.intrinsics, frame.T_world_cam
     points = in_camera @ T[:3, :3].T + T[:3, 3]
-    colour = np.zeros((len(z), 3))
+    colour = np.zeros((len(points), 3))
     if image is not None and image.image is not None:
         colour = resample_nearest(image.image, image.intrinsics, K, frame.depth.shape)[v, u].astype(np.float64)
     weight = 1 / np.square(sigma.astype(np.float64))[:, None]
@@ -194,7 +199,7 @@ def _merged(
     return keys, np.stack([np.bincount(index, column, len(keys)) for column in columns], axis=-1)
 
 
-def _image(frame: Gated, sequence: FrameSequence | None) -> Frame | None:
+def image_of(frame: Gated, sequence: FrameSequence | None) -> Frame | None:
     """The frame of the recording; None where it cannot be read."""
     if sequence is None or frame.index >= len(sequence) or sequence.names[frame.index] != frame.name:
         return None
@@ -204,7 +209,7 @@ def _image(frame: Gated, sequence: FrameSequence | None) -> Frame | None:
         return None
 
 
-def _folder(out: Path, *names: str) -> Path:
+def export_folder(out: Path, *names: str) -> Path:
     folder = out.joinpath("export", *names)
     folder.mkdir(parents=True, exist_ok=True)
     return folder

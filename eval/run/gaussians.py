@@ -51,7 +51,7 @@ def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_fir
     Raises:
         ValueError: ``T_world_first`` has another shape.
     """
-    parts = _Components(mixture, T_world_first)
+    parts = Components(mixture, T_world_first)
     quaternion = Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True)
     opacity = np.full(len(parts.mean), np.log(OPACITY / (1 - OPACITY)))
     columns = (parts.mean, parts.axes[:, :, 0], (parts.colour / 255 - 0.5) / SH_DC, opacity, np.log(parts.sigma))
@@ -69,7 +69,7 @@ def write_ellipsoids_ply(path: str | Path, mixture: GaussianMixture, *, T_world_
     sqrt(disagreement), disagreement [m^2] and the component's number. Arguments, result and errors as
     :func:`write_mixture_ply`.
     """
-    parts = _Components(mixture, T_world_first)
+    parts = Components(mixture, T_world_first)
     sphere, triangles = icosphere(SUBDIVISIONS)
     k, n = len(parts.mean), len(sphere)
     # Sigma^(1/2) u: symmetric with a positive determinant, so triangles keep facing outwards.
@@ -123,7 +123,7 @@ def icosphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int64]
     return vertices, triangles
 
 
-class _Components:
+class Components:
     """The occupied components of the first stream in float64, in the frame asked for.
 
     Attributes:

@@ -135,7 +135,7 @@ def detect(path: Path) -> bool:
 def _bag_path(path: Path) -> Path | None:
     if path.is_file():
         return path if path.suffix in _SUFFIXES else None
-    files = [p for p in path.iterdir() if any(end in p.suffixes for end in _SUFFIXES)] if path.is_dir() else []
+    files = [p for p in path.glob("*") if any(end in p.suffixes for end in _SUFFIXES)]
     if files and (path / _METADATA).is_file():
         return path
     return files[0] if len(files) == 1 and files[0].suffix in _SUFFIXES else None
@@ -217,7 +217,8 @@ def _choose(bag: Bag, options: Options) -> _Topics:
     if not info and options.intrinsics is None:
         raise ValueError(f"{bag.path} has no camera info: pass intrinsics")
     same_view = [name for name, frame in depths.items() if frame == images[image]]
-    depth = _one("the depth", bag, same_view, named, types)
+    so_called = [name for name in same_view if name in named or "depth" in name.lower()]  # not a map of sigma
+    depth = _one("the depth", bag, so_called or same_view, named, types)
     other = [name for name in named if name in depths and name not in same_view]
     if other:
         raise ValueError(

@@ -1,0 +1,123 @@
+"""A run's result as a ROS 2 bag (mcap), written with rosbags: what RViz, a costmap or ``open_sequence`` reads.
+
+Frames: tf has ``camera`` (optical axes) in ``world``. Images, depth and sigma show the same pixels, the image's;
+without images, those of the depth maps. A pixel that is left out is NaN (REP 118).
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ufmstar_torch.eval.run.export import Gated, export_folder, image_of, points_in_camera
+from ufmstar_torch.eval.sequences.frame import FrameSequence
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
+from ufmstar_torch.optional import optional
+
+WORLD, CAMERA = "world", "camera"
+IMAGE, INFO, DEPTH, SIGMA = "/camera/image", "/camera/camera_info", "/camera/depth", "/camera/sigma"
+CLOUD, TF = "/camera/points", "/tf"
+_FIELDS = ("x", "y", "z", "variance")
+_FLOAT32 = 7  # of sensor_msgs/PointField
+
+
+def export_bag(frames: Iterator[Gated], out: Path, sequence: FrameSequence | None) -> str:
+    """OUT/export/bag: of each frame the image (where the recording can be read), camera info, depth and sigma (32FC1,
+    [m]), its points in the camera's axes with their variance [m^2], and the camera's pose in tf.
+
+    Raises:
+        ModuleNotFoundError: rosbags is not installed.
+    """
+    how = ("ROS bags need rosbags", "'ufmstar-torch[recordings]'")
+    rosbag2, stores = optional("rosbags.rosbag2", *how), optional("rosbags.typesys", *how)
+    folder, count = export_folder(out) / "bag", 0
+    if folder.exists():
+        shutil.rmtree(folder)  # an earlier export's: rosbags writes into a new folder only
+    ros = _Messages(stores.get_typestore(stores.Stores.ROS2_HUMBLE))
+    with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+        connections: dict[str, Any] = {}
+        for count, frame in enumerate(frames, start=1):  # noqa: B007
+            # without times, frames are a second apart
+            seconds = float(frame.index) if frame.timestamp is None else frame.timestamp
+            stamp = max(0, round(seconds * 1e9))
+            for topic, message in _of_frame(ros, stamp, frame, sequence).items():
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=ros.store)
+                writer.write(connections[topic], stamp, ros.store.serialize_cdr(message, message.__msgtype__))
+    return f"{folder}: {count} frames"
+
+
+def _of_frame(ros: _Messages, stamp: int, frame: Gated, sequence: FrameSequence | None) -> dict[str, Any]:
+    """A frame's messages by topic."""
+    image, K, depth, sigma = image_of(frame, sequence), frame.intrinsics, frame.depth, frame.sigma
+    messages = {TF: ros.tf(stamp, frame.T_world_cam)}
+    if image is not None and image.image is not None:
+        K, size = image.intrinsics, (image.image.shape[0], image.image.shape[1])
+        depth, sigma = (
+            np.where(values > 0, values, np.float32(np.nan))
+            for values in (resample_nearest(values, frame.intrinsics, K, size) for values in (depth, sigma))
+        )
+        messages[IMAGE] = ros.image(stamp, image.image, "rgb8")
+    messages[INFO] = ros.info(stamp, K, depth.shape)
+    messages[DEPTH], messages[SIGMA] = (ros.image(stamp, values, "32FC1") for values in (depth, sigma))
+    points, (v, u) = points_in_camera(frame)
+    messages[CLOUD] = ros.cloud(stamp, np.column_stack([points, np.square(frame.sigma[v, u])]))
+    return messages
+
+
+class _Messages:
+    """ROS 2's messages of arrays."""
+
+    def __init__(self, store: Any) -> None:
+        self.store = store
+
+    def _make(self, kind: str, /, **values: Any) -> Any:
+        return self.store.types[kind](**values)
+
+    def _header(self, stamp: int, frame: str = CAMERA) -> Any:
+        time = self._make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+        return self._make("std_msgs/msg/Header", stamp=time, frame_id=frame)
+
+    def image(self, stamp: int, values: NDArray[Any], encoding: str) -> Any:
+        data = np.ascontiguousarray(values).view(np.uint8).ravel()
+        size = {"height": len(values), "width": values.shape[1], "step": data.size // len(values)}
+        how = {"encoding": encoding, "is_bigendian": 0, "data": data}
+        return self._make("sensor_msgs/msg/Image", header=self._header(stamp), **size, **how)
+
+    def info(self, stamp: int, K: NDArray[np.float64], size: tuple[int, ...]) -> Any:
+        zero = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+        P = np.hstack([K, np.zeros((3, 1))]).ravel()
+        how = {"d": np.zeros(5), "k": K.ravel().copy(), "r": np.eye(3).ravel(), "p": P, "binning_x": 0, "binning_y": 0}
+        how |= {"height": size[0], "width": size[1], "distortion_model": "plumb_bob"}
+        roi = self._make("sensor_msgs/msg/RegionOfInterest", **zero)
+        return self._make("sensor_msgs/msg/CameraInfo", header=self._header(stamp), roi=roi, **how)
+
+    def cloud(self, stamp: int, points: NDArray[Any]) -> Any:
+        data = np.ascontiguousarray(points, dtype="<f4")
+        field, width = "sensor_msgs/msg/PointField", data.itemsize * len(_FIELDS)
+        fields = [
+            self._make(field, name=name, offset=data.itemsize * i, datatype=_FLOAT32, count=1)
+            for i, name in enumerate(_FIELDS)
+        ]
+        how = {"height": 1, "width": len(data), "fields": fields, "is_bigendian": False, "is_dense": True}
+        how |= {"point_step": width, "row_step": width * len(data), "data": data.view(np.uint8).ravel()}
+        return self._make("sensor_msgs/msg/PointCloud2", header=self._header(stamp), **how)
+
+    def tf(self, stamp: int, T_world_cam: NDArray[np.float64]) -> Any:
+        quaternion = Rotation.from_matrix(T_world_cam[:3, :3]).as_quat()
+        position = dict(zip("xyz", T_world_cam[:3, 3].tolist(), strict=True))
+        motion = self._make(
+            "geometry_msgs/msg/Transform",
+            translation=self._make("geometry_msgs/msg/Vector3", **position),
+            rotation=self._make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", quaternion.tolist(), strict=True))),
+        )
+        how = {"header": self._header(stamp, WORLD), "child_frame_id": CAMERA, "transform": motion}
+        return self._make(
+            "tf2_msgs/msg/TFMessage", transforms=[self._make("geometry_msgs/msg/TransformStamped", **how)]
+        )
