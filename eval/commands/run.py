@@ -22,6 +22,10 @@ PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
 _OF_FOLDER = ("variance", "depth_scale", "map_intrinsics")
 
 
+# Of UfM*'s settings, those that are off by default.
+_SECTIONS = ("anchors", "confidence", "posterior", "merge")
+
+
 @dataclass(frozen=True, kw_only=True)
 class NetworkOptions:
     """Depth from networks.
@@ -109,8 +113,7 @@ class UfMOptions:
         defaults: dict[str, Any] = {}
         if self.ufm_preset == "paper":
             changed = flat(UfMStarConfig.paper().to_dict()) | {"on_bad_frame": "skip"}
-            off = ("anchors", "posterior", "merge")
-            defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in off}
+            defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in _SECTIONS}
         if self.preset is not None:
             preset = SPGFConfig.preset(self.preset).to_dict()
             defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
@@ -177,8 +180,7 @@ class RunOptions:
         """Return the options that define the result, as plain values of a configuration file."""
         started = ("resume", "overwrite", "debug")
         plain = {name: value for name, value in as_dict(self).items() if name not in started}
-        sections = ("anchors", "posterior", "merge")
-        ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in sections}
+        ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in _SECTIONS}
         return plain | {"ufm": ufm}
 
 

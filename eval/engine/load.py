@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from ufmstar_torch.eval.sequences.frame import Size, parse_size
 from ufmstar_torch.models.dropout import SAMPLES
 from ufmstar_torch.models.inference import Inference, runtime_of
 from ufmstar_torch.models.load import DIRECTORIES, load_network, network_names
+from ufmstar_torch.models.monodepth2 import MonodepthResNet
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained, read_info
 from ufmstar_torch.networks_in_turn import NetworksInTurn
@@ -72,6 +73,14 @@ class NetworkChoice:
         if not (base and equals and model):
             raise ValueError(f"a network must be given as {_FORM}, got {text!r}")
         return cls(base, model, tuple(file for file in files.split(",") if file), label)
+
+    def with_spec(self, spec: str | None) -> NetworkChoice:
+        """The choice with that spec, unless it has one, or needs none as the sequence's own depth."""
+        if spec is None or self.spec is not None or self.model == TRUTH:
+            return self
+        if not spec.endswith(".json"):
+            raise ValueError(f"--spec must be a file *.json, got {spec!r}")
+        return replace(self, files=(*self.files, spec))
 
     @property
     def weights(self) -> tuple[str, ...]:
@@ -218,7 +227,7 @@ def load_members(
             fetch = "`hf download NAME --local-dir DIR` fetches a checkpoint from the hub"
             raise FileNotFoundError(f"no such directory: {path}; {fetch}")
     for path in of_files:
-        if not path.is_file():
+        if not path.is_file() and not (model == "monodepth2" and path.is_dir()):
             raise FileNotFoundError(f"no such file: {path}")
     members: list[DepthNetwork] = []
     how = {} if spec is None else {"spec": spec}
@@ -261,7 +270,7 @@ def _label(model: str, file: Path, network: DepthNetwork) -> str:
     if model == "fastdepth":
         return "FastDepth"
     if model == "monodepth2":
-        return f"ResNet{getattr(network, 'layers', 50)}-Monodepth2"
+        return f"ResNet{network.layers}-Monodepth2" if isinstance(network, MonodepthResNet) else "Monodepth2"
     return "Depth Anything V2" if model == "depth_anything" else file.stem
 
 

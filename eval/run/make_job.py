@@ -61,7 +61,7 @@ def make_job(
         sequence=sequence,
         indices=indices,
         source=source,
-        config=config.within(source.max_depth),
+        config=config.within(source.max_depth, source.states_confidence),
         recalibration=recalibration_of(options, config, source),
         device=torch.device(options["device"]),
         settings=options,
