@@ -20,7 +20,7 @@ from ufmstar_torch.models.hugging_face import from_hugging_face, of_transformers
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import METRIC, OutputSpec, ProgramSpec, Spread
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.prediction import DepthPrediction, infer
+from ufmstar_torch.prediction import DepthPrediction, infer, states_confidence
 from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
 
 # Files of a torch.export archive: those of a word or a number, and tensors as raw bytes.
@@ -51,6 +51,11 @@ class WrappedNetwork(DepthNetwork):
         """[m] As declared."""
         return self.outputs.max_depth
 
+    @property
+    def states_confidence(self) -> bool:
+        """Whether one is declared, or stated by a network that returns a ``DepthPrediction``."""
+        return self.outputs.confidence is not None or states_confidence([self.network])
+
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it, with ``intrinsics`` [B, 3, 3]
         [px] for a network that takes them. Raises ValueError: the network's output is not what was declared, or the
@@ -74,6 +79,7 @@ def wrap_network(
     aleatoric_kind: Spread = "variance",
     epistemic: str | int | None = None,
     epistemic_kind: Spread = "variance",
+    confidence: str | int | None = None,
     resize: bool = False,
     focal: float | None = None,
     max_depth: float | None = None,
@@ -89,7 +95,8 @@ def wrap_network(
         output: which of several outputs is depth: a name, or a position in a tuple.
         scale: [m] length of one unit of depth.
         inverse: declares inverse or relative depth, which is refused.
-        aleatoric, aleatoric_kind, epistemic, epistemic_kind, resize, focal, max_depth: as in :class:`OutputSpec`.
+        aleatoric, aleatoric_kind, epistemic, epistemic_kind, confidence, resize, focal, max_depth: as in
+            :class:`OutputSpec`.
         takes_intrinsics: whether it is called as ``network(x, K)``, K [B, 3, 3] [px] of ``x``; an attribute
             ``takes_intrinsics = True`` of ``network`` does the same.
         preprocess: what its input needs; None: images in [0, 1] at their own size. Of a model of ``transformers``, also
@@ -102,7 +109,11 @@ def wrap_network(
     if isinstance(network, type) or not callable(network):
         raise TypeError(f"network must be an nn.Module or a function, got {_described(network)}")
     if of_transformers(network):
-        if inverse or resize or any(v is not None for v in (output, aleatoric, epistemic, focal, max_depth)):
+        if (
+            inverse
+            or resize
+            or any(v is not None for v in (output, aleatoric, epistemic, confidence, focal, max_depth))
+        ):
             raise ValueError("of a model of transformers only scale, takes_intrinsics and preprocess can be declared")
         own = preprocess is None or isinstance(preprocess, Preprocess)
         declared: dict[str, Any] = {
@@ -113,7 +124,7 @@ def wrap_network(
     if preprocess is not None and not isinstance(preprocess, Preprocess):
         raise TypeError(f"preprocess must be a Preprocess or None, got {_described(preprocess)}")
     kind, spreads = "inverse" if inverse else METRIC, (aleatoric, aleatoric_kind, epistemic, epistemic_kind)
-    spec = OutputSpec(kind, output, scale, *spreads, resize, focal, max_depth)
+    spec = OutputSpec(kind, output, scale, *spreads, confidence, resize, focal, max_depth)
     return WrappedNetwork(network, spec, preprocess or Preprocess(), takes_intrinsics)
 
 

@@ -15,7 +15,7 @@ _LOADERS = {
     "fastdepth": ("fastdepth", "load_fastdepth"),
     "huggingface": ("hugging_face", "load_hugging_face"),
     "litert": ("litert_network", "load_litert"),
-    "monodepth2": ("monodepth2", "load_monodepth_resnet"),
+    "monodepth2": ("monodepth2_import", "load_monodepth_resnet"),
     "onnx": ("fastdepth", "load_graph"),
     "torchscript": ("any_network", "load_torchscript"),
     "trained": ("trained", "load_ensemble"),
@@ -39,7 +39,8 @@ def load_network(name: str, weights: str | Path | None = None, **options: Any) -
             fastdepth: ``size``, ``dropout``, ``positive`` with a state_dict, ``runtime``, ``threads`` and ``device``.
                 ``weights``: an ONNX export, which runs in ONNX Runtime (``runtime="torch"``: in torch), a .tflite file,
                 or a state_dict (.pth, .pt, .safetensors).
-            monodepth2: ``strides`` ("v1.5" or "v1"), ``size``, ``dropout``. ``weights``: a state_dict.
+            monodepth2: ``strides`` ("v1.5" or "v1"), ``size``, ``dropout``. ``weights``: a state_dict. Or a folder with
+                Monodepth2's published encoder.pth and depth.pth, and ``spec`` (see ``PublishedSpec``).
             trained: ``backbone``, of a head on a module of one's own. ``weights``: a file of ``save_trained``; where
                 it has several members, all of them as one network (``Ensemble``). ``load_trained`` gives them one by
                 one, and takes several files.

@@ -107,6 +107,8 @@ class MonodepthResNet(Backbone):
         dropout: probability of decoder dropout, after each of the five levels.
         dropout_both: dropout after both convolutions of a level instead of the second only.
         decoder: channels of the five levels, full resolution first.
+        disparity: (least, largest) depth in units of ``scale`` [m], between whose inverses the last convolution's
+            sigmoid interpolates, as in Monodepth2; None = its softplus is depth.
         size: (height, width) [px], multiples of 32 and at least 64, that ``preprocess`` makes.
 
     Raises:
@@ -122,9 +124,14 @@ class MonodepthResNet(Backbone):
         dropout: float = 0.0,
         dropout_both: bool = False,
         decoder: tuple[int, ...] = DECODER_WIDTHS,
+        disparity: tuple[float, float] | None = None,
+        scale: float = 1.0,
         size: tuple[int, int] = (224, 224),
     ) -> None:
         super().__init__()
+        if not (disparity is None or 0 < disparity[0] < disparity[1]) or not 0 < scale < math.inf:
+            raise ValueError(f"disparity must be (least, largest) and scale positive, got {disparity} and {scale}")
+        self.disparity, self.scale = disparity, scale
         if len(decoder) != LEVELS or min(decoder) < 1:
             raise ValueError(f"decoder must be {LEVELS} positive numbers of channels, got {decoder}")
         if not fits(*size, MULTIPLE, SMALLEST):
@@ -166,8 +173,18 @@ class MonodepthResNet(Backbone):
         return maps[::-1]
 
     def depth(self, features: Tensor) -> Tensor:
-        """Depth [B, H, W] [m] from :meth:`features`: a 3x3 convolution and softplus, hence positive."""
-        return F.softplus(self.head(features))[:, 0]
+        """Depth [B, H, W] [m] from :meth:`features`: a 3x3 convolution and softplus, hence positive; or the inverse of
+        its disparity."""
+        raw = self.head(features)[:, 0]
+        if self.disparity is None:
+            return F.softplus(raw)
+        far, near = (1 / depth for depth in reversed(self.disparity))
+        return self.scale / (far + (near - far) * raw.sigmoid())
+
+    @property
+    def max_depth(self) -> float | None:
+        """[m] The largest depth of a disparity."""
+        return None if self.disparity is None else self.scale * self.disparity[1]
 
     @classmethod
     def imagenet(
@@ -207,25 +224,14 @@ def shape_of_state_dict(state: Mapping[str, Tensor]) -> tuple[int, tuple[int, ..
     Raises ValueError: a tensor from which they are read is missing."""
     keys = ["encoder.layer1.0.conv2.weight", *(f"levels.{i}.before.weight" for i in range(LEVELS))]
     _, *decoder = channels_of(state, keys, "MonodepthResNet")
-    # Two, or three, blocks of two convolutions in the first stage; or three of three.
+    return layers_of(state), tuple(decoder)
+
+
+def layers_of(state: Mapping[str, Any]) -> int:
+    """Layers of the ResNet behind "encoder.": two, or three, blocks of two convolutions in the first stage; or three of
+    three."""
     deep = 34 if "encoder.layer1.2.conv1.weight" in state else 18
-    layers = 50 if "encoder.layer1.0.conv3.weight" in state else deep
-    return layers, tuple(decoder)
-
-
-def load_monodepth_resnet(
-    weights: Path, size: tuple[int, int] = (224, 224), dropout: float = 0.0, strides: str = "v1.5"
-) -> MonodepthResNet:
-    """The network in a state_dict file, with the layers and widths of the file; errors as
-    ``checkpoints.load_weights``."""
-    state = load_state_dict_file(weights)
-    try:
-        layers, decoder = shape_of_state_dict(state)
-    except ValueError as error:
-        raise ValueError(f"{weights}: {error}") from error
-    network = MonodepthResNet(layers, strides=strides, dropout=dropout, decoder=decoder, size=size)
-    fill(network, state, str(weights))
-    return network
+    return 50 if "encoder.layer1.0.conv3.weight" in state else deep
 
 
 def _fill_encoder(encoder: ResNetEncoder, state: Mapping[str, Tensor], source: str) -> None:

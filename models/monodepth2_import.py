@@ -1,4 +1,4 @@
-"""Published Monodepth2 weights in a :class:`MonodepthResNet`.
+"""Weights from files in a :class:`MonodepthResNet`, the published ones of Monodepth2 among them.
 
 Its repository publishes two state_dicts. ``encoder.pth`` holds torchvision's keys behind "encoder." and the
 image size it was trained at. ``depth.pth`` numbers the decoder's convolutions in the order of execution: levels 4
@@ -10,16 +10,32 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from ufmstar_torch.models.checkpoints import CheckpointError, load_state_dict_file
-from ufmstar_torch.models.monodepth2 import IMAGENET_MEAN, IMAGENET_STD, LEVELS, MonodepthResNet
+from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.models.alignment import AlignedNetwork, Alignment
+from ufmstar_torch.models.checkpoints import CheckpointError, channels_of, fill, load_state_dict_file, read_tensors
+from ufmstar_torch.models.monodepth2 import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    LEVELS,
+    MonodepthResNet,
+    layers_of,
+    shape_of_state_dict,
+)
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.preprocess import Preprocess
 
 # Keys of encoder.pth that are no weights.
 _NO_WEIGHTS = ("height", "width", "use_stereo")
+# [m] Length of a unit of depth of networks that were trained on KITTI's stereo pairs, whose cameras are .54 m apart and
+# in training .1 units.
+STEREO_SCALE = 5.4
 # Monodepth2 normalises every colour of an image in [0, 1] by these.
 _MEAN, _STD = 0.45, 0.225
 _CONVOLUTION = re.compile(r"decoder\.(\d+)(?:\.conv)?\.conv\.(weight|bias)")
@@ -31,14 +47,14 @@ class Imported:
 
     loaded: tuple[str, ...]  # keys of the network that were filled
     skipped: Mapping[str, str]  # keys of the files that were not used, with the reason
-    kept: tuple[str, ...]  # keys of the network that stayed as they were; always its head, since disparity is not depth
+    kept: tuple[str, ...]  # keys of the network that stayed as they were; of a metric network its head
 
 
 def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_path: str | Path) -> Imported:
     """Fill a network's encoder and decoder with published Monodepth2 weights, in place, where shapes allow.
 
-    The result does not predict depth yet: Monodepth2's last convolutions give disparity without a metric
-    scale, so the depth head stays untrained and needs fine-tuning. The first convolution is rescaled from
+    A network with ``disparity`` gets the finest disparity convolution too. Another one does not predict depth yet: its
+    head stays untrained. The first convolution is rescaled from
     Monodepth2's normalisation of colours to ImageNet's, exactly but for the border, which is padded with
     ImageNet's mean instead of its grey.
 
@@ -56,7 +72,8 @@ def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_pa
     expected = network.state_dict()
     skipped: dict[str, str] = {}
     loaded: dict[str, Tensor] = {}
-    for path, place in ((encoder_path, _encoder_place), (depth_path, _decoder_place)):
+    decoder = partial(_decoder_place, disparity=network.disparity is not None)
+    for path, place in ((encoder_path, _encoder_place), (depth_path, decoder)):
         state = load_state_dict_file(path, ignore=_NO_WEIGHTS)
         fitting, unused = {}, {}
         for key, value in state.items():
@@ -77,6 +94,84 @@ def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_pa
     return Imported(tuple(sorted(loaded)), skipped, tuple(sorted(set(expected) - set(loaded))))
 
 
+@dataclass(frozen=True)
+class PublishedSpec(Checked):
+    """The meaning of published Monodepth2 weights' disparity.
+
+    Attributes:
+        scale: [m] length of a unit of depth; None = 5.4 where the weights were trained on stereo pairs.
+        alignment: instead of it: "affine" of the depth in units, or "inverse" of its inverse.
+        least, largest: depth between whose inverses the disparity lies [units].
+        size: (height, width) [px] of the input; None = as in training.
+    """
+
+    scale: float | None = number(None, "s", "m", 0.0, open_low=True)
+    alignment: Alignment | None = None
+    least: float = 0.1
+    largest: float = 100.0
+    size: tuple[int, int] | None = None
+
+
+class Units(nn.Module):
+    """A network's depth [B, H, W], or its inverse, as an alignment takes it."""
+
+    def __init__(self, network: DepthNetwork, inverse: bool) -> None:
+        super().__init__()
+        self.network, self.inverse = network, inverse
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Of ``image`` [B, 3, H, W]."""
+        depth: Tensor = self.network(image).depth
+        return 1 / depth if self.inverse else depth
+
+
+def load_published(folder: Path, spec: PublishedSpec | Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
+    """Metric depth by the weights in a folder with Monodepth2's encoder.pth and depth.pth; ``spec``: declarations,
+    plain values or a JSON file. Raises FileNotFoundError, CheckpointError: as :func:`load_monodepth2`; ValueError:
+    weights of single images without a scale, or an impossible value."""
+    s, files = PublishedSpec.read(spec or {}), (folder / "encoder.pth", folder / "depth.pth")
+    if missing := [path for path in files if not path.is_file()]:
+        raise FileNotFoundError(f"no {missing[0]}; expected a folder with Monodepth2's encoder.pth and depth.pth")
+    with files[0].open("rb") as opened:
+        about: Any = read_tensors(opened, files[0])
+    if s.alignment is None and s.scale is None and not about.get("use_stereo"):
+        raise ValueError(
+            f'{folder}: trained on single images, Monodepth2\'s depth has no scale: declare "scale" [m] or "alignment" '
+            "(fit_affine_depth, fit_inverse_depth) in a spec"
+        )
+    decoder = load_state_dict_file(files[1])
+    widths = channels_of(
+        decoder, [f"decoder.{2 * n + 1}.conv.conv.weight" for n in range(LEVELS)], "Monodepth2 decoder"
+    )
+    scale = (s.scale or STEREO_SCALE) if s.alignment is None else 1.0
+    network = MonodepthResNet(layers_of(about), decoder=widths[::-1], disparity=(s.least, s.largest), scale=scale)
+    report = load_monodepth2(network, *files)
+    if kept := [key for key in report.kept if not key.endswith("num_batches_tracked")]:
+        raise CheckpointError(f"{folder} lacks {kept[0]} ({len(kept)} such tensors)")
+    size = s.size or (int(about.get("height", 192)), int(about.get("width", 640)))
+    network.preprocess = Preprocess(size=size, mean=IMAGENET_MEAN, std=IMAGENET_STD)
+    if s.alignment is None:
+        return network.eval()
+    return AlignedNetwork(Units(network, s.alignment.kind == "inverse"), s.alignment, network.preprocess).eval()
+
+
+def load_monodepth_resnet(
+    weights: Path, size: tuple[int, int] = (224, 224), dropout: float = 0.0, strides: str = "v1.5", spec: Any = None
+) -> DepthNetwork:
+    """The network in a state_dict file, with the layers and widths of the file; errors as
+    ``checkpoints.load_weights``. Of a folder, :func:`load_published` with ``spec``."""
+    if weights.is_dir():
+        return load_published(weights, spec)
+    state = load_state_dict_file(weights)
+    try:
+        layers, decoder = shape_of_state_dict(state)
+    except ValueError as error:
+        raise ValueError(f"{weights}: {error}") from error
+    network = MonodepthResNet(layers, strides=strides, dropout=dropout, decoder=decoder, size=size)
+    fill(network, state, str(weights))
+    return network
+
+
 def _encoder_place(key: str) -> str:
     """The network's key for one of encoder.pth. Raises ValueError: there is none."""
     if key.startswith("encoder.fc."):
@@ -84,14 +179,16 @@ def _encoder_place(key: str) -> str:
     return key
 
 
-def _decoder_place(key: str) -> str:
+def _decoder_place(key: str, disparity: bool = False) -> str:
     """The network's key for one of depth.pth. Raises ValueError: there is none."""
     match = _CONVOLUTION.fullmatch(key)
     if match is None:
         raise ValueError("not a key of Monodepth2's decoder")
     number, kind = int(match[1]), match[2]
+    if disparity and number == 2 * LEVELS:
+        return f"head.{kind}"
     if number >= 2 * LEVELS:
-        raise ValueError("disparity is not metric depth")
+        raise ValueError("coarser disparities are not used" if disparity else "disparity is not metric depth")
     return f"levels.{LEVELS - 1 - number // 2}.{'after' if number % 2 else 'before'}.{kind}"
 
 

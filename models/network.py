@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor, nn
 
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.prediction import DepthPrediction, stated_range, takes_intrinsics
+from ufmstar_torch.prediction import DepthPrediction, stated_range, states_confidence, takes_intrinsics
 
 
 class DepthNetwork(nn.Module, ABC):
@@ -35,6 +35,11 @@ class DepthNetwork(nn.Module, ABC):
     def max_depth(self) -> float | None:
         """[m] The largest depth that it can predict; None where it is not bounded, or not known."""
         return stated_range(self.wrapped)
+
+    @property
+    def states_confidence(self) -> bool:
+        """Whether its predictions have a ``confidence``."""
+        return states_confidence(self.wrapped)
 
     if TYPE_CHECKING:
 

@@ -41,7 +41,9 @@ class OutputSpec(Checked):
         aleatoric, epistemic: names of the outputs with the learned data and model variance, if any.
         aleatoric_kind, epistemic_kind: "variance", "std", "log_variance" or "log_std" (natural logarithms), in the
             units of the depth output; or "relative_std", a standard deviation per depth (to first order that of the
-            logarithm of depth). A "confidence" has no such meaning and is refused.
+            logarithm of depth). A "confidence" has no such meaning and is refused: name it in ``confidence``.
+        confidence: name of an output that ranks the pixels in whatever unit, as a confidence or an uncertainty; anchors
+            teach what it means in metres (``ufmstar_torch.confidence``).
         max_depth: [m] largest depth that the network can predict: ``UncertainDepth`` and the commands use no pixel
             beyond it; None where it is not known.
         resize: whether outputs of another resolution than the input are brought to it by repeating or
@@ -58,6 +60,7 @@ class OutputSpec(Checked):
     aleatoric_kind: str = choice(*SPREADS)
     epistemic: str | int | None = None
     epistemic_kind: str = choice(*SPREADS)
+    confidence: str | int | None = None
     resize: bool = False
     focal: float | None = number(None, "f", "px", 0.0, open_low=True, open_high=True)
     max_depth: float | None = number(None, "d_max", "m", 0.0, open_low=True, open_high=True)
@@ -72,12 +75,15 @@ class OutputSpec(Checked):
         if self.kind != METRIC:
             raise ValueError(f"OutputSpec.kind must be {METRIC!r} (refused: {NOT_METRIC}), got {self.kind!r}")
         if "confidence" in (self.aleatoric_kind, self.epistemic_kind):
-            raise ValueError(f"a confidence is no spread of depth: it ranks pixels only; expected one of {SPREADS}")
+            raise ValueError(
+                f"a confidence is no spread of depth: it ranks pixels only, declare it as confidence=NAME; spreads are "
+                f"{SPREADS}"
+            )
         super().__post_init__()
 
     def names(self) -> list[str | int]:
         """The outputs that are declared by name."""
-        return [name for name in (self.depth, self.aleatoric, self.epistemic) if name is not None]
+        return [name for name in (self.depth, self.aleatoric, self.epistemic, self.confidence) if name is not None]
 
     def prediction(
         self, outputs: Mapping[str | int, Tensor], size: tuple[int, int], intrinsics: Tensor | None = None
@@ -100,7 +106,8 @@ class OutputSpec(Checked):
         depth = depth * unit
         aleatoric = self._variance(outputs, self.aleatoric, self.aleatoric_kind, depth, unit)
         epistemic = self._variance(outputs, self.epistemic, self.epistemic_kind, depth, unit)
-        return DepthPrediction(depth, aleatoric, epistemic)
+        confidence = None if self.confidence is None else self._map(outputs, self.confidence, size)
+        return DepthPrediction(depth, aleatoric, epistemic, confidence)
 
     def _unit(self, intrinsics: Tensor | None, depth: Tensor) -> float | Tensor:
         """[m] length of one unit of the depth output: a number, or [B, 1, 1] where the camera decides."""

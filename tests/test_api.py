@@ -16,6 +16,7 @@ PUBLIC = {
     "LiveDepth",
     "LiveResult",
     "AnchorConfig",
+    "ConfidenceConfig",
     "MergeConfig",
     "PosteriorConfig",
     "Recalibration",

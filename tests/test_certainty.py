@@ -90,7 +90,7 @@ def test_declared_ranges_reach_the_pipeline_and_the_evaluation():
     assert UfMStarConfig().segment.depth_limit == 20.0
     source = NetworkSource(NetworksInTurn(network), torch.device("cpu"), {})
     assert source.max_depth == 7.0
-    made = make_estimator(Row(Method.parse("UfM*-DepthOnly")), torch.device("cpu"), source.max_depth)
+    made = make_estimator(Row(Method.parse("UfM*-DepthOnly")), torch.device("cpu"), source)
     assert made.ufm.config.segment.max_depth == 7.0
 
 

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.models import (
     CheckpointError,
     MonodepthResNet,
@@ -121,8 +122,10 @@ def published_decoder(channels: tuple[int, ...], widths: tuple[int, ...], seed: 
     return random_like(empty, seed)
 
 
-def write_published(folder: Path, encoder: dict[str, Any], decoder: dict[str, Tensor]) -> tuple[Path, Path]:
-    extra = {"height": 192, "width": 640, "use_stereo": False}
+def write_published(
+    folder: Path, encoder: dict[str, Any], decoder: dict[str, Tensor], stereo: bool = False
+) -> tuple[Path, Path]:
+    extra = {"height": 64, "width": 96, "use_stereo": stereo}
     torch.save({f"encoder.{k}": v for k, v in encoder.items()} | extra, folder / "encoder.pth")
     torch.save(decoder, folder / "depth.pth")
     return folder / "encoder.pth", folder / "depth.pth"
@@ -144,6 +147,47 @@ def test_published_weights_are_taken(tmp_path: Path) -> None:
     with torch.inference_mode():
         expected = decoder_of_the_paper(decoder, network.encoder(image))
         torch.testing.assert_close(network.features(image), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_published_weights_predict_metric_depth(tmp_path: Path) -> None:
+    """Of stereo pairs as they are: 5.4 m over a disparity between 1 / 100 and 1 / .1, from the finest convolution."""
+    decoder = published_decoder((64, 64, 128, 256, 512), SMALL)
+    write_published(tmp_path, classifier_weights(), decoder, stereo=True)
+    network = load_network("monodepth2", tmp_path)
+    assert isinstance(network, MonodepthResNet)
+    assert (network.layers, network.preprocess.size, network.max_depth) == (18, (64, 96), 540.0)
+    image = torch.randn(2, 3, 64, 96, generator=seeded())
+    with torch.inference_mode():
+        features = F.pad(decoder_of_the_paper(decoder, network.encoder(image)), (1, 1, 1, 1), mode="reflect")
+        raw = F.conv2d(features, decoder["decoder.10.conv.weight"], decoder["decoder.10.conv.bias"])[:, 0]
+        expected = 5.4 / (0.01 + (10 - 0.01) / (1 + (-raw).exp()))
+        torch.testing.assert_close(network(image).depth, expected, rtol=1e-4, atol=1e-5)
+    source = network_source("monodepth2", [tmp_path])
+    assert source.label == "ResNet18-Monodepth2"
+
+
+def test_published_weights_of_single_images_need_a_scale(tmp_path: Path) -> None:
+    write_published(tmp_path, classifier_weights(), published_decoder((64, 64, 128, 256, 512), SMALL))
+    with pytest.raises(ValueError, match=r"no scale: declare .scale. \[m\] or .alignment."):
+        load_network("monodepth2", tmp_path)
+    image = torch.randn(1, 3, 64, 96, generator=seeded())
+
+    def depth(**spec: Any) -> Tensor:
+        with torch.inference_mode():
+            result: Tensor = load_network("monodepth2", tmp_path, spec=spec)(image).depth
+        return result
+
+    units = depth(scale=1.0)
+    torch.testing.assert_close(depth(scale=30.0), 30 * units)
+    affine = {"kind": "affine", "scale": 20.0, "shift": 1.5}
+    torch.testing.assert_close(depth(alignment=affine), 20 * units + 1.5)
+    torch.testing.assert_close(depth(alignment={**affine, "kind": "inverse"}), 1 / (20 / units + 1.5))
+    nearer = depth(scale=1.0, least=0.2, largest=10.0)
+    torch.testing.assert_close(1 / nearer, 0.1 + (1 / units - 0.01) * (5 - 0.1) / (10 - 0.01), rtol=1e-4, atol=1e-5)
+    with pytest.raises(FileNotFoundError, match=r"expected a folder with Monodepth2's encoder.pth and depth.pth"):
+        load_network("monodepth2", tmp_path.parent, spec={"scale": 1.0})
+    with pytest.raises(ValueError, match=r"disparity must be \(least, largest\)"):
+        depth(scale=1.0, least=200.0)
 
 
 def test_colours_are_renormalised(tmp_path: Path) -> None:

@@ -222,7 +222,8 @@ def test_an_encoder_that_starts_from_nothing_is_told(ufmstar, frames, tmp_path, 
     (tmp_path / "x").write_text("nothing is trained: the folder is refused")
     code, _, text = ufmstar("train", *words, "--data", "sequences", "--root", frames, "--out", tmp_path)
     assert code == cli.FAILED
-    remark = "the ResNet50 encoder starts from random weights; the paper's starts from ImageNet: --init imagenet"
+    remark = "the ResNet50 encoder starts from random weights; "
+    remark += "that of the authors' DecTrain starts from ImageNet: --init imagenet"
     assert text.splitlines()[:-1] == [f"ufmstar train: {remark}"] * told
 
 

@@ -14,7 +14,7 @@ from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.train import PRESETS, DataConfig, FitSettings, Job, Recipe, preset
 from ufmstar_torch.train.member import new_network
 from ufmstar_torch.train.module import move_average, share_of_rate
-from ufmstar_torch.train.presets import OURS
+from ufmstar_torch.train.presets import TRAINING
 from ufmstar_torch.train.progress import Sums, Validation
 
 
@@ -26,12 +26,16 @@ def test_every_method_of_the_paper_is_a_preset_of_both_architectures():
     for name, recipe in PRESETS.items():
         if name in ("demo", "fastdepth-ufmstar"):
             continue
-        # Section V-A.
+        # Section VII, and of table 1 the heads' size.
         assert (recipe.network.size, recipe.epochs, recipe.weight_decay) == ((224, 224), 50, 1e-4)
         assert (recipe.beta1, recipe.beta2) == (0.9, 0.999)
         assert recipe.network.dropout == 0.2
         assert max(recipe.members, recipe.network.members) == (10 if "ensemble" in name else 1)
-        assert recipe.learning_rate == OURS[recipe.network.architecture]["learning_rate"]
+        assert recipe.learning_rate == TRAINING[recipe.network.architecture]["learning_rate"]
+        heads = recipe.network.architecture == "monodepth2" and recipe.network.method != "depth"
+        assert recipe.network.head_scales == (4 if heads else 1)
+    # DecTrain's.
+    assert (preset("monodepth2-ensemble").batch_size, preset("monodepth2-ensemble").learning_rate) == (4, 1e-4)
 
 
 def test_members_are_the_ensembles_or_the_batch_ensembles():

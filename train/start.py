@@ -56,11 +56,11 @@ def starting_network(
 
 
 def missing_start(spec: NetworkSpec, init: Path | None) -> str | None:
-    """A remark on a start that is not the paper's, or None."""
+    """A remark on a start that is not the authors', or None."""
     if spec.architecture != "monodepth2" or init is not None:
         return None
     encoder = f"the ResNet{spec.layers} encoder starts from random weights"
-    return f"{encoder}; the paper's starts from ImageNet: --init {IMAGENET}"
+    return f"{encoder}; that of the authors' DecTrain starts from ImageNet: --init {IMAGENET}"
 
 
 def train_only(network: nn.Module, prefixes: Sequence[str]) -> int:

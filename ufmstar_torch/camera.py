@@ -72,10 +72,11 @@ def rotation_deviation(R: Tensor) -> Tensor:
 
 
 def invert_rigid(T: Tensor) -> Tensor:
-    """The inverse of rigid transforms [..., 4, 4]."""
+    """The inverse [..., 4, 4] of rigid transforms [..., 4, 4], or without their last row [..., 3, 4]."""
     R_inv = T[..., :3, :3].mT
     t_inv = -apply(R_inv, T[..., :3, 3])
-    return torch.cat([torch.cat([R_inv, t_inv[..., None]], dim=-1), T[..., 3:, :]], dim=-2)
+    last = T[..., 3:, :] if T.shape[-2] == 4 else T.new_tensor([[0, 0, 0, 1]]).expand(*T.shape[:-2], 1, 4)
+    return torch.cat([torch.cat([R_inv, t_inv[..., None]], dim=-1), last], dim=-2)
 
 
 def relative_pose(T_world_a: Tensor, T_world_b: Tensor) -> tuple[Tensor, Tensor]:

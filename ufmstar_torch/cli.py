@@ -22,6 +22,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("eval.commands.run", "depth and variance of a sequence of posed images, onto disk"),
     "rank": ("eval.commands.rank", "which images of a pool to label, the most uncertain first"),
     "eval": ("eval.commands.evaluate", "the rows of a table or figure of the paper, on your own sequences"),
+    "live": ("eval.commands.live", "depth and variance of a camera, or of a recording at its pace"),
     "report": ("eval.commands.report", "tables, figures and a page from the results of eval"),
     "bench": ("eval.commands.bench", "time per stage and memory, beside the depth network's own"),
     "train": ("train.command", "a network with an uncertainty head, or an ensemble of them"),

@@ -165,6 +165,29 @@ class AnchorConfig(Checked):
 
 
 @dataclass(frozen=True)
+class ConfidenceConfig(Checked):
+    """A network's confidence as a factor of the variance (``ufmstar_torch.confidence``).
+
+    Attributes:
+        anchors: the last ones of a stream from which the factor is learnt
+        each: of them, at most so many of one frame
+        bins: of equal size, by confidence
+        shrinkage: anchors in a bin with which its factor counts half, and 1 the other half
+        least: smallest factor of the variance
+        largest: largest factor, and largest squared error of an anchor over the variance
+        half_life: age after which a frame's verdict on the confidence counts half
+    """
+
+    anchors: int = number(1024, "N", "1", 64)
+    each: int = number(64, "n", "1", 1)
+    bins: int = number(16, "K", "1", 2, 64)
+    shrinkage: float = number(16.0, "kappa", "anchors", 0.0, open_low=True)
+    least: float = number(0.1, "h_min", "1", 0.0, 1.0, open_low=True)
+    largest: float = number(25.0, "h_max", "1", 1.0, 1e6)
+    half_life: float = number(20.0, "ln 2/ln(1/gamma)", "frames", 5.0)
+
+
+@dataclass(frozen=True)
 class MergeConfig(Checked):
     """Merging of components that overlap (``ufmstar_torch.merge``).
 
@@ -216,6 +239,7 @@ class UfMStarConfig(Checked):
         on_bad_frame: refuse a frame with a fault, or skip and count it
         backend: implementation of the kernels
         anchors: use anchors, sparse measured depths (an extension)
+        confidence: with anchors, learn what the network's confidence means (an extension)
         posterior: with anchors, also a corrected depth and its variance (an extension)
         merge: join Gaussians that overlap (an extension)
     """
@@ -261,13 +285,15 @@ class UfMStarConfig(Checked):
 
     # Extensions, not in the paper
     anchors: AnchorConfig | None = section(AnchorConfig, optional=True)
+    confidence: ConfidenceConfig | None = section(ConfidenceConfig, optional=True)
     posterior: PosteriorConfig | None = section(PosteriorConfig, optional=True)
     merge: MergeConfig | None = section(MergeConfig, optional=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.posterior is not None and self.anchors is None:
-            raise ValueError("UfMStarConfig.posterior needs anchors: set anchors=AnchorConfig() as well")
+        for name in ("posterior", "confidence"):
+            if getattr(self, name) is not None and self.anchors is None:
+                raise ValueError(f"UfMStarConfig.{name} needs anchors: set anchors=AnchorConfig() as well")
         if self.aleatoric_in_h and (self.anchors is not None or not self.add_aleatoric):
             raise ValueError(
                 "UfMStarConfig.aleatoric_in_h goes with add_aleatoric=True and without anchors, got another setting"
@@ -300,11 +326,15 @@ class UfMStarConfig(Checked):
         """Regressed quantities per Gaussian beside m: ``features``, and with ``aleatoric_in_h`` A and 1."""
         return self.features + 2 * self.aleatoric_in_h
 
-    def within(self, stated: float | None) -> UfMStarConfig:
-        """The settings for a network that states its largest depth [m]: ``segment.max_depth``, where that is None."""
-        if stated is None or self.segment.max_depth is not None:
-            return self
-        return self.replace(segment=replace(self.segment, max_depth=stated))
+    def within(self, max_depth: float | None, states_confidence: bool = False) -> UfMStarConfig:
+        """The settings for a network that states its largest depth [m], for ``segment.max_depth``, or a confidence, for
+        the section ``confidence`` where there are anchors; each only where the setting is None."""
+        changes: dict[str, Any] = {}
+        if max_depth is not None and self.segment.max_depth is None:
+            changes["segment"] = replace(self.segment, max_depth=max_depth)
+        if states_confidence and self.anchors is not None and self.confidence is None:
+            changes["confidence"] = ConfidenceConfig()
+        return self.replace(**changes) if changes else self
 
     def replace(self, **changes: Any) -> UfMStarConfig:
         """A copy with some fields changed, checked again."""

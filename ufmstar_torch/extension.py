@@ -27,6 +27,8 @@ Tensors = Mapping[str, Tensor]
 Distribute = Callable[[GaussianMixture, Tensor, Tensor, UfMStarConfig], Tensor]
 # M -> V without what extensions add to M
 Total = Callable[[Tensor], Tensor]
+# Map [B, H, W] -> its values at the pixels that are regressed, [B, H, W] or [B, n]
+Chosen = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,10 @@ class FrameExtension:
     def disagreement(self, disagreement: Tensor, depth: Tensor) -> Tensor:
         """M with what the extension adds to it [m^2], at pixels of this depth [m]."""
         return disagreement
+
+    def map_variance(self, variance: Tensor, chosen: Chosen) -> Tensor:
+        """V [m^2] of this frame after everything else, at the pixels that ``chosen`` takes from a map."""
+        return variance
 
     def outputs(self) -> dict[str, Tensor]:
         """Further maps for :class:`~ufmstar_torch.output.UfMStarOutput`, by name."""
@@ -202,6 +208,12 @@ class FrameExtensions:
         for one in self.each:
             disagreement = one.disagreement(disagreement, depth)
         return disagreement
+
+    def map_variance(self, variance: Tensor, chosen: Chosen) -> Tensor:
+        """See :meth:`FrameExtension.map_variance`."""
+        for one in self.each:
+            variance = one.map_variance(variance, chosen)
+        return variance
 
     def outputs(self) -> dict[str, Tensor]:
         """See :meth:`FrameExtension.outputs`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ufmstar_torch.anchors.extension import AnchorExtension
+from ufmstar_torch.confidence import ConfidenceExtension
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension, Extensions
 from ufmstar_torch.kernels.select import select_anchors, select_merge, select_posterior
@@ -21,6 +22,8 @@ def extensions_of(config: UfMStarConfig, further: Sequence[Extension] = ()) -> E
     each: list[Extension] = []
     if config.anchors is not None:
         each.append(AnchorExtension(config, select_anchors))
+    if config.confidence is not None:
+        each.append(ConfidenceExtension(config))
     if config.posterior is not None:
         each.append(PosteriorExtension(config, select_posterior))
     if config.merge is not None:

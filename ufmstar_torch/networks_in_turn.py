@@ -12,7 +12,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.prediction import DepthPrediction, infer, stated_range
+from ufmstar_torch.prediction import DepthPrediction, infer, stated_range, states_confidence
 
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
 Preprocess = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -54,6 +54,11 @@ class NetworksInTurn(nn.Module):
     def max_depth(self) -> float | None:
         """[m] The largest depth that the networks can predict, where each of them states one."""
         return stated_range(self.networks)
+
+    @property
+    def states_confidence(self) -> bool:
+        """Whether each of the networks states a confidence."""
+        return states_confidence(self.networks)
 
     @property
     def passes(self) -> int:
@@ -123,7 +128,8 @@ def combine(predictions: Sequence[DepthPrediction]) -> DepthPrediction:
     """The mixture of an ensemble's predictions (Lakshminarayanan et al. 2017).
 
     depth = mean d_n; A = mean A_n (None unless every member has one); E = the variance of d_n between
-    the members, 1/N sum d_n^2 - (mean d_n)^2, plus the mean of their own E_n where every member has one.
+    the members, 1/N sum d_n^2 - (mean d_n)^2, plus the mean of their own E_n where every member has one; the mean
+    confidence where every member has one.
 
     Raises:
         ValueError: no prediction.
@@ -132,10 +138,12 @@ def combine(predictions: Sequence[DepthPrediction]) -> DepthPrediction:
         raise ValueError("predictions must not be empty")
     depth = torch.stack([p.depth for p in predictions])
     aleatoric = [p.aleatoric_variance for p in predictions if p.aleatoric_variance is not None]
+    confidence = [p.confidence for p in predictions if p.confidence is not None]
     stated = [p.epistemic_variance for p in predictions if p.epistemic_variance is not None]
     between = depth.var(0, correction=0)
     return DepthPrediction(
         depth.mean(0),
         torch.stack(aleatoric).mean(0) if len(aleatoric) == len(depth) else None,
         between + torch.stack(stated).mean(0) if len(stated) == len(depth) else between,
+        torch.stack(confidence).mean(0) if len(confidence) == len(depth) else None,
     )

@@ -44,6 +44,8 @@ class FrameStatistics:
             as it states, more = it is too certain. NaN before any; None without.
         unseen: likewise, variance of log g/d that held-out anchors show for surfaces far from all anchors: large where
             evidence covers little of what the camera sees.
+        confidence: with ``config.confidence``, by how much the network's confidence makes held-out anchors likelier,
+            less the standard error [nat]; at most 0 = it is ignored, -inf = not judged yet. None without.
     """
 
     components: Tensor
@@ -65,6 +67,7 @@ class FrameStatistics:
     pose_error: Tensor | None = None
     calibration: Tensor | None = None
     unseen: Tensor | None = None
+    confidence: Tensor | None = None
 
     def __repr__(self) -> str:
         """The counts of every stream that are not 0, in a line."""

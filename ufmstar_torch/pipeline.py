@@ -152,7 +152,7 @@ class UncertainDepth(NetworksInTurn):
             config = config.replace(anchors=sections[0], posterior=sections[1])
             anchors = "dense" if anchors is None and networks is not None else anchors
         mapped = () if recalibration is None else (recalibration,)
-        self.ufm = UfMStar(config.within(self.max_depth), extensions=mapped)
+        self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), extensions=mapped)
         if anchors is not None and self.ufm.config.anchors is None:
             raise ValueError("anchors go with UfMStarConfig(anchors=AnchorConfig())")
         self.landmarks = None if anchors is None else StreamLandmarks(anchors)
@@ -238,7 +238,8 @@ class UncertainDepth(NetworksInTurn):
             ValueError, TypeError: as :meth:`UfMStar.forward`; the images are not counted then.
         """
         a, e = prediction.aleatoric_variance, prediction.epistemic_variance
-        out = self.ufm(prediction.depth, pose, intrinsics, a, e, valid, anchors=anchors, features=features)
+        inputs = {"anchors": anchors, "confidence": self._confidence(prediction)}
+        out = self.ufm(prediction.depth, pose, intrinsics, a, e, valid, features=features, **inputs)
         self._count(self._next + 1)
         return out
 
@@ -272,11 +273,15 @@ class UncertainDepth(NetworksInTurn):
             p, K = predicted.prediction, predicted.map_intrinsics
             mean = self.ufm.mean_uncertainty(
                 p.depth, predicted.pose, K, p.aleatoric_variance, p.epistemic_variance, valid, anchors=found,
-                features=predicted.features, **sample,
+                confidence=self._confidence(p), features=predicted.features, **sample,
             )  # fmt: skip
         self._undo(mean.statistics)
         self._count(self._next + 1)
         return mean
+
+    def _confidence(self, prediction: DepthPrediction) -> Tensor | None:
+        """The confidence, where UfM* uses one."""
+        return None if self.ufm.config.confidence is None else prediction.confidence
 
     def _fused(
         self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None
@@ -338,11 +343,11 @@ class UncertainDepth(NetworksInTurn):
             self._warn_of_size(x)
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
         H = None if features is None else as_tensor("features", features)
-        parts = (prediction.depth, prediction.aleatoric_variance, prediction.epistemic_variance, K, H)
-        (depth, *variances, K_there, H), ready = _copied(parts, self.multiview_device)
+        own = (prediction.aleatoric_variance, prediction.epistemic_variance, prediction.confidence)
+        (depth, *maps, K_there, H), ready = _copied((prediction.depth, *own, K, H), self.multiview_device)
         assert depth is not None
         assert K_there is not None
-        return _Predicted(picture, T, K_image, DepthPrediction(depth, *variances), K_there, member, H, ready)
+        return _Predicted(picture, T, K_image, DepthPrediction(depth, *maps), K_there, member, H, ready)
 
     def _warn_of_size(self, x: Tensor) -> None:
         """Name a network that states the size of its input and gets another one, as where ``preprocess`` was

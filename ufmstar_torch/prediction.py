@@ -11,6 +11,8 @@ from torch import Tensor
 
 from ufmstar_torch.arguments import as_tensor
 
+_OPTIONAL = ("aleatoric_variance", "epistemic_variance", "confidence")
+
 
 @dataclass(frozen=True)
 class DepthPrediction:
@@ -20,6 +22,8 @@ class DepthPrediction:
         depth: [B, H, W] metric depth D along the optical axis [m].
         aleatoric_variance: [B, H, W] learned data variance A [m^2], or None.
         epistemic_variance: [B, H, W] learned model variance E [m^2], or None.
+        confidence: [B, H, W] a map of any unit that says which pixels are better or worse, or None; what it means in
+            metres is learnt from anchors (``ufmstar_torch.confidence``).
 
     Raises:
         TypeError: something else than tensors and arrays.
@@ -29,21 +33,27 @@ class DepthPrediction:
     depth: Tensor
     aleatoric_variance: Tensor | None = None
     epistemic_variance: Tensor | None = None
+    confidence: Tensor | None = None
 
     def __post_init__(self) -> None:
-        for name in ("depth", "aleatoric_variance", "epistemic_variance"):
+        for name in ("depth", *_OPTIONAL):
             if (value := getattr(self, name)) is not None or name == "depth":
                 object.__setattr__(self, name, as_tensor(name, value))
         if self.depth.dim() != 3 or not torch.is_floating_point(self.depth):
             raise ValueError(
                 f"depth must be a floating-point tensor [B, H, W], got {self.depth.dtype} {tuple(self.depth.shape)}"
             )
-        for name in ("aleatoric_variance", "epistemic_variance"):
+        for name in _OPTIONAL:
             value = getattr(self, name)
             if value is not None and value.shape != self.depth.shape:
                 raise ValueError(
                     f"{name} must have the depth's shape {tuple(self.depth.shape)}, got {tuple(value.shape)}"
                 )
+
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> DepthPrediction:
+        """With a function applied to every map."""
+        maps = (self.depth, *(getattr(self, name) for name in _OPTIONAL))
+        return DepthPrediction(*(None if value is None else function(value) for value in maps))  # type: ignore[arg-type]
 
     @property
     def variance(self) -> Tensor | None:
@@ -65,6 +75,12 @@ def stated_range(networks: Iterable[Callable[..., Any]]) -> float | None:
     stated = [getattr(network, "max_depth", None) for network in networks]
     known = [float(value) for value in stated if isinstance(value, int | float) and value > 0]
     return max(known) if known and len(known) == len(stated) else None
+
+
+def states_confidence(networks: Iterable[Callable[..., Any]]) -> bool:
+    """Whether each of the networks states a confidence, by its attribute ``states_confidence``."""
+    stated = [bool(getattr(network, "states_confidence", False)) for network in networks]
+    return bool(stated) and all(stated)
 
 
 def infer(network: Callable[..., Any], image: Tensor, intrinsics: Tensor | None, *, takes: bool | None = None) -> Any:

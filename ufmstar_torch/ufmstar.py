@@ -315,7 +315,7 @@ class UfMStar(StatefulModule):
                 variance = variance if value is None else variance + value
             if self.config.variance_floor:
                 variance = variance.clamp_min(self.config.variance_floor)
-            return self._extensions.map_variance(variance)
+            return extensions.map_variance(self._extensions.map_variance(variance), chosen)
 
         extensions = self._extensions.of_frame(frame, own, inputs, dense=pixels is None)
         # Normal tensors also under the caller's inference_mode: the state must outlive it.

@@ -170,11 +170,12 @@ def job_from(options: EvalOptions) -> EvalJob:
     from ufmstar_torch.eval.engine.load import NetworkChoice
     from ufmstar_torch.eval.methods.suite import suite_named
     from ufmstar_torch.eval.sequences.options import Options
-    from ufmstar_torch.eval.suite.job import EvalJob, with_recalibrations
+    from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
     from ufmstar_torch.eval.suite.work_items import find_work, read_names
 
     what, data, output, values = options.what, options.data, options.output, as_dict(options)
     suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), what.recalibration)
+    require_methods(suite, options.opening.plugin)
     architectures: list[dict[str, NetworkChoice]] = [{}]
     for choice in map(NetworkChoice.parse, what.network):  # a base's n-th network belongs to the n-th architecture
         number = sum(choice.base in known for known in architectures)
@@ -187,7 +188,8 @@ def job_from(options: EvalOptions) -> EvalJob:
     opening = {name: value for name, value in options.opening.given().items() if name != "layout"}
     Options(**{name: value for name, value in opening.items() if name != "poses"})  # raises for impossible values
     only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
-    items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, layout=options.opening.layout)
+    where: dict[str, Any] = {"layout": options.opening.layout, "plugin": options.opening.plugin}
+    items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, **where)
     return EvalJob(
         suite=suite.with_bases(networks),
         networks=networks,
@@ -197,6 +199,7 @@ def job_from(options: EvalOptions) -> EvalJob:
         missing_bases=tuple(base for base in suite.bases if base not in networks),
         frames=parse_slice(data.frames),
         cache=None if output.cache is None else Path(output.cache),
+        plugin=options.opening.plugin,
         **{name: values[name] for name in _OF_JOB},
     )
 

@@ -30,6 +30,7 @@ class OpeningOptions:
         time_offset: added to image times [s]
         max_pose_gap: poses are interpolated over at most so long [s]
         topics: of a ROS bag; a pose's with =FRAME, the frame that it moves
+        plugin: Python files with READERS (eval: also METHODS, METRICS)
         scans: KITTI-360: also scans of so many frames around
     """
 
@@ -45,6 +46,7 @@ class OpeningOptions:
     time_offset: float = 0.0
     max_pose_gap: float = 0.1
     topics: tuple[str, ...] = ()
+    plugin: tuple[str, ...] = ()
     scans: int | None = None
 
     def given(self) -> dict[str, Any]:

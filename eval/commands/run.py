@@ -22,6 +22,10 @@ PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
 _OF_FOLDER = ("variance", "depth_scale", "map_intrinsics")
 
 
+# Of UfM*'s settings, those that are off by default.
+_SECTIONS = ("anchors", "confidence", "posterior", "merge")
+
+
 @dataclass(frozen=True, kw_only=True)
 class NetworkOptions:
     """Depth from networks.
@@ -94,6 +98,27 @@ class UfMOptions:
     recalibration: str | None = None
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
 
+    @property
+    def config(self) -> UfMStarConfig:
+        """The configuration. Raises ValueError: settings of anchors or posterior without them."""
+        sections: dict[str, Any] = {}
+        for name, used in (("anchors", self.anchors or self.posterior), ("posterior", self.posterior)):
+            if self.ufm[name] is not None and not used:
+                raise ValueError(f"--ufm.{name}.* needs --{name}")
+            sections[name] = (self.ufm[name] or {}) if used else None
+        return UfMStarConfig.from_dict(self.ufm | sections)
+
+    def preset_defaults(self) -> dict[str, Any]:
+        """Other defaults than the options' own, by their names, as ``preset`` and ``ufm_preset`` ask."""
+        defaults: dict[str, Any] = {}
+        if self.ufm_preset == "paper":
+            changed = flat(UfMStarConfig.paper().to_dict()) | {"on_bad_frame": "skip"}
+            defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in _SECTIONS}
+        if self.preset is not None:
+            preset = SPGFConfig.preset(self.preset).to_dict()
+            defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
+        return defaults
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
@@ -149,20 +174,13 @@ class RunOptions:
     @property
     def config(self) -> UfMStarConfig:
         """The configuration of UfM*."""
-        chosen = self.uncertainty
-        sections: dict[str, Any] = {}
-        for name, used in (("anchors", chosen.anchors or chosen.posterior), ("posterior", chosen.posterior)):
-            if chosen.ufm[name] is not None and not used:
-                raise ValueError(f"--ufm.{name}.* needs --{name}")
-            sections[name] = (chosen.ufm[name] or {}) if used else None
-        return UfMStarConfig.from_dict(chosen.ufm | sections)
+        return self.uncertainty.config
 
     def settings(self) -> dict[str, Any]:
         """Return the options that define the result, as plain values of a configuration file."""
         started = ("resume", "overwrite", "debug")
         plain = {name: value for name, value in as_dict(self).items() if name not in started}
-        sections = ("anchors", "posterior", "merge")
-        ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in sections}
+        ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in _SECTIONS}
         return plain | {"ufm": ufm}
 
 
@@ -181,15 +199,7 @@ def read_ufm(kind: type[T], words: Sequence[str], prog: str, own: Mapping[str, A
     name. Errors as :func:`read`."""
     options = parse(kind, words, prog, own)
     chosen: UfMOptions = options.uncertainty  # type: ignore[attr-defined]
-    defaults: dict[str, Any] = {}
-    if chosen.ufm_preset == "paper":
-        paper = UfMStarConfig.paper()
-        changed = flat(paper.to_dict()) | {"on_bad_frame": "skip"}
-        off = ("anchors", "posterior", "merge")
-        defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in off}
-    if chosen.preset is not None:
-        preset = SPGFConfig.preset(chosen.preset).to_dict()
-        defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
+    defaults = chosen.preset_defaults()
     return parse(kind, words, prog, {**defaults, **own}) if defaults else options
 
 

@@ -19,6 +19,7 @@ from ufmstar_torch.eval.sequences.frame import Size, parse_size
 from ufmstar_torch.models.dropout import SAMPLES
 from ufmstar_torch.models.inference import Inference, runtime_of
 from ufmstar_torch.models.load import DIRECTORIES, load_network, network_names
+from ufmstar_torch.models.monodepth2 import MonodepthResNet
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained, read_info
 from ufmstar_torch.networks_in_turn import NetworksInTurn
@@ -218,7 +219,7 @@ def load_members(
             fetch = "`hf download NAME --local-dir DIR` fetches a checkpoint from the hub"
             raise FileNotFoundError(f"no such directory: {path}; {fetch}")
     for path in of_files:
-        if not path.is_file():
+        if not path.is_file() and not (model == "monodepth2" and path.is_dir()):
             raise FileNotFoundError(f"no such file: {path}")
     members: list[DepthNetwork] = []
     how = {} if spec is None else {"spec": spec}
@@ -261,7 +262,7 @@ def _label(model: str, file: Path, network: DepthNetwork) -> str:
     if model == "fastdepth":
         return "FastDepth"
     if model == "monodepth2":
-        return f"ResNet{getattr(network, 'layers', 50)}-Monodepth2"
+        return f"ResNet{network.layers}-Monodepth2" if isinstance(network, MonodepthResNet) else "Monodepth2"
     return "Depth Anything V2" if model == "depth_anything" else file.stem
 
 

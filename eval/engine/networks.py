@@ -59,6 +59,7 @@ class NetworkSource(DepthSource):
         self._turns = networks.to(device)
         self.networks = cast("tuple[DepthNetwork, ...]", tuple(self._turns.networks))
         self.max_depth, self.passes = self._turns.max_depth, self._turns.passes
+        self.states_confidence = self._turns.states_confidence
         self._device, self._precision = device, precision
         self._timer = StageTimer(device)
         self._generator = torch.Generator(device)

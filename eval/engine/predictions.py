@@ -34,9 +34,7 @@ class Predicted(NamedTuple):
 
     def to(self, to: torch.device | torch.dtype) -> Predicted:
         """With its maps on a device, or of a type."""
-        maps, a, e = self.maps, self.maps.aleatoric_variance, self.maps.epistemic_variance
-        variances = (None if value is None else value.to(to) for value in (a, e))
-        return self._replace(maps=DepthPrediction(maps.depth.to(to), *variances))
+        return self._replace(maps=self.maps.mapped(lambda value: value.to(to)))
 
 
 class DepthSource(ABC):
@@ -49,11 +47,12 @@ class DepthSource(ABC):
         networks: that it runs; () of maps.
         passes: inferences that all members (or samples) take.
         max_depth: [m] the largest depth that its networks can predict; None where it is not known.
+        states_confidence: whether its networks do.
         needs_image: whether it predicts from the image; from the depth map otherwise.
         is_truth: whether it is the sequence's own depth, which has no error.
     """
 
-    needs_image = is_truth = False
+    needs_image = is_truth = states_confidence = False
     networks: tuple[DepthNetwork, ...] = ()
     passes = 1
     max_depth: float | None = None

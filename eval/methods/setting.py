@@ -15,7 +15,7 @@ from typing import Any
 
 from ufmstar_torch.anchors.landmarks import DENSE, FILE_TYPES
 from ufmstar_torch.checked import Checked, choice, number
-from ufmstar_torch.config import AnchorConfig, MergeConfig, PosteriorConfig, UfMStarConfig
+from ufmstar_torch.config import AnchorConfig, ConfidenceConfig, MergeConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.stateful import flat
 
 TRACKED, TRUTH = "tracked", "truth"
@@ -175,7 +175,7 @@ def default_of(name: str, preset: str = DEFAULTS) -> Any:
         return getattr(DEFAULT, name)
     start = _start(preset)
     # Sections that the row's own ``anchors`` and ``posterior`` switch on; merging is off where nothing is changed.
-    on = start.replace(anchors=AnchorConfig(), posterior=PosteriorConfig())
+    on = start.replace(anchors=AnchorConfig(), confidence=ConfidenceConfig(), posterior=PosteriorConfig())
     off = dict.fromkeys(flat(MergeConfig().to_dict(), "merge."))
     values = flat(on.to_dict()) | off
     if inner := [other for other in values if other.startswith(f"{name}.")]:

@@ -180,6 +180,29 @@ def _anchor_lines(summary: Mapping[str, Any]) -> list[str]:
     return [line, rest + (f"; {later} later: with what was learnt before" if later else "")]
 
 
+def realtime_table(summary: Mapping[str, Any]) -> str:
+    """Times, drops and memory of ``RealTime.summary``."""
+
+    def ms(name: str) -> list[str]:
+        times = summary[name] or {}
+        return [number(times.get(quantile)) for quantile in ("p50", "p99", "max")]
+
+    rows = [["[ms]", "p50", "p99", "max"], ["image to variance", *ms("latency_ms")]]
+    rows += [["  network, with its input", *ms("network_ms")], ["  UfM*", *ms("ours_ms")]]
+    counts = [f"{summary['results']} of {summary['images']} images in {summary['seconds']:.1f} s"]
+    counts += [f"{count} {reason}" for reason, count in (summary["dropped"] | summary["skipped"]).items()]
+    lost, ours = (None if summary[name] is None else 100 * summary[name] for name in ("lost_share", "ours_share"))
+    memory = ("memory", summary["memory_bytes"]), ("growth", summary["memory_growth_bytes"])
+    megabytes = ", ".join(f"{name} {'-' if value is None else f'{value / 1e6:.1f}'} MB" for name, value in memory)
+    return "\n".join(
+        [
+            *aligned(rows),
+            f"{'; '.join(counts)}: {number(lost)} % dropped or skipped, {number(summary['per_second'])} per second",
+            f"UfM*'s share of the time: {number(ours)} %; {megabytes}",
+        ]
+    )
+
+
 def number(value: float | None) -> str:
     """Three digits, a dash for no value."""
     return "-" if value is None or math.isnan(value) else f"{value:.3g}"

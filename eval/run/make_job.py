@@ -61,8 +61,8 @@ def make_job(
         sequence=sequence,
         indices=indices,
         source=source,
-        config=config.within(source.max_depth),
-        recalibration=_recalibration(options, config, source),
+        config=config.within(source.max_depth, source.states_confidence),
+        recalibration=recalibration_of(options, config, source),
         device=torch.device(options["device"]),
         settings=options,
         every=options["model"] is not None and options["mode"] == "full",
@@ -73,7 +73,7 @@ def make_job(
     )
 
 
-def _recalibration(options: Mapping[str, Any], config: UfMStarConfig, source: DepthSource) -> Recalibration | None:
+def recalibration_of(options: Mapping[str, Any], config: UfMStarConfig, source: DepthSource) -> Recalibration | None:
     """The map that is named or lies beside the weights; None = none.
 
     Raises:

@@ -92,6 +92,18 @@ def read_trajectory(path: str | Path) -> Trajectory:
     return Trajectory(timestamps, T_world_cam)
 
 
+def parse_pose(text: str, where: str) -> tuple[float, np.ndarray] | None:
+    """Timestamp and pose [4, 4] of one line with 8, 13 or 17 numbers; all NaN if an entry of the pose is not finite;
+    None for a comment or an empty line. Raises ValueError: something else; ``where`` names the line."""
+    tokens = _tokens(text)
+    if not tokens:
+        return None
+    row = np.array([_number(token, where) for token in tokens])
+    if len(row) not in (8, 13, 17) or not np.isfinite(row[0]):
+        raise ValueError(f"{where}: expected a timestamp and a pose of 7, 12 or 16 numbers, got {text.strip()!r:.60}")
+    return float(row[0]), poses_from_columns(row[None, 1:], [where])[0]
+
+
 def associate(first: np.ndarray, second: np.ndarray, max_difference: float) -> dict[int, int]:
     """One-to-one pairs {i: j} of timestamps [N] and [M] [s] that differ by at most ``max_difference``.
 
@@ -221,11 +233,16 @@ def _numbers(path: str | Path) -> tuple[list[list[float]], list[str]]:
     comment."""
     rows, lines = [], []
     for number, text in numbered_lines(path):
-        tokens, where = re.split(r"(?:^|\s)#", text, maxsplit=1)[0].split(), f"{path}:{number}"
+        tokens, where = _tokens(text), f"{path}:{number}"
         if tokens:
             rows.append([_number(token, where) for token in tokens])
             lines.append(where)
     return rows, lines
+
+
+def _tokens(text: str) -> list[str]:
+    """The words of a line before its comment."""
+    return re.split(r"(?:^|\s)#", text, maxsplit=1)[0].split()
 
 
 def _number(token: str, where: str) -> float:

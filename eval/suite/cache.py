@@ -18,6 +18,7 @@ from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.prediction import DepthPrediction
 
+_MAPS = "depth", "aleatoric", "epistemic", "confidence"
 _DIGEST = 32  # bytes of a SHA-256
 
 
@@ -60,12 +61,13 @@ class PredictionCache:
             return None
         K = torch.from_numpy(arrays.pop("intrinsics"))
         maps = {name: torch.from_numpy(value)[None].to(device) for name, value in arrays.items()}
-        return Predicted(DepthPrediction(maps["depth"], maps.get("aleatoric"), maps.get("epistemic")), K[None])
+        return Predicted(DepthPrediction(*(maps.get(name) for name in _MAPS)), K[None])  # type: ignore[arg-type]
 
     def store(self, path: Path, content: str, predicted: Predicted) -> None:
         """Keep a prediction. Raises CacheError: it cannot be written."""
         maps = predicted.maps
-        named = {"depth": maps.depth, "aleatoric": maps.aleatoric_variance, "epistemic": maps.epistemic_variance}
+        each = (maps.depth, maps.aleatoric_variance, maps.epistemic_variance, maps.confidence)
+        named = dict(zip(_MAPS, each, strict=True))
         arrays = {name: value[0].cpu().numpy() for name, value in named.items() if value is not None}
         arrays["intrinsics"] = predicted.intrinsics[0].numpy()
         arrays["content"] = np.frombuffer(content.encode(), np.uint8)

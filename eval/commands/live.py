@@ -1,0 +1,276 @@
+"""``ufmstar live``: its options, its sources, and what it prints; ``LiveDepth`` does the work."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields
+from itertools import takewhile
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from ufmstar_torch.eval.commands.opening import SequenceOptions
+from ufmstar_torch.eval.commands.options import UsageError, as_dict, positional
+from ufmstar_torch.eval.commands.run import NetworkOptions, UfMOptions, read_ufm
+from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.engine.realtime import RealTime
+    from ufmstar_torch.eval.sequences.live import LiveEvent
+    from ufmstar_torch.live import LiveDepth, LiveResult
+    from ufmstar_torch.pipeline import UncertainDepth
+
+_STANDARD_INPUT = "-"
+# What a source that is no recording takes, of the options for opening.
+_OF_LIVE = ("intrinsics", "trajectory", "poses", "pose_scale", "max_pose_gap")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions:
+    """Depth with a variance for the newest image, as images and poses come.
+
+    A recording is replayed at its pace. A camera, and a folder with --follow, take their poses from the file
+    --trajectory, to which another program adds lines. On standard input, a line is
+    {"stamp": s, "pose": [x, y, z, qx, qy, qz, qw], "image": "file", "intrinsics": [fx, fy, cx, cy]} or a part of it.
+    Ends with its source, or with Ctrl-C.
+
+    Attributes:
+        source: a recording (folder, video, bag, tour:SEED), the number of a camera, or - for lines of JSON
+        follow: the source is a folder to which images are added, named by their time
+        speed: of a recording, 2 = twice as fast
+        seconds: end after so long
+        idle: with --follow, end after so long without a new image [s]
+        max_wait: for the poses after an image [s]
+        state: file in which the state is kept, and from which it goes on
+        save_every: of the state [s]
+        out: folder for realtime.json and a .npz with depth, variance, disagreement, pose and intrinsics per image
+        json: print a line of JSON per image instead of the status
+        device: cpu, cuda or cuda:N
+        threads: number of CPU threads of network and step; default: all cores but one
+        debug: show tracebacks
+    """
+
+    USAGE: ClassVar[str] = "ufmstar live SOURCE --model NAME --weights FILE... [options]"
+
+    source: str = positional()
+    follow: bool = False
+    speed: float = 1.0
+    seconds: float = float("inf")
+    idle: float = float("inf")
+    max_wait: float = 0.2
+    state: Path | None = None
+    save_every: float = 10.0
+    out: Path | None = None
+    json: bool = False
+    device: str = "cpu"
+    threads: int | None = None
+    debug: bool = False
+    opening: SequenceOptions
+    network: NetworkOptions
+    uncertainty: UfMOptions
+
+    def __post_init__(self) -> None:
+        _ = self.uncertainty.config  # checks the settings
+        parse_intrinsics(self.opening.intrinsics, "--intrinsics")
+        for name in ("speed", "seconds", "idle"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"--{name} must be positive, got {getattr(self, name)}")
+        if self.network.model is None or not self.network.weights:
+            raise ValueError("live needs a network: --model NAME --weights FILE")
+        if self.uncertainty.scale_from is not None:
+            raise ValueError("--scale-from goes with ufmstar run, which sees the whole recording")
+        if self.recorded:
+            return
+        defaults = SequenceOptions()
+        used = {f.name for f in fields(defaults) if getattr(self.opening, f.name) != getattr(defaults, f.name)}
+        if wrong := sorted(used - set(_OF_LIVE)):
+            raise ValueError(f"--{wrong[0].replace('_', '-')} goes with recordings, not with {self.source}")
+        if self.source != _STANDARD_INPUT and (self.opening.trajectory is None or not self.opening.intrinsics):
+            raise ValueError(f"{self.source} needs --trajectory FILE (lines may be added) and --intrinsics fx fy cx cy")
+
+    @property
+    def recorded(self) -> bool:
+        """Whether the source is a recording."""
+        return not (self.follow or self.source == _STANDARD_INPUT or self.source.isdecimal())
+
+
+def read(words: Sequence[str]) -> LiveOptions:
+    """The options of a command line; errors as :func:`read_ufm`."""
+    return read_ufm(LiveOptions, words, "ufmstar live", {})
+
+
+def main(options: LiveOptions) -> int:
+    """Run until the source ends, and print the real-time table; the exit code."""
+    from ufmstar_torch.eval.engine.realtime import RealTime
+    from ufmstar_torch.eval.report.text import realtime_table
+    from ufmstar_torch.eval.run.files import write_json_atomic
+    from ufmstar_torch.eval.run.machine import share_threads
+
+    if options.threads is None:
+        share_threads()
+    try:
+        events = _events(options)
+        model = _model(options)
+        if options.out is not None:
+            options.out.mkdir(parents=True, exist_ok=True)
+    except (ImportError, OSError, ValueError) as error:
+        raise UsageError(error) from error
+    times = RealTime(model)
+    live = _run(options, model, events, times)
+    summary = times.summary(live.statistics)
+    if options.out is not None:
+        write_json_atomic(options.out / "realtime.json", summary)
+    print(realtime_table(summary), file=sys.stderr if options.json else sys.stdout)
+    return 0 if summary["results"] else 1
+
+
+def _run(options: LiveOptions, model: UncertainDepth, events: Iterator[LiveEvent], times: RealTime) -> LiveDepth:
+    """Push the events until they end, the time is over, or a signal comes."""
+    from ufmstar_torch.live import LiveDepth
+
+    ends = monotonic() + options.seconds
+    K = None if not options.opening.intrinsics else _intrinsics(options)
+
+    def on_result(result: LiveResult) -> None:
+        times.take(result)
+        if options.out is not None:
+            _write(options.out, result)
+        _say(result, live, times, as_json=options.json)
+
+    how: dict[str, Any] = {"max_wait": options.max_wait, "max_gap": options.opening.max_pose_gap}
+    with (
+        _interrupted_by_sigterm(),
+        LiveDepth(model, on_result, K, state=options.state, save_every=options.save_every, **how) as live,
+        suppress(KeyboardInterrupt),
+    ):
+        for event in takewhile(lambda _: monotonic() < ends, events):
+            if event.T_world_cam is not None:
+                live.push_pose(event.stamp, event.T_world_cam)
+            if event.image is not None:
+                live.push_image(event.stamp, event.image, event.intrinsics)
+        live.wait_idle()
+    return live
+
+
+def _events(options: LiveOptions) -> Iterator[LiveEvent]:
+    """What the source yields; errors as ``open_sequence``."""
+    from ufmstar_torch.eval.sequences import live
+    from ufmstar_torch.eval.sequences.open import open_sequence
+
+    opening = options.opening
+    if options.recorded:
+        sequence = open_sequence(options.source, **opening.given())
+        if not sequence.posed:
+            raise ValueError(f"{options.source} has no poses; ufmstar poses computes them")
+        return live.replay(sequence, options.speed)
+    scale = 1.0 if opening.pose_scale is None else opening.pose_scale
+    if options.source == _STANDARD_INPUT:
+        return live.json_lines(sys.stdin, ".", opening.poses, scale)
+    poses = live.PoseFile(str(opening.trajectory), opening.poses, scale)
+    if options.follow:
+        return live.growing_folder(options.source, poses, options.idle)
+    return live.camera(int(options.source), poses)
+
+
+def _model(options: LiveOptions) -> UncertainDepth:
+    """The networks with UfM*, compiled, in the state of ``--state``; errors as ``network_source``."""
+    import torch
+
+    from ufmstar_torch.eval.commands.terminal import Bars
+    from ufmstar_torch.eval.engine.load import network_source
+    from ufmstar_torch.eval.engine.progress import Progress
+    from ufmstar_torch.eval.engine.warm_up import warm_up_command
+    from ufmstar_torch.eval.run.make_job import recalibration_of
+    from ufmstar_torch.models.inference import Inference
+    from ufmstar_torch.pipeline import UncertainDepth
+
+    chosen = options.network
+    own = {name: getattr(chosen, name) for name in ("model", "weights", "spec", "mode", "samples", "offload")}
+    inference = Inference(chosen.runtime, chosen.precision, options.threads)
+    source = network_source(**own, inference=inference, device=options.device)
+    config, anchors = options.uncertainty.config, options.uncertainty.anchors
+    model = UncertainDepth(
+        source.networks,
+        config,
+        mode="full" if chosen.mode == "full" else "alternate",
+        posterior=options.uncertainty.posterior,
+        samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
+        preprocess=source.networks[0].preprocess,
+        anchors=_anchors(anchors),
+        recalibration=recalibration_of(as_dict(options.uncertainty) | as_dict(chosen), config, source),
+    ).to(options.device)
+    with Bars() as bars:
+        dense = config.anchors is not None and anchors in (False, "dense")
+        warm_up_command(
+            model.ufm.config,
+            torch.device(options.device),
+            lambda done, total: bars.show(Progress("kernels", done, total)),
+            dense=dense,
+        )
+    if options.state is not None and options.state.exists():
+        try:
+            model.load_state_dict(torch.load(options.state, map_location=options.device, weights_only=True))
+        except (RuntimeError, ValueError, OSError, pickle.UnpicklingError) as error:
+            raise ValueError(f"--state {options.state} cannot be continued: {error}") from error
+    return model
+
+
+def _anchors(value: bool | str) -> Path | Literal["corners", "dense"] | None:
+    """What ``--anchors`` means to ``UncertainDepth``."""
+    if value is True or value == "corners":
+        return "corners"
+    return "dense" if value == "dense" else Path(value) if isinstance(value, str) else None
+
+
+def _intrinsics(options: LiveOptions) -> Any:
+    from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
+
+    given = parse_intrinsics(options.opening.intrinsics, "--intrinsics")
+    return None if given is None else read_intrinsics(given)
+
+
+def _write(out: Path, result: LiveResult) -> None:
+    """The maps of an image, as OUT/STAMP.npz."""
+    import numpy as np
+
+    from ufmstar_torch.eval.run.files import write_atomic
+
+    maps = {"depth": result.out.depth, "variance": result.out.variance, "disagreement": result.out.disagreement}
+    arrays = {name: value[0].cpu().numpy() for name, value in maps.items()}
+    camera = {"T_world_cam": result.T_world_cam, "intrinsics": result.out.intrinsics[0].cpu().numpy()}
+    write_atomic(out / f"{result.stamp:.6f}.npz", lambda file: np.savez(file, allow_pickle=False, **arrays, **camera))
+
+
+def _say(result: LiveResult, live: LiveDepth, times: RealTime, *, as_json: bool) -> None:
+    """A line of JSON for every image, or a status every 30 images."""
+    if not as_json and len(times.latency) % 30 != 1:
+        return
+    depth, std, counts = result.out.depth, result.out.std, live.statistics
+    about = {
+        "stamp": result.stamp,
+        "latency_ms": round(1000 * result.latency, 2),
+        "depth_m": round(float(depth.median()), 3),
+        "sigma_m": round(float(std.nanmedian()), 3),
+        "components": int(result.out.ufm.statistics.components[0]),
+        "dropped": sum(counts.dropped.values()),
+        "skipped": sum(counts.skipped.values()),
+    }
+    if as_json:
+        print(json.dumps(about), flush=True)
+    else:
+        print("  ".join(f"{name} {value:g}" for name, value in about.items()), file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _interrupted_by_sigterm() -> Iterator[None]:
+    """SIGTERM raises KeyboardInterrupt, as Ctrl-C does."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,81 @@
+"""How a model keeps up with a camera: latencies, drops, the network's share, and the memory of the process."""
+
+from __future__ import annotations
+
+from array import array
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ufmstar_torch.live import LiveResult, LiveStatistics
+from ufmstar_torch.pipeline import UncertainDepth
+
+_SETTLED = 60  # results after which the memory is first read: buffers and threads are there then
+_STATM = Path("/proc/self/statm")
+
+
+class RealTime:
+    """Times of the results of one ``LiveDepth``.
+
+    Args:
+        model: of the ``LiveDepth``; what follows its networks' last inference of an image counts as ours.
+    """
+
+    def __init__(self, model: UncertainDepth) -> None:
+        self.latency, self.compute, self.network = array("d"), array("d"), array("d")  # [s]
+        self._predicted = 0.0
+        self._memory: int | None = None
+        self._first = self._last = 0.0
+        for network in model.networks:
+            network.register_forward_hook(self._note)
+
+    def _note(self, *_: object) -> None:
+        self._predicted = perf_counter()
+
+    def take(self, result: LiveResult) -> None:
+        """Add a result; call it in ``on_result``."""
+        self._first, self._last = self._first or result.received, result.finished
+        self.latency.append(result.latency)
+        self.compute.append(result.finished - result.started)
+        self.network.append(self._predicted - result.started)
+        if len(self.latency) == _SETTLED:
+            self._memory = resident_bytes()
+
+    def summary(self, statistics: LiveStatistics) -> dict[str, Any]:
+        """Plain values: counts, results per second, latencies and times [ms], and memory [bytes]; None where there is
+        nothing to measure."""
+        compute, network = np.array(self.compute), np.array(self.network)
+        now, seconds = resident_bytes(), self._last - self._first
+        lost = sum(statistics.dropped.values()) + sum(statistics.skipped.values())
+        return {
+            "images": statistics.images,
+            "results": statistics.results,
+            "dropped": dict(statistics.dropped),
+            "skipped": dict(statistics.skipped),
+            "lost_share": lost / statistics.images if statistics.images else None,
+            "seconds": seconds,
+            "per_second": (len(compute) - 1) / seconds if len(compute) > 1 else None,
+            "latency_ms": _quantiles(np.array(self.latency)),
+            "network_ms": _quantiles(network),
+            "ours_ms": _quantiles(compute - network),
+            "ours_share": float(1 - network.sum() / compute.sum()) if len(compute) else None,
+            "memory_bytes": now,
+            "memory_growth_bytes": None if self._memory is None or now is None else now - self._memory,
+        }
+
+
+def _quantiles(seconds: np.ndarray) -> dict[str, float] | None:
+    """p50, p99 and the largest [ms]."""
+    if not seconds.size:
+        return None
+    values = np.quantile(1000 * seconds, [0.5, 0.99, 1])
+    return dict(zip(("p50", "p99", "max"), values.tolist(), strict=True))
+
+
+def resident_bytes() -> int | None:
+    """Memory of this process that is in RAM; None where the system does not say (it is Linux's)."""
+    import resource
+
+    return int(_STATM.read_text().split()[1]) * resource.getpagesize() if _STATM.exists() else None

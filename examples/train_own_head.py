@@ -1,0 +1,58 @@
+"""A head on a depth network of your own: what does it gain, and what does UfM* add? `python examples/train_own_head.py`
+
+The network (take yours) learns depth in rendered rooms, then a head on the frozen network how far it errs.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ufmstar_torch import DepthPrediction
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.frame import in_memory
+from ufmstar_torch.models import AleatoricHead, wrap_network
+from ufmstar_torch.train import DataConfig, judge_network, train_module
+
+FIGURES = ("delta1", "nll", "ece_delta", "ece_q", "ause_rmse")
+DATA = DataConfig("tour", tours=12, validation_tours=2, tour_frames=20, tour_size=(96, 128))
+ROOMS = ("tour:1?frames=30&size=96x128", "tour:2?frames=30&size=96x128")
+
+
+def network() -> nn.Module:
+    """Image [B, 3, H, W] to depth [B, 1, H / 2, W / 2] [m]."""
+    layers: list[nn.Module] = []
+    for inputs, outputs, stride in ((3, 24, 2), (24, 48, 2), (48, 96, 2), (96, 96, 1), (96, 192, 1)):
+        layers += [nn.Conv2d(inputs, outputs, 3, stride, 1), nn.BatchNorm2d(outputs), nn.ReLU()]
+    return nn.Sequential(*layers, nn.PixelShuffle(4), nn.Conv2d(12, 1, 3, padding=1), nn.Softplus())
+
+
+def main(words: list[str] | None = None) -> dict[str, dict[str, float]]:
+    """Train network and head, print the table, and return its figures by row."""
+    parser = argparse.ArgumentParser(description="what a head gains")
+    parser.add_argument("--out", type=Path, default=Path("own_head"), help="folder for both trainings")
+    parser.add_argument("--epochs", type=int, default=12, help="of each training")
+    o = parser.parse_args(words)
+    rooms = [in_memory(open_sequence(name)) for name in ROOMS]
+    how: dict[str, Any] = {"epochs": o.epochs, "learning_rate": 3e-3, "overwrite": True}
+    depth = train_module(network(), "depth-only", DATA, o.out / "depth", fine_tune=True, **how)
+    head = train_module(depth, AleatoricHead, DATA, o.out / "head", **how)
+    rmse = json.loads((o.out / "depth" / "summary.json").read_text())["mean"]["val_rmse"]
+
+    def constant(image: Tensor) -> DepthPrediction:
+        predicted = depth(image).depth
+        return DepthPrediction(predicted, torch.full_like(predicted, rmse**2))
+
+    judged = {"constant": judge_network(wrap_network(constant), rooms, rows=("network",))["network"]}
+    judged["UfM* without head"] = judge_network(depth, rooms, rows=("ufmstar",))["ufmstar"]
+    judged |= {f"head: {name}": row for name, row in judge_network(head, rooms).items()}
+    for name, row in judged.items():
+        print(f"{name:18}", "  ".join(f"{figure} {row.figures[figure]:.3f}" for figure in FIGURES))
+    return {name: dict(row.figures) for name, row in judged.items()}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""A network's confidence in whatever unit: against the oracle, its invariance, when it is ignored, and its state."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracle_confidence as oracle
+import pytest
+import torch
+from modules import same
+from torch import nn
+
+from ufmstar_torch import AnchorConfig, ConfidenceConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.confidence import isotonic
+from ufmstar_torch.models import Ensemble, Preprocess, wrap_network
+
+PLAIN = UfMStarConfig(anchors=AnchorConfig())
+CONFIG = PLAIN.replace(confidence=ConfidenceConfig())
+SIZE = H, W = 24, 32
+K = torch.tensor([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]], dtype=torch.float64)
+
+
+def frames(count, seed=0, n=150, dtype=torch.float64):
+    """Depth, the standard deviation of its relative error (known to nobody but the confidence), and anchors."""
+    rng = np.random.default_rng(seed)
+    for i in range(count):
+        depth = 2 + 0.5 * np.sin(np.linspace(0, 3, W) + 0.1 * i)[None] * np.ones((H, 1))
+        sigma = np.exp(rng.uniform(np.log(0.01), np.log(0.6), SIZE))
+        at = rng.choice(H * W, n, replace=False)
+        pixel = np.stack([at % W, at // W], -1).astype(float)
+        g = np.abs(depth.flat[at] * (1 + sigma.flat[at] * rng.standard_normal(n)))
+        given = Anchors(*(torch.from_numpy(x)[None] for x in (pixel, g, np.full(n, 1e-4))))
+        T = torch.eye(4, dtype=torch.float64)
+        T[0, 3] = 0.05 * i
+        yield torch.from_numpy(depth)[None].to(dtype), torch.from_numpy(sigma)[None], given, T[None], at
+
+
+def variances(config, unit, count=12, **how):
+    ufm, maps = UfMStar(config, dtype=torch.float64), []
+    for depth, sigma, given, T, _ in frames(count, **how):
+        c = None if unit is None else unit(sigma)
+        maps.append(ufm(depth, T, K, anchors=given, **({} if c is None else {"confidence": c})))
+    return maps, ufm
+
+
+def test_values_against_the_oracle():
+    """Over frames, from before the first anchor until it is used; V without the confidence is the plain module's."""
+    state, plain = oracle.start(), variances(PLAIN, None, count=14)[0]
+    maps, _ = variances(CONFIG, lambda sigma: 1 / (1 + sigma), count=14)
+    for out, before, (depth, sigma, given, _, at) in zip(maps, plain, frames(14), strict=True):
+        c = (1 / (1 + sigma[0])).float().double().numpy()
+        predicted = depth[0].numpy().flat[at]
+        values = (at, predicted, given.depth[0].numpy(), given.variance[0].numpy())
+        state, expected = oracle.update(state, c, before.variance[0].numpy(), *values)
+        np.testing.assert_allclose(out.variance[0], expected, rtol=1e-9)
+        np.testing.assert_allclose(float(out.statistics.confidence), oracle.gain(state), rtol=1e-6)
+    assert not same(out.variance, before.variance)
+    worse = (out.variance / before.variance)[sigma > 0.3].mean()
+    better = (out.variance / before.variance)[sigma < 0.03].mean()
+    assert worse > 5 * better
+
+
+def test_the_unit_does_not_count():
+    """A confidence, a logit, an exponential, a constant factor: the same V; the other way round nearly so."""
+    (expected, _), *others = (
+        variances(CONFIG, unit)
+        for unit in (torch.log, lambda s: s, lambda s: 40 * s - 3, lambda s: s**3, lambda s: s.log().exp().sqrt())
+    )
+    for maps, _ in others:
+        torch.testing.assert_close(maps[-1].variance, expected[-1].variance)
+    inverted = variances(CONFIG, lambda s: -torch.log(s))[0][-1].variance
+    assert (inverted / expected[-1].variance).log().abs().mean() < 0.1
+
+
+@pytest.mark.parametrize("kind", ["random", "constant", "absent", "NaN"])
+def test_what_says_nothing_is_ignored(kind):
+    """V is plain UfM*'s, to the bit."""
+    generator = torch.Generator().manual_seed(1)
+    units = {
+        "random": lambda s: torch.rand(s.shape, generator=generator, dtype=s.dtype),
+        "constant": torch.ones_like,
+        "absent": None,
+        "NaN": lambda s: torch.full_like(s, torch.nan),
+    }
+    maps, _ = variances(CONFIG, units[kind], count=20)
+    plain, _ = variances(PLAIN, None, count=20)
+    assert same(maps[-1].variance, plain[-1].variance)
+    assert kind == "absent" or not bool(maps[-1].statistics.confidence > 0)
+
+
+def test_what_the_confidence_meant_is_forgotten():
+    """It is inverted in the middle: soon ignored, later used again the other way round."""
+    ufm, used = UfMStar(CONFIG), []
+    for i, (depth, sigma, given, T, _) in enumerate(frames(60, dtype=torch.float32)):
+        out = ufm(depth, T, K, anchors=given, confidence=sigma.float() if i < 20 else -sigma.float())
+        used.append(bool(out.statistics.confidence > 0))
+    assert (used[19], used[-1]) == (True, True)
+    assert not all(used[20:40])
+
+
+def test_state_is_saved_restored_and_loaded_as_a_whole():
+    given = list(frames(12, dtype=torch.float32))
+    ufm, other = UfMStar(CONFIG), UfMStar(CONFIG)
+    for depth, sigma, anchors, T, _ in given[:-1]:
+        ufm(depth, T, K, anchors=anchors, confidence=sigma.float())
+    other.load_state_dict(ufm.state_dict())
+    depth, sigma, anchors, T, _ = given[-1]
+    sample = ufm.mean_uncertainty(depth, T, K, confidence=sigma.float(), average=False, fraction=1.0)
+    ufm.load_state_dict(other.state_dict())
+    assert sample.mean > 0
+    last = [one(depth, T, K, anchors=anchors, confidence=sigma.float()).variance for one in (ufm, other)]
+    assert torch.equal(*last)
+    for spoil in (lambda c: c.fill_(-1.0), lambda c: c[:, -4:].fill_(torch.nan)):
+        wrong = {name: value.clone() for name, value in ufm.state_dict().items()}
+        spoil(wrong["confidence"])
+        before = {name: value.clone() for name, value in other.state_dict().items()}
+        with pytest.raises(RuntimeError, match="confidence"):
+            other.load_state_dict(wrong)
+        assert all(same(value, before[name]) for name, value in other.state_dict().items())
+
+
+def test_streams_of_a_batch_are_independent_and_anchors_may_be_padded():
+    both, alone = UfMStar(CONFIG, dtype=torch.float64), UfMStar(CONFIG, dtype=torch.float64)
+    for (d, s, a, T, _), (d2, s2, a2, T2, _) in zip(frames(10), frames(10, seed=1, n=60), strict=True):
+        pad = [torch.cat([getattr(a2, name), getattr(a, name)[:, 60:]], 1) for name in ("pixel", "depth", "variance")]
+        padded = Anchors(*pad, valid=torch.arange(150)[None] < 60)
+        whole = [torch.cat([getattr(a, name), getattr(padded, name)]) for name in ("pixel", "depth", "variance")]
+        valid = torch.stack([torch.ones(150, dtype=torch.bool), torch.arange(150) < 60])
+        stacked = [torch.cat(pair) for pair in ((d, d2), (T, T2), (s, s2))]
+        out = both(*stacked[:2], K.expand(2, 3, 3), anchors=Anchors(*whole, valid=valid), confidence=stacked[2])
+        expected = alone(d2, T2, K, anchors=a2, confidence=s2)
+    torch.testing.assert_close(out.variance[1:], expected.variance)
+
+
+def test_isotonic_regression_against_pooling():
+    rng = np.random.default_rng(0)
+    value, weight = rng.uniform(0, 3, (5, 16)), rng.uniform(0.1, 9, (5, 16))
+    expected = [oracle.pooled(*pair) for pair in zip(value, weight, strict=True)]
+    np.testing.assert_allclose(isotonic(torch.from_numpy(value), torch.from_numpy(weight)), expected, rtol=1e-12)
+
+
+class Stated(nn.Module):
+    """Depth, and an uncertainty in arbitrary units."""
+
+    def forward(self, x):
+        return {"depth": 1 + x.mean(1), "conf": x[:, 0]}
+
+
+def test_a_network_states_it():
+    """One declaration: through wrappers and ensembles into UfM*, which then learns where it has anchors."""
+    network = wrap_network(Stated(), "depth", confidence="conf", preprocess=Preprocess(size=SIZE))
+    assert network.states_confidence
+    assert Ensemble([network, network]).states_confidence
+    assert not wrap_network(Stated(), "depth").states_confidence
+    image = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(network(image).confidence, image[:, 0])
+    torch.testing.assert_close(Ensemble([network, network])(image).confidence, image[:, 0])
+    assert UncertainDepth(network).ufm.config.confidence is None
+    model = UncertainDepth([network, network], UfMStarConfig(anchors=AnchorConfig()), preprocess=network.preprocess)
+    assert model.ufm.config.confidence == ConfidenceConfig()
+    given = next(frames(1, dtype=torch.float32))[2]
+    out = model(image, torch.eye(4), K, anchors=given)
+    assert torch.equal(out.prediction.confidence, image[:, 0])
+    assert bool(model.ufm.confidence.any())
+
+
+REFUSED = {
+    "a confidence as a spread": (
+        lambda: wrap_network(Stated(), "depth", aleatoric="conf", aleatoric_kind="confidence"), "declare it as conf"
+    ),
+    "a confidence of another size": (
+        lambda: DepthPrediction(torch.ones(1, 4, 4), confidence=torch.ones(1, 2, 2)), "confidence must have the depth's"
+    ),
+    "a confidence that is not used": (
+        lambda: UfMStar()(torch.ones(1, 4, 4), torch.eye(4), torch.eye(3), confidence=torch.ones(1, 4, 4)),
+        "confidence must be None where",
+    ),
+    "a section without anchors": (
+        lambda: UfMStarConfig(confidence=ConfidenceConfig()), "UfMStarConfig.confidence needs anchors"
+    ),
+    "whole numbers": (
+        lambda: UfMStar(CONFIG)(torch.ones(1, 4, 4), torch.eye(4), torch.eye(3), confidence=torch.ones(1, 4, 4).int()),
+        "confidence must have a floating-point",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "message"), REFUSED.values(), ids=REFUSED)
+def test_refusals(call, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        call()

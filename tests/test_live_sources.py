@@ -1,0 +1,243 @@
+"""``ufmstar live`` and its sources: recordings at their pace, files that grow, lines of JSON, options and output."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import sys
+import threading
+import time
+from dataclasses import replace
+from itertools import count
+
+import numpy as np
+import pytest
+import torch
+from demo_networks import write_members
+from layouts import quaternion_line, write_generic
+from PIL import Image
+
+from ufmstar_torch import cli
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
+
+TOUR = "tour:3?frames=5&size=64x96"
+POSE = [1, 2, 3, 0, 0, 0, 1]
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    return write_members(tmp_path_factory.mktemp("weights") / "three.safetensors")
+
+
+@pytest.fixture
+def ufmstar(capsys, weights):
+    """Run the command with the test's network; its exit code, output and errors."""
+
+    def run(*words):
+        code = cli.main(["live", *map(str, words), "--model", "trained", "--weights", str(weights)])
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def content(image):
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "PNG")
+    return file.getvalue()
+
+
+def test_a_recording_comes_at_its_pace():
+    sequence = open_sequence(TOUR)
+    list(replay(sequence))  # renders
+    started, moments = time.perf_counter(), []
+    for event in replay(sequence, speed=2):
+        moments.append(time.perf_counter() - started)
+        assert event.image.shape == (64, 96, 3)
+    assert all(moment >= n / 15 / 2 for n, moment in enumerate(moments))
+    assert [event.stamp for event in replay(sequence, np.inf)] == [n / 15 for n in range(5)]
+    entries = [replace(entry, timestamp=None) for entry in sequence.entries]
+    assert [event.stamp for event in replay(replace(sequence, entries=tuple(entries)), np.inf)][1] == 1 / 30
+
+
+def test_poses_are_read_as_their_lines_are_completed(tmp_path):
+    poses = PoseFile(tmp_path / "poses.txt", "world-to-camera", scale=2.0)
+    assert list(poses.new()) == []
+    with (tmp_path / "poses.txt").open("w") as file:
+        for text, expected in (
+            ("# time x y z\n1.5 1 2 3 0 0 0 1\n2.5 1 2", [1.5]),
+            (" 3 0 0 0", []),
+            (" 1\n3 nan 0 0 0 0 0 1\n", [2.5, 3.0]),
+        ):
+            file.write(text)
+            file.flush()
+            events = list(poses.new())
+            assert [event.stamp for event in events] == expected
+            if expected == [1.5]:
+                np.testing.assert_allclose(events[0].T_world_cam[:3, 3], [-2, -4, -6])
+        assert np.isnan(events[-1].T_world_cam).all()
+        file.write("4 1 2 3\n")
+        file.flush()
+        with pytest.raises(ValueError, match=r"poses\.txt:5: expected a timestamp and a pose"):
+            list(poses.new())
+
+
+def test_a_folder_that_grows(tmp_path):
+    folder, image = tmp_path / "images", np.full((8, 8, 3), 7, np.uint8)
+    folder.mkdir()
+    (folder / "1.0.png").write_bytes(content(image))  # was there before
+    events = growing_folder(folder, PoseFile(tmp_path / "poses.txt"), idle=5)
+    found = []
+    thread = threading.Thread(target=lambda: found.extend(event for _, event in zip(range(4), events, strict=False)))
+    thread.start()
+    time.sleep(0.1)
+    (folder / "2.0.png").write_bytes(content(image)[:40])  # still being written
+    (folder / "3.0.png").write_bytes(content(image))
+    (folder / "notes.txt").write_text("no image")
+    (tmp_path / "poses.txt").write_text("2.5 0 0 0 0 0 0 1\n")
+    time.sleep(0.1)
+    (folder / "2.0.png").write_bytes(content(image))
+    time.sleep(0.1)
+    (folder / "front.png").write_bytes(content(image))
+    thread.join(20)
+    assert [event.stamp for event in found[:3]] == [2.5, 2.0, 3.0]
+    assert found[0].image is None
+    assert abs(found[3].stamp - time.time()) < 60  # that of the file
+    assert list(growing_folder(folder, PoseFile(tmp_path / "none"), idle=0.05)) == []
+    with pytest.raises(FileNotFoundError, match="no such folder"):
+        next(growing_folder(tmp_path / "nowhere", PoseFile(tmp_path / "none")))
+
+
+def test_lines_of_json(tmp_path):
+    image = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
+    (tmp_path / "a.png").write_bytes(content(image))
+    embedded = "data:image/png;base64," + base64.b64encode(content(image)).decode()
+    lines = [
+        {"stamp": 1, "pose": POSE},
+        {"stamp": 2, "image": "a.png", "intrinsics": [5, 5, 4, 4]},
+        {"stamp": 3, "image": embedded, "pose": np.eye(4).tolist()},
+    ]
+    pose, file, both = json_lines(["\n", *map(json.dumps, lines)], tmp_path)
+    np.testing.assert_array_equal(pose.T_world_cam[:3, 3], [1, 2, 3])
+    np.testing.assert_array_equal(file.image, image)
+    np.testing.assert_array_equal(both.image, image)
+    np.testing.assert_array_equal(both.T_world_cam, np.eye(4))
+    assert file.intrinsics.tolist() == [5, 5, 4, 4]
+
+
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        ("{", "line 1: "),
+        ("[1]", "line 1: expected"),
+        ('{"stamp": 1}', "line 1: a stamp and a pose or an image"),
+        ('{"stamp": 1, "poses": []}', "line 1: expected"),
+        ('{"stamp": "now", "pose": [1, 2, 3, 0, 0, 0, 1]}', "line 1: could not convert"),
+        ('{"stamp": 1, "pose": [1, 2, 3]}', r"line 1: a pose has 7 \(x y z qx qy qz qw\) or 12"),
+        ('{"stamp": 1, "pose": [1, 2, 3, 0, 0, 0, 2]}', "line 1: pose: the quaternion's norm is 2"),
+        ('{"stamp": 1, "pose": [[1, 2], [3]]}', "line 1: "),
+        ('{"stamp": 1, "image": "none.png"}', r"line 1: .*none\.png"),
+        ('{"stamp": 1, "image": "data:;base64,%"}', "line 1: "),
+        ('{"stamp": 1, "image": 5}', "line 1: an image is the name of a file, got 5"),
+    ],
+)
+def test_a_line_that_is_none_is_named(tmp_path, line, text):
+    with pytest.raises(ValueError, match=text):
+        list(json_lines([line], tmp_path))
+
+
+def test_a_recording_live(ufmstar, tmp_path):
+    words = ("--state", tmp_path / "state.pt", "--out", tmp_path / "out", "--json", "--speed", "0.2")
+    code, out, err = ufmstar(TOUR, *words)
+    assert code == 0, err
+    lines = [json.loads(line) for line in out.splitlines()]
+    summary = json.loads((tmp_path / "out" / "realtime.json").read_text())
+    assert summary["images"] == 5
+    assert len(lines) == summary["results"] == 5 - sum(summary["dropped"].values()) >= 1
+    assert "UfM*'s share of the time" in err
+    assert 0 < summary["ours_share"] < 1
+    assert summary["latency_ms"]["p50"] <= summary["latency_ms"]["p99"]
+    with np.load(tmp_path / "out" / f"{lines[-1]['stamp']:.6f}.npz") as maps:
+        assert maps["depth"].shape == maps["variance"].shape == (64, 96)
+        np.testing.assert_allclose(maps["T_world_cam"], open_sequence(TOUR)[-1].T_world_cam)
+        assert float(np.median(maps["depth"])) == pytest.approx(lines[-1]["depth_m"], abs=1e-3)
+    images = int(torch.load(tmp_path / "state.pt")["image_index"])
+    assert images == summary["results"]
+    code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt", "--speed", "0.2")
+    assert code == 0, err
+    assert int(torch.load(tmp_path / "state.pt")["image_index"]) > images  # it went on
+    (tmp_path / "state.pt").write_bytes(b"no state")
+    code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt")
+    assert code == 2
+    assert "cannot be continued" in err
+
+
+def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):
+    sequence, lines = open_sequence(TOUR), []
+    for n, frame in enumerate(sequence):
+        Image.fromarray(frame.image).save(tmp_path / f"{n}.png")
+        lines.append(json.dumps({"stamp": n, "pose": frame.T_world_cam.tolist()}))
+        lines.append(json.dumps({"stamp": n, "image": str(tmp_path / f"{n}.png")}))
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines)))
+    K = sequence.intrinsics
+    code, out, err = ufmstar("-", "--intrinsics", K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    assert code == 0, err
+    assert "of 5 images" in out
+    monkeypatch.setattr(sys, "stdin", io.StringIO(lines[1]))
+    code, _, err = ufmstar("-")
+    assert code == 1
+    assert "intrinsics of the image are needed" in err
+
+
+def test_a_folder_that_grows_live(ufmstar, tmp_path):
+    sequence = open_sequence(TOUR)
+    folder = tmp_path / "images"
+    folder.mkdir()
+
+    ended = threading.Event()
+
+    def write():
+        for n in count():
+            frame = sequence[n % len(sequence)]
+            (folder / f"{n / 20}.png").write_bytes(content(frame.image))
+            with (tmp_path / "poses.txt").open("a") as file:
+                file.write(f"{n / 20} {quaternion_line(frame.T_world_cam)}\n")
+            if ended.wait(0.05):
+                return
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    K = sequence.intrinsics
+    words = ("--trajectory", tmp_path / "poses.txt", "--intrinsics", K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    code, out, err = ufmstar(folder, "--follow", "--seconds", "1", *words)
+    ended.set()
+    writer.join()
+    assert code == 0, err
+    assert "UfM*'s share" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        ("0", "0 needs --trajectory FILE"),
+        ("images --follow --intrinsics 1 1 1 1", "images needs --trajectory FILE"),
+        ("- --drive 3", "--drive goes with recordings, not with -"),
+        ("tour:3 --speed 0", "--speed must be positive"),
+        ("tour:3 --scale-from network", "--scale-from goes with ufmstar run"),
+        ("tour:3 --ufm.anchors.half_life 5", "needs --anchors"),
+        ("nowhere", "no such file or folder: nowhere"),
+        ("{images}", "has no known layout"),
+    ],
+)
+def test_refusals(ufmstar, tmp_path, words, text):
+    write_generic(tmp_path)
+    words = words.format(images=tmp_path / "walk" / "images")
+    code, _, err = ufmstar(*words.split())
+    assert code == 2
+    assert text in err
+
+
+def test_a_network_is_needed(capsys):
+    assert cli.main(["live", TOUR]) == 2
+    assert "live needs a network" in capsys.readouterr().err

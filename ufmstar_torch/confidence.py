@@ -1,0 +1,236 @@
+"""A network's confidence as a variance in metres: a monotone factor of V, learnt from anchors.
+
+A confidence c says which pixels are worse, in units of its own, and whether large is good or bad is not stated either.
+At an anchor (depth g, variance s^2) of a pixel with prediction d and variance V, the network's error is known:
+
+    y = min((g - d)^2 / (V + s^2), largest),      w = (V / (V + s^2))^2;
+
+y is 1 on average where V is right, and an anchor that is noisier than V says little. The last anchors of a stream, with
+forgetting of all before them, are divided by c into bins of one size. Of each bin the mean is taken with a prior of
+kappa anchors for which V is right,
+
+    m = (sum w y + kappa) / (sum w + kappa),
+
+and an isotonic regression over the bins (Barlow and Brunk 1972), rising or falling, whichever fits better, makes it the
+factor h(c):
+
+    V' = h(c) V.
+
+Only the order of c counts: a logit, a probability and a standard deviation of the same content give the same V'.
+
+Whether c helps is decided by anchors that the map has not learnt from: before a frame's anchors are added, the mean log
+likelihood of their errors under V h(c) is compared with that under V, and with that under V and the one factor that the
+same anchors give without c. Means of both gains fade by half in some frames; c is used where both exceed their standard
+errors, and ignored otherwise: V' = V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.anchors.extension import AnchorFrame
+from ufmstar_torch.arguments import require_float
+from ufmstar_torch.config import ConfidenceConfig, UfMStarConfig
+from ufmstar_torch.extension import Chosen, Extension, FrameExtension, Tensors, Total
+from ufmstar_torch.frame import LARGEST, FrameInput
+from ufmstar_torch.output import StepOutput
+from ufmstar_torch.state import UfMStarState
+
+# An anchor: c, y, w. Of the gains: fading counts of frames, sums and sums of squares over V, and over one factor.
+FIELDS, GAINS = 3, 5
+# Frames that must have judged c before it is used, anchors per bin before it is judged, and the gain [nat] beyond its
+# standard error from which on it is used: less is rounding, or no use.
+FEWEST, FULL, USEFUL = 5, 4, 1e-3
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What is known of the confidence of B streams.
+
+    Attributes:
+        c, y, w: [B, N] of the last anchors, the youngest last; w = 0: there is none.
+        gains: [B, 5] frames, sum and sum of squares of the gain over V, and of that over one factor [nat].
+    """
+
+    c: Tensor
+    y: Tensor
+    w: Tensor
+    gains: Tensor
+
+    @classmethod
+    def of(cls, packed: Tensor) -> Learnt:
+        """From a row of numbers [B, 3 N + 5] a stream; zeros are the start."""
+        anchors, gains = packed[:, :-GAINS], packed[:, -GAINS:]
+        c, y, w = anchors.view(len(packed), FIELDS, -1).unbind(1)
+        return cls(c, y, w, gains)
+
+    def packed(self) -> Tensor:
+        """[B, 3 N + 5], for :meth:`of`."""
+        return torch.cat([torch.stack([self.c, self.y, self.w], 1).flatten(1), self.gains], 1)
+
+    def added(self, c: Tensor, y: Tensor, w: Tensor, limit: int) -> Learnt:
+        """With the anchors of a frame [B, n], of which at most ``limit`` are taken, evenly; the oldest go."""
+        taken = evenly(w > 0, limit)
+        every = [torch.cat(pair, 1) for pair in ((self.c, c), (self.y, y), (self.w, torch.where(taken, w, 0)))]
+        order = (every[2] > 0).to(torch.int8).argsort(dim=1, stable=True)[:, c.shape[1] :]
+        return replace(self, **dict(zip("cyw", (value.gather(1, order) for value in every), strict=True)))
+
+    def judged(self, gains: Sequence[Tensor], fresh: Tensor, half_life: float) -> Learnt:
+        """With a frame's mean gains over V and over one factor, each [B], of the streams ``fresh``."""
+        one = torch.stack([torch.ones_like(gains[0]), *(f(g) for g in gains for f in (torch.clone, torch.square))], 1)
+        faded = 0.5 ** (1 / half_life) * self.gains + one.to(self.gains)
+        return replace(self, gains=torch.where(fresh[:, None], faded, self.gains))
+
+    def gain(self) -> Tensor:
+        """[B] by how much the confidence makes held-out anchors likelier than the better of V and one factor, less the
+        standard error and ``USEFUL`` [nat]; at most 0: it is ignored. -inf before enough frames."""
+        frames = self.gains[:, 0]
+        n = frames.clamp_min(1)
+        least = torch.full_like(n, torch.inf)
+        for total, square in (self.gains[:, 1:3].unbind(1), self.gains[:, 3:5].unbind(1)):
+            mean = total / n
+            least = torch.minimum(least, mean - ((square / n - mean.square()).clamp_min(0) / n).sqrt())
+        return torch.where(frames >= FEWEST * (1 - 1e-3), least - USEFUL, -torch.inf)
+
+
+def evenly(valid: Tensor, limit: int) -> Tensor:
+    """[B, n] every k-th of the valid ones, with the least k that leaves at most ``limit``."""
+    stride = (valid.sum(1, keepdim=True) + limit - 1) // limit
+    return valid & ((valid.cumsum(1) - 1) % stride.clamp_min(1) == 0)
+
+
+def factors(learnt: Learnt, config: ConfidenceConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """The map h: edges [B, K - 1] of the bins in c, factors [B, K], and the one factor without c [B, 1].
+
+    Bin k holds the c with k edges at or below it. The edges are the anchors at equal steps of the rank.
+    """
+    known, bins = learnt.w > 0, config.bins
+    ordered = torch.where(known, learnt.c, torch.inf).sort(1).values
+    step = torch.arange(1, bins, device=ordered.device) * known.sum(1, keepdim=True) // bins
+    edges = ordered.gather(1, step)
+    at = torch.searchsorted(edges.contiguous(), learnt.c.contiguous(), right=True)
+    w, wy = (torch.zeros_like(ordered[:, :bins]).scatter_add(1, at, v) for v in (learnt.w, learnt.w * learnt.y))
+    prior = config.shrinkage
+    weight, mean = w + prior, (wy + prior) / (w + prior)
+    rising, falling = isotonic(mean, weight), isotonic(mean.flip(1), weight.flip(1)).flip(1)
+    misfit = [(weight * (mean - fitted).square()).sum(1, keepdim=True) for fitted in (rising, falling)]
+    h = torch.where(misfit[0] <= misfit[1], rising, falling)
+    one = (wy.sum(1, keepdim=True) + prior) / (w.sum(1, keepdim=True) + prior)
+    return edges, h.clamp(config.least, config.largest), one.clamp(config.least, config.largest)
+
+
+def isotonic(value: Tensor, weight: Tensor) -> Tensor:
+    """The non-decreasing sequence nearest to ``value`` [B, K] by weighted squares: max over i <= k of min over j >= k
+    of the weighted mean from i to j."""
+    k = value.shape[1]
+    upto = torch.nn.functional.pad(torch.stack([value * weight, weight]).cumsum(-1), (1, 0))
+    total, weights = upto[..., None, 1:] - upto[..., :-1, None]  # [B, i, j]
+    upper = torch.ones(k, k, dtype=torch.bool, device=value.device).triu()
+    means = torch.where(upper, total / weights.clamp_min(torch.finfo(value.dtype).tiny), torch.inf)
+    least = means.flip(-1).cummin(-1).values.flip(-1)
+    return torch.where(upper, least, -torch.inf).amax(-2)
+
+
+def read(c: Tensor, edges: Tensor, h: Tensor) -> Tensor:
+    """h(c) at c [B, n]; 1 where c is NaN."""
+    bins = torch.searchsorted(edges, c.contiguous(), right=True)
+    return torch.where(c.isnan(), 1.0, h.gather(1, bins))
+
+
+class ConfidenceFrame(FrameExtension):
+    """The confidence of one frame.
+
+    Args:
+        c: [B, H, W] float32.
+        of_anchors: the anchors during the same frame; None: nothing is learnt from it.
+        frame: of B streams.
+        config: of the confidence.
+    """
+
+    def __init__(self, c: Tensor, of_anchors: AnchorFrame | None, frame: FrameInput, config: ConfidenceConfig) -> None:
+        self._c, self._anchors, self._frame, self._config = c, of_anchors, frame, config
+        self._factor: Tensor | None = None
+
+    def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
+        """Judge the map by the frame's anchors, learn from them, and compute h at every pixel."""
+        learnt = Learnt.of(state.by_stream["confidence"])
+        if self._anchors is not None and self._anchors.anchors is not None:
+            learnt = self._taught(learnt, total(self._anchors.disagreement(out.disagreement, self._frame.depth)))
+        edges, h, _ = factors(learnt, self._config)
+        gain = learnt.gain()
+        h = torch.where(gain[:, None] > 0, h, torch.ones_like(h))
+        self._factor = read(self._c.flatten(1).to(edges), edges, h).view_as(self._c)
+        state = state.with_tensors({"confidence": learnt.packed()})
+        return state, replace(out, statistics=replace(out.statistics, confidence=gain))
+
+    def _taught(self, learnt: Learnt, variance: Tensor) -> Learnt:
+        """After the frame's anchors, of which the map has not learnt yet; ``variance`` is V without it [B, H, W]."""
+        assert self._anchors is not None
+        anchors, dtype = self._anchors.anchors, learnt.c.dtype
+        assert anchors is not None
+        c = self._c.flatten(1).gather(1, anchors.index).to(dtype)
+        V = variance.detach().flatten(1).gather(1, anchors.index).double()
+        known = anchors.valid & V.isfinite() & (V > 0) & ~c.isnan()
+        V = torch.where(known, V, torch.ones_like(V))
+        spread = V + anchors.variance
+        y = ((anchors.depth - anchors.predicted).square() / spread).clamp_max(self._config.largest).to(dtype)
+        w = torch.where(known, (V / spread).square(), torch.zeros_like(V)).to(dtype)
+        edges, h, one = factors(learnt, self._config)
+        likelihood = [-0.5 * (y / f + f.log()) for f in (read(c, edges, h), torch.ones_like(one), one)]
+        weight = w.sum(1)
+        gains = [(w * (likelihood[0] - other)).sum(1) / weight.clamp_min(1e-6) for other in likelihood[1:]]
+        enough = (learnt.w > 0).sum(1) >= FULL * self._config.bins
+        judged = learnt.judged(gains, enough & (weight > 0), self._config.half_life)
+        return judged.added(c.nan_to_num(), y, w, self._config.each)
+
+    def map_variance(self, variance: Tensor, chosen: Chosen) -> Tensor:
+        """V' = h(c) V."""
+        return variance if self._factor is None else variance * chosen(self._factor).to(variance.dtype)
+
+
+class ConfidenceExtension(Extension):
+    """The network's confidence, judged at anchors. ``config``: with ``confidence`` and ``anchors``."""
+
+    argument = "confidence"
+
+    def __init__(self, config: UfMStarConfig) -> None:
+        assert config.confidence is not None
+        self._config: ConfidenceConfig = config.confidence
+
+    def by_stream(self, streams: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, Tensor]:
+        """``confidence`` [B, 3 N + 5], the last N anchors and the gains (:class:`Learnt`)."""
+        return {"confidence": torch.zeros(streams, FIELDS * self._config.anchors + GAINS, dtype=dtype, device=device)}
+
+    def require_state(self, state: Tensors) -> None:
+        """See :meth:`Extension.require_state`."""
+        learnt = Learnt.of(state["confidence"])
+        bad = (learnt.w < 0) | (learnt.w > 1) | (learnt.y < 0) | (learnt.y > self._config.largest)
+        if bool(bad.any()) or bool((learnt.gains[:, ::2] < 0).any()) or bool((learnt.gains.abs() > LARGEST).any()):
+            raise ValueError("confidence holds impossible errors, weights or gains")
+
+    def of_frame(
+        self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool
+    ) -> FrameExtension:
+        """Without a confidence it does nothing; of a subset of pixels it applies what was learnt, and learns nothing.
+
+        Raises:
+            TypeError, ValueError: ``confidence`` is no map of the depth's shape.
+        """
+        if given is None:
+            return FrameExtension()
+        of_anchors = [one for one in before if isinstance(one, AnchorFrame)] if dense else []
+        return ConfidenceFrame(as_confidence(given, frame), of_anchors[0] if of_anchors else None, frame, self._config)
+
+
+def as_confidence(given: Any, frame: FrameInput) -> Tensor:
+    """[B, H, W] float32, as large as finite numbers are. Raises TypeError, ValueError: it is no map of the depth's
+    shape."""
+    size = tuple(frame.depth.shape)
+    c = require_float("confidence", given, [size, (size[0], 1, *size[1:])], frame.depth).detach()
+    limit = torch.finfo(torch.float32).max
+    return c.reshape(size).clamp(-limit, limit).float()
