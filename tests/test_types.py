@@ -39,6 +39,8 @@ def trajectory():
 def hugging_face():
     from ufmstar_torch.models import from_hugging_face
     from_hugging_face("a/b")
+def train_module():
+    from ufmstar_torch.train import train_module
 def corners():
     from ufmstar_torch.anchors import LandmarkTracker
     LandmarkTracker().update(np.zeros((48, 64, 3), np.uint8), np.eye(4), np.eye(3) + np.eye(3, k=2) * 9)
@@ -50,7 +52,7 @@ def own_network():
     from ufmstar_torch.models import wrap_network
     model = UncertainDepth(wrap_network(lambda x: x[:, :1] + 1))
     print(model(torch.ones(1, 3, 48, 64), torch.eye(4), (50.0, 50.0, 32.0, 24.0)).std.median())
-for call in (own_network, trajectory, hugging_face, corners, command):
+for call in (own_network, trajectory, hugging_face, train_module, corners, command):
     try:
         call()
     except ModuleNotFoundError as error:
@@ -80,6 +82,7 @@ def test_what_is_missing_without_extras_is_named():
     for who, package, extra in (
         ("trajectory ufmstar_torch.eval.sequences.read_trajectory", "scipy", "eval"),
         ("hugging_face", "transformers", "models"),
+        ("train_module ufmstar_torch.train.train_module", "lightning", "train"),
         ("ufmstar run: failed: this command", "scipy", "eval"),
     ):
         (line,) = (line for line in said.splitlines() if line.startswith(who))
