@@ -183,7 +183,7 @@ def test_wrong_usage(tmp_path, exported, capsys):
         ((tmp_path,), "has no known layout, and nothing below it has"),
         ((exported, "--truth-scale", 1000), "depth_scale is in metres per unit"),
         ((exported, "--poses", "upside-down"), "choose from 'camera-to-world'"),
-        ((exported, "--layout", "kitti"), "choose from 'auto'"),
+        ((exported, "--layout", "kitti"), "layout must be one of auto, tum"),
         ((exported, "--pairs", 0), "pairs must be at least 1"),
         ((exported, "--intrinsics", 1, 2, 3), "--intrinsics must be a file, or the four numbers"),
     ):
@@ -268,6 +268,6 @@ def test_every_command_and_piece_of_code_on_the_page_runs(tmp_path, monkeypatch,
 
 
 def test_the_page_names_every_layout():
-    from ufmstar_torch.eval.sequences.layout import LAYOUTS
+    from ufmstar_torch.eval.sequences.layout import READERS
 
-    assert set(re.findall(r"^\| `(\w+)` \|", PAGE.read_text(), re.M)) == set(LAYOUTS) - {"auto"}
+    assert set(re.findall(r"^\| `(\w+)` \|", PAGE.read_text(), re.M)) == set(READERS) - {"auto"}

@@ -1,37 +1,127 @@
-"""The example of a method and a metric of one's own: its figures against loops by hand."""
+"""Plug-ins, by the example: a method, a metric and a reader of one's own, in eval, report, run and data check."""
 
 from __future__ import annotations
 
+import json
+import shutil
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import layouts
 import numpy as np
 import own_method as example
 import pytest
-import torch
 
-from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.models import NetworkSpec, build_network, save_trained
+from ufmstar_torch import cli
+from ufmstar_torch.eval.methods.method import Method
+from ufmstar_torch.eval.sequences import find_sequences, open_sequence, plugins
 
-SPEC = NetworkSpec(widths=0.1, positive="softplus", size=(64, 96), preprocess="resize")
+FOLDER = Path(example.__file__).parent
+PLUGIN = str(FOLDER / "own_method.py")
+SUITE = str(FOLDER / "own_method.toml")
+NETWORK = "depth_only=ground-truth"
 
 
-@pytest.mark.slow
-def test_both_rows_are_judged(tmp_path, capsys):
-    torch.manual_seed(0)
-    network = build_network(SPEC).eval()
-    save_trained(tmp_path / "net.safetensors", network, SPEC)
-    tour = "tour:5?frames=3&size=64x96"
-    result = example.main([tour, "--model", "trained", "--weights", str(tmp_path / "net.safetensors")])
-    assert list(result) == ["UfM*", "a tenth"]
-    assert capsys.readouterr().out.startswith("UfM* ")
-    inside = pixels = 0
-    errors = []
-    for frame in open_sequence(tour):
-        with torch.no_grad():
-            image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
-            x, _ = network.preprocess(image, torch.from_numpy(frame.intrinsics)[None].float())
-            depth = network(x).depth[0].numpy()
-        use = frame.depth > 0
-        errors.append(np.square(depth - frame.depth)[use])
-        inside += int((np.abs(depth - frame.depth)[use] <= 0.2 * depth[use]).sum())
-        pixels += int(use.sum())
-    assert result["a tenth"]["within 2 sigma"] == pytest.approx(inside / pixels, abs=1e-3)
-    assert result["a tenth"]["rmse"] == pytest.approx(float(np.sqrt(np.concatenate(errors).mean())), rel=0.05)
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """A sequence in the example's own layout, whose images alone say how far all is."""
+    scene = layouts.truth(layouts.resized(500, 510, 310, 245, (480, 640)))
+    path = tmp_path_factory.mktemp("data") / "walk.npz"
+    depths, poses = np.float32(scene.depths), np.array(scene.T_world_cam)
+    np.savez(path, images=np.array(scene.images), depths=depths, poses=poses, K=scene.K)
+    return path, scene
+
+
+def evaluate(path, out, *words):
+    rest = ("--plugin", PLUGIN, "--network", NETWORK, "--root", str(path), "--out", str(out), *words)
+    return cli.main(["eval", "--suite", SUITE, *rest])
+
+
+def test_eval_and_report_show_them(walk, tmp_path, capfd):
+    path, _ = walk
+    assert evaluate(path, tmp_path / "out", "--no-report") == 0
+    table = capfd.readouterr().out
+    assert "tenth-DepthOnly" in table
+    assert "within_2_sigma" in table
+    record = json.loads((tmp_path / "out/records/npz/walk/tenth-DepthOnly.json").read_text())
+    assert record["figures"]["own.within_2_sigma"] == 1  # perfect depth
+    assert record["figures"]["rmse"] == 0
+    shutil.rmtree(tmp_path / "out" / "cache", ignore_errors=True)
+    assert cli.main(["report", str(tmp_path / "out")]) == 0  # without the plug-in
+    assert "within_2_sigma" in (tmp_path / "out" / "report.html").read_text()
+    settings = json.loads((tmp_path / "out" / "eval.json").read_text())["settings"]
+    assert settings["plugin"] == [PLUGIN]
+
+
+def test_the_metric_equals_a_loop(walk):
+    """On numbers with errors of which some are beyond two sigma."""
+    import torch
+
+    rng = np.random.default_rng(0)
+    target, depth, variance = rng.uniform(1, 5, 500), rng.uniform(1, 5, 500), rng.uniform(0, 1, 500)
+    target[:50] = 0
+    metric = example.Coverage()
+    for part in (slice(0, 200), slice(200, 500)):
+        metric.update(*(torch.from_numpy(values[part]) for values in (depth, variance, target)))
+    hits = [abs(d - t) <= 2 * v**0.5 for d, v, t in zip(depth, variance, target, strict=True) if t > 0]
+    assert 0.2 < np.mean(hits) < 0.8
+    assert float(metric.compute()["within_2_sigma"]) == pytest.approx(np.mean(hits))
+
+
+def test_the_reader_is_everywhere(walk, tmp_path, capfd):
+    path, scene = walk
+    sequence = open_sequence(path, plugin=[PLUGIN])
+    assert sequence.layout == "npz"
+    np.testing.assert_array_equal(sequence[3].image, scene.images[3])
+    np.testing.assert_allclose(sequence[3].depth, scene.depths[3], rtol=1e-6)
+    assert [one.layout for one in find_sequences(path.parent, plugin=[PLUGIN])] == []  # files are none below a folder
+    assert [one.layout for one in find_sequences(path, plugin=[PLUGIN])] == ["npz"]
+    assert cli.main(["data", "check", str(path), "--plugin", PLUGIN]) == 0
+    out = tmp_path / "out"
+    words = ["run", str(path), "--plugin", PLUGIN, "--depth", "self", "--no-video", "--no-sheet", "--out", str(out)]
+    assert cli.main(words) == 0
+    assert "own.within_2_sigma" in json.loads((out / "summary.json").read_text())["metrics"]
+    assert cli.main(["export", str(out), "--to", "transforms"]) == 0
+    assert len(open_sequence(out / "export" / "transforms")) == 6
+    with pytest.raises(ValueError, match="has no known layout"):
+        open_sequence(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("x = 1", "has none of READERS, METHODS, METRICS"),
+        ("READERS = {'mine': 3}", "readers: 'mine' lacks detect"),
+        ("METRICS = {'Mine': 3}", "metrics: 'Mine' lacks add"),
+        ("METHODS = {'My-one': print}", "methods: 'My-one' needs small letters"),
+    ],
+)
+def test_what_is_no_plugin_is_named(walk, tmp_path, content, message):
+    file = tmp_path / "mine.py"
+    file.write_text(content)
+    with pytest.raises(ValueError, match=message):
+        open_sequence(walk[0], plugin=[str(file)])
+    with pytest.raises(FileNotFoundError, match="--plugin: no such file"):
+        open_sequence(walk[0], plugin=[str(tmp_path / "absent.py")])
+
+
+def test_names_that_are_taken_or_unknown(walk, tmp_path, capfd):
+    file = tmp_path / "taken.py"
+    file.write_text("class R:\n    detect = read = LOOKED_FOR = None\nREADERS = {'tum': R}")
+    with pytest.raises(ValueError, match="there is a reader 'tum' already"):
+        open_sequence(walk[0], plugin=[str(file)])
+    words = ["eval", "--suite", SUITE, "--network", NETWORK, "--root", "tour:5", "--out", str(tmp_path / "out")]
+    assert cli.main(words) == 2
+    assert "row tenth-DepthOnly: --plugin FILE.py adds yours" in capfd.readouterr().err
+    for name in ("Mine-Ensemble", "alone-Ensemble", "mine-Network", "ufm-Ensemble"):
+        with pytest.raises(ValueError, match="no method is called"):
+            Method.parse(name)
+    assert Method.parse("mine-FullEnsemble").name == "mine-FullEnsemble"
+
+
+def test_installed_packages_have_entry_points(monkeypatch):
+    points = {"ufmstar.methods": [EntryPoint("share", "own_method:ShareOfDepth", "ufmstar.methods")]}
+    monkeypatch.setattr(plugins, "entry_points", lambda group: points.get(group, []))
+    plugins._load.cache_clear()
+    assert plugins.load_plugins().methods == {"share": example.ShareOfDepth}
+    plugins._load.cache_clear()

@@ -52,7 +52,16 @@ def own_network():
     from ufmstar_torch.models import wrap_network
     model = UncertainDepth(wrap_network(lambda x: x[:, :1] + 1))
     print(model(torch.ones(1, 3, 48, 64), torch.eye(4), (50.0, 50.0, 32.0, 24.0)).std.median())
-for call in (own_network, trajectory, hugging_face, train_module, corners, command):
+def choosing():
+    from ufmstar_torch.choose import UncertaintySampler, choose
+    from ufmstar_torch.online import TrainDecision
+    print("chosen", choose([1.0, 2.0]), list(UncertaintySampler([0.0, 1.0], 2)), TrainDecision(0.1)(torch.ones(3)))
+def metrics():
+    from ufmstar_torch.eval.metrics import mean_and_ci
+def ranking():
+    from ufmstar_torch.cli import main
+    main(["rank", "a", "--depth", "self", "--out", "c"])
+for call in (choosing, metrics, ranking, own_network, trajectory, hugging_face, train_module, corners, command):
     try:
         call()
     except ModuleNotFoundError as error:
@@ -84,9 +93,12 @@ def test_what_is_missing_without_extras_is_named():
         ("hugging_face", "transformers", "models"),
         ("train_module ufmstar_torch.train.train_module", "lightning", "train"),
         ("ufmstar run: failed: this command", "scipy", "eval"),
+        ("ufmstar rank: failed: this command", "scipy", "eval"),
+        ("metrics ufmstar_torch.eval.metrics.mean_and_ci", "torchmetrics", "eval"),
     ):
         (line,) = (line for line in said.splitlines() if line.startswith(who))
         assert f"needs the package {package}: pip install 'ufmstar-torch[{extra}]'" in line
+    assert "chosen [1, 0] [1, 1] True" in said, said
     assert "corners landmarks of images need OpenCV: pip install 'ufmstar-torch[eval]'" in said
 
 

@@ -69,16 +69,17 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
         ValueError: an option out of range, or nothing below the folder has a known layout.
     """
     from ufmstar_torch.eval.check.data_check import check_data
-    from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of
+    from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of, require_layout
     from ufmstar_torch.eval.sequences.options import Options
 
     path, opening = options.path, options.opening.given()
+    require_layout(options.opening.layout, options.opening.plugin)
     Options(**{name: value for name, value in opening.items() if name not in ("layout", "poses")})
     one = path.startswith("tour:") or any(name in opening for name in _OF_ONE)
     if not one:  # a folder that fits several layouts is one too, whose layout must be named
-        fitting = layouts_of(Path(path))
+        fitting = layouts_of(Path(path), options.opening.plugin)
         one = len(fitting) > 1 or (len(fitting) == 1 and len(parts_of(Path(path), fitting[0])) == 1)
-    result = [] if one else find_sequences(path, layout=options.opening.layout)
+    result = [] if one else find_sequences(path, layout=options.opening.layout, plugin=options.opening.plugin)
     if not one and not result and options.opening.layout == "auto":
         raise ValueError(f"{path} has no known layout, and nothing below it has; see docs/data.md, or --layout")
     if one or not result:  # check_data names what a layout looks for

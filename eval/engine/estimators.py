@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
-from ufmstar_torch.eval.methods.method import ALONE, UFM
+from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
@@ -68,16 +69,19 @@ class Estimator(ABC):
             raise ValueError(f"the saved state lacks {result.missing_keys} and has {result.unexpected_keys} too many")
 
 
-def make_estimator(row: Row, device: torch.device, source: DepthSource | None = None) -> Estimator:
+def make_estimator(
+    row: Row, device: torch.device, source: DepthSource | None = None, own: Mapping[str, Any] = MappingProxyType({})
+) -> Estimator:
     """The estimator of a row, in its initial state.
 
     Args:
         row: method and setting.
         device: where it runs.
         source: of its depth, which states a largest depth and a confidence; None: neither.
+        own: methods of one's own (``sequences.plugins``), by name.
 
     Raises:
-        ValueError: a recalibration that was fitted under other settings.
+        ValueError: a recalibration that was fitted under other settings, or no method of that name.
         FileNotFoundError: the setting's recalibration does not exist.
     """
     method, setting = row.method, row.setting
@@ -86,6 +90,11 @@ def make_estimator(row: Row, device: torch.device, source: DepthSource | None = 
     if method.fusion == UFM:
         points = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
         return Pointwise(points, uses_variances=method.uses_aleatoric)
+    if method.fusion != UFM_STAR:
+        if method.fusion not in own:
+            raise ValueError(f"row {method.name}: no method is called {method.fusion!r}: --plugin FILE.py adds yours")
+        estimator: Estimator = own[method.fusion](row, device)
+        return estimator
     fitted = Recalibration.from_json(setting.recalibration) if setting.recalibration else None
     config = ufm_star_config(row)
     config = config if source is None else config.within(source.max_depth, source.states_confidence)

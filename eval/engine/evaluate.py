@@ -28,6 +28,7 @@ from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.plugins import Plugins
 from ufmstar_torch.frame import FRAME_FAULTS, check_frame
 
 _TOLERANCE = UfMStarConfig().rotation_tolerance
@@ -46,6 +47,7 @@ class Judge:
     store: PredictionStore | None = None  # of predictions; None = all are computed
     limit: slice = field(default_factory=lambda: slice(None))  # which frames, before a setting's skip
     bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
+    plugins: Plugins = field(default_factory=Plugins)  # methods and metrics of one's own
 
 
 def evaluate_sequence(
@@ -85,11 +87,11 @@ def evaluate_sequence(
     runners, judges = [], {}
     for row in rows:
         source = sources[row.method.base, row.setting.preprocess]
-        estimator = make_estimator(row, judge.device, source)
+        estimator = make_estimator(row, judge.device, source, judge.plugins.methods)
         how: dict[str, Any] = {"every": row.method.every_member, "setting": row.setting, "device": judge.device}
         runners.append(RowRunner(row.slug, source, estimator, anchors=anchors.get(row), **how))
         named = {other.slug: other.method.name for other in references(row, rows)}
-        judges[row.slug] = RowJudge(row, named, judge.bins)
+        judges[row.slug] = RowJudge(row, named, judge.bins, judge.plugins.metrics)
     tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)
     check = partial(_check_frame, sources=sources.values(), tracked=tracked)
     stream = FrameStream(sequence, indices, runners, store=judge.store, device=judge.device, check=check)

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 from time import perf_counter
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -31,6 +32,9 @@ if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence with
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Names of a row's sums.
 METRICS, BY_ERROR = "metrics", "nll_by_error"
+# Metrics of one's own by name (``sequences.plugins``).
+Own = Mapping[str, Any]
+NONE: Own = MappingProxyType({})
 
 
 class SequenceError(Exception):
@@ -51,11 +55,11 @@ class RunMetrics(FrameSink):
     All are of the pixels that the row uses; the others are masked. ``sums`` are those of an earlier part of the run.
     Its time is added to ``FrameResult.ms`` as "metrics" [ms]."""
 
-    def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]]) -> None:
-        self._key = key
+    def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]], own: Own = NONE) -> None:
+        self._key, self._own = key, own
         self._metrics: dict[str, SequenceMetrics] = {}
         for name, state in sums.items():
-            metrics_of(self._metrics, name).load_state_dict(dict(state))
+            metrics_of(self._metrics, name, own=own).load_state_dict(dict(state))
 
     def sums(self) -> dict[str, dict[str, Tensor]]:
         """By name. They are exchanged by updates, never changed in place."""
@@ -82,7 +86,7 @@ class RunMetrics(FrameSink):
         if row.posterior_depth is not None:
             maps[POSTERIOR] = row.posterior_depth, row.posterior_variance
         for name, (depth, variance) in maps.items():
-            metrics_of(self._metrics, name).update(depth, variance, target, row.valid)
+            metrics_of(self._metrics, name, own=self._own).update(depth, variance, target, row.valid)
 
 
 @dataclass(frozen=True)
@@ -105,8 +109,8 @@ class RowJudge:
     """Collects counts, metrics, times and memory of one row over a sequence; ``named`` are the references by whose
     confident pixels its NLL is binned by error: their names by key."""
 
-    def __init__(self, row: Row, named: Mapping[str, str], bins: str) -> None:
-        self.row, self.named, self._bins = row, named, bins
+    def __init__(self, row: Row, named: Mapping[str, str], bins: str, own: Own = NONE) -> None:
+        self.row, self.named, self._bins, self._own = row, named, bins, own
         self._metrics: dict[str, SequenceMetrics] = {}
         self._by_error: dict[str, NLLByError] = {}
         self._judged, self.reasons, self._idle = 0, Counter[str](), Counter[str]()
@@ -135,7 +139,7 @@ class RowJudge:
         depth, variance, target = (
             torch.where(result.valid, result.depth, torch.nan), result.variance, torch.from_numpy(result.truth)
         )  # fmt: skip
-        how = {"with_variance": variance is not None, "bins": self._bins}
+        how = {"with_variance": variance is not None, "bins": self._bins, "own": self._own}
         metrics_of(self._metrics, METRICS, **how).update(depth, variance, target)
         if variance is None:
             return

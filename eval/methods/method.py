@@ -22,7 +22,11 @@ BASES = {
 MANY = ("ensemble", "mc_dropout", "batch_ensemble")
 ALONE, UFM, UFM_STAR = "alone", "ufm", "ufm_star"
 FUSIONS = (ALONE, UFM, UFM_STAR)
-_NAME = re.compile(r"(?P<fusion>UfM\*?)-(?P<full>Full)?(?P<base>[A-Za-z]+)(-(?P<cap>\d+)K)?(?P<fixed>-fixed-param)?")
+# Of a method of one's own (``sequences.plugins``).
+_OWN = r"[a-z][a-z0-9_]*"
+_NAME = re.compile(
+    rf"(?P<fusion>UfM\*?|{_OWN})-(?P<full>Full)?(?P<base>[A-Za-z]+)(-(?P<cap>\d+)K)?(?P<fixed>-fixed-param)?"
+)
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ class Method:
     """
 
     base: str  # a key of ``BASES``
-    fusion: str = ALONE  # "alone" (the network's own variance), "ufm" or "ufm_star"
+    fusion: str = ALONE  # "alone" (the network's own variance), "ufm", "ufm_star", or the name of a method of one's own
     # behind UfM or UfM*, run all members (or samples) on every image instead of one in turn.
     full: bool = False
     max_points: int | None = None  # of UfM; None = unpruned
@@ -44,8 +48,10 @@ class Method:
     def __post_init__(self) -> None:
         if self.base not in BASES:
             raise ValueError(f"base must be one of {', '.join(BASES)}, got {self.base!r}")
-        if self.fusion not in FUSIONS:
-            raise ValueError(f"fusion must be one of {', '.join(FUSIONS)}, got {self.fusion!r}")
+        if not re.fullmatch(_OWN, self.fusion):
+            raise ValueError(
+                f"fusion must be one of {', '.join(FUSIONS)} or a name in small letters, got {self.fusion!r}"
+            )
         if self.full and (self.fusion == ALONE or self.base not in MANY):
             raise ValueError(f"full goes with UfM or UfM* behind one of {', '.join(MANY)}")
         if self.max_points is not None and (self.fusion != UFM or self.max_points < 1000 or self.max_points % 1000):
@@ -60,7 +66,7 @@ class Method:
         if self.fusion == ALONE:
             return alone
         cap = "" if self.max_points is None else f"-{self.max_points // 1000}K"
-        prefix = "UfM" if self.fusion == UFM else "UfM*"
+        prefix = {UFM: "UfM", UFM_STAR: "UfM*"}.get(self.fusion, self.fusion)
         return f"{prefix}-{'Full' if self.full else ''}{behind}{cap}{'-fixed-param' if self.fixed_param else ''}"
 
     @property
@@ -81,14 +87,15 @@ class Method:
             return cls(by_alone[name])
         by_behind = {behind: base for base, (_, behind) in BASES.items()}
         match = _NAME.fullmatch(name)
-        if match is None or match["base"] not in by_behind:
+        if match is None or match["base"] not in by_behind or match["fusion"] in FUSIONS:
             known = f"{', '.join(by_alone)}, or UfM-, UfM*-, UfM*-Full with {', '.join(by_behind)}"
             raise ValueError(
-                f"no method is called {name!r}; there are {known}, UfM's with -100K, UfM*'s with -fixed-param"
+                f"no method is called {name!r}; there are {known}, UfM's with -100K, UfM*'s with -fixed-param, "
+                "and NAME- of a plug-in's"
             )
         return cls(
             base=by_behind[match["base"]],
-            fusion=UFM_STAR if match["fusion"] == "UfM*" else UFM,
+            fusion={"UfM": UFM, "UfM*": UFM_STAR}.get(match["fusion"], match["fusion"]),
             full=match["full"] is not None,
             max_points=None if match["cap"] is None else 1000 * int(match["cap"]),
             fixed_param=match["fixed"] is not None,

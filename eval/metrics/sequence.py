@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from torch import Tensor, nn
@@ -16,6 +17,7 @@ from ufmstar_torch.eval.metrics.ranking import Sparsification, SpearmanCorrelati
 
 OURS, AUTHORS = "ours", "authors"
 BINS = (OURS, AUTHORS)
+_OWN = "own_"  # before the names of a user's metrics
 _LEVELS = [level / 100 for level in range(101)]
 _AUTHORS: dict[type[SumMetric], dict[str, Any]] = {ECEDelta: {"bins": 100}, ECEQuantile: {"levels": _LEVELS}}
 
@@ -30,9 +32,18 @@ class SequenceMetrics(nn.Module):
         with_variance: False for a network that predicts depth alone.
         ranking: with AUSE, AURG and Spearman's correlation.
         bins: of the calibration errors: "ours", 10 of the confidence and 10 levels, or "authors", 100 and 101.
+        own: classes of ``SumMetric`` by name, whose figures are called "own.FIGURE"; without a variance, those that
+            need none.
     """
 
-    def __init__(self, *, with_variance: bool = True, ranking: bool = True, bins: str = OURS) -> None:
+    def __init__(
+        self,
+        *,
+        with_variance: bool = True,
+        ranking: bool = True,
+        bins: str = OURS,
+        own: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
         super().__init__()
         if bins not in BINS:
             raise ValueError(f"bins must be one of {', '.join(BINS)}, got {bins!r}")
@@ -43,6 +54,8 @@ class SequenceMetrics(nn.Module):
             kinds += [Sparsification, SpearmanCorrelation] if ranking else []
         finer = _AUTHORS if bins == AUTHORS else {}
         made = {kind.__name__: kind(**finer.get(kind, {}), sync_on_compute=False) for kind in kinds}
+        usable = {name: kind for name, kind in own.items() if with_variance or not kind.OF_VARIANCE}
+        made |= {f"{_OWN}{name}": kind(sync_on_compute=False) for name, kind in usable.items()}
         self.metrics = nn.ModuleDict(made)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
@@ -95,7 +108,12 @@ class SequenceMetrics(nn.Module):
         return [m for m in self.metrics.values() if isinstance(m, SumMetric)]
 
     def _results(self) -> dict[str, Tensor]:
-        return {name: value for metric in self._all() for name, value in metric.compute().items()}
+        return {
+            f"own.{name}" if kind.startswith(_OWN) else name: value
+            for kind, metric in self.metrics.items()
+            if isinstance(metric, SumMetric)
+            for name, value in metric.compute().items()
+        }
 
 
 def mean_and_ci(values: Iterable[float], *, level: float = 0.95) -> tuple[float, float]:

@@ -299,7 +299,7 @@ def _compute(total: Sums, file: Path) -> Merged:
     metrics = SequenceMetrics(with_variance="NLL" in kinds, ranking="Sparsification" in kinds, bins=bins)
     by_error = {name: NLLByError() for name in total if name != METRICS}
     try:
-        metrics.load_state_dict(dict(states))
+        metrics.load_state_dict({key: value for key, value in states.items() if not key.startswith("metrics.own_")})
         for name, metric in by_error.items():
             metric.load_state_dict(dict(total[name]))
     except RuntimeError as error:

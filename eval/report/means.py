@@ -10,7 +10,7 @@ from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.names import LOWER, NO_MATCH, NO_SEGMENT, Quantity
+from ufmstar_torch.eval.report.names import LOWER, NO_MATCH, NO_SEGMENT, OWN, Quantity
 from ufmstar_torch.eval.suite.record import Record
 
 # Student's interval of fewer values rests on a normal distribution, which nobody checked: no interval is given.
@@ -41,6 +41,8 @@ def value_of(record: Record, key: str) -> float:
         return math.nan if None in parts else math.fsum(float(part) for part in parts if part is not None)
     if key in (NO_SEGMENT.key, NO_MATCH.key):  # as a share
         return record.frames.get(name, math.nan) / max(1, record.frames.get("done", 0))
+    if group == OWN:
+        name, group = key, ""
     value = {"": record.figures, "state": record.state, "ms": record.ms, "frames": record.frames}[group].get(name)
     return math.nan if value is None else float(value)
 

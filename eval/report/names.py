@@ -70,6 +70,7 @@ EXTRA = (
     NETWORK_MS,
     UNCERTAINTY_MS,
 )
+OWN = "own"  # the group of figures of a user's metrics
 # Figures of which differences between rows are shown.
 DIFFERENCES = (NLL, ECE_DELTA, ECE_Q, AUSE, SPEARMAN)
 
@@ -119,6 +120,11 @@ _WORDS = {
 }
 # Values in words.
 _VALUES = {"tracked": "tracked corners", "dense": "dense evidence", "truth": "ground truth"}
+
+
+def own_quantities(figures: Iterable[str]) -> list[Quantity]:
+    """The columns of a user's metrics among the names of figures, each once."""
+    return [Quantity(key, key.partition(".")[2], 3) for key in dict.fromkeys(figures) if key.startswith(f"{OWN}.")]
 
 
 def setting_name(name: str) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ufmstar_torch.eval.methods.method import ALONE, UFM, Method
+from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.run.colours import FAINT, INK, plain, require_matplotlib
 from ufmstar_torch.eval.run.files import write_atomic
 
@@ -39,6 +39,8 @@ def look_of(method: Method) -> Look:
         cap = "" if method.max_points is None else f"-{method.max_points // 1000}K"
         colour = ("#F0E442", "X") if full else ("#D55E00", "v") if cap else ("#E69F00", "s")
         return Look(f"UfM{full}{cap}", *colour)
+    if method.fusion != UFM_STAR:
+        return Look(f"{method.fusion}{full}", "#56B4E9", "*")
     fixed = " fixed-param" if method.fixed_param else ""
     colour = ("#009E73", "D") if full else ("#CC79A7", "P") if fixed else ("#0072B2", "o")
     return Look(f"UfM*{full}{fixed}", *colour)

@@ -29,6 +29,7 @@ from ufmstar_torch.eval.report.names import (
     MAIN,
     MEMORY,
     Quantity,
+    own_quantities,
     row_labels,
     shared_words,
 )
@@ -107,7 +108,8 @@ def _means(
     records = {row: listed for row in results.rows if (listed := results.of(row, dataset))}
     alike = len({frozenset((r.dataset, r.sequence) for r in listed) for listed in records.values()}) == 1
     group = "Ours" if quoted else ""
-    columns = _figures(records, quantities, group)
+    own = own_quantities(key for r in results.records for key in r.figures) if name == "main" else []
+    columns = _figures(records, [*quantities, *own], group)
     notes = [_network_note(results), _prepared_note(records), _interval_note(records)]
     costs = _costs(results.efficiency, records, group) if name == "main" and results.efficiency else []
     if any(cell.value for column in costs for cell in column.cells.values()):

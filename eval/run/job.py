@@ -17,13 +17,14 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.check.image_fit import FollowedCorners, ImageFit, image_fit, track_corners
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
 from ufmstar_torch.eval.engine.estimators import Gaussians
-from ufmstar_torch.eval.engine.judge import UFM
+from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.setting import TRACKED, Setting
 from ufmstar_torch.eval.run.run_folder import Checkpoint
 from ufmstar_torch.eval.run.scale import NetworkScale
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.plugins import load_plugins
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
 
@@ -55,6 +56,10 @@ class RunJob:
     def image_fit(self) -> ImageFit | None:
         """How poses and intrinsics fit the images; None where no corner could be followed."""
         return image_fit(self.sequence, self.corners)
+
+    def metrics(self, checkpoint: Checkpoint) -> RunMetrics:
+        """The metrics, those of plug-ins included, with the sums of a checkpoint."""
+        return RunMetrics(UFM, checkpoint.metrics, load_plugins(self.settings.get("plugin", ())).metrics)
 
     def row(self, checkpoint: Checkpoint) -> RowRunner:
         """UfM* on the source, in the state of a checkpoint."""

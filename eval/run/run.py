@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.anchors.dense import DenseEvidence
-from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
@@ -77,7 +76,7 @@ def run(
 def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
     """The frames that are left."""
     warm_up_job(job, progress)
-    row, metrics = job.row(folder.checkpoint), RunMetrics(UFM, folder.checkpoint.metrics)
+    row, metrics = job.row(folder.checkpoint), job.metrics(folder.checkpoint)
     stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=folder.checkpoint.position)
     with WriterThread([metrics, FrameRecorder(job, folder, metrics)]) as writer:
         stream.drive([writer, ProgressSink(progress, _skipped(folder))], stop=stop)
@@ -120,7 +119,7 @@ def _outputs(
         return {}
     for name, write in mixture_writers(job.ufm(folder.checkpoint)).items():
         write(folder.path / name)
-    write_json_atomic(folder.path / "curves.json", RunMetrics(UFM, folder.checkpoint.metrics).curves())
+    write_json_atomic(folder.path / "curves.json", job.metrics(folder.checkpoint).curves())
     made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json"))
     with_error = any(record["ground_truth"] for record in done) and not job.source.is_truth
     finished = Finished(folder.path, job.sequence, done, with_error)

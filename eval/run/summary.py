@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.eval.check.image_fit import DepthFit, depth_fit
-from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM, RunMetrics
+from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM
 from ufmstar_torch.eval.run import machine
 from ufmstar_torch.eval.run.files import to_json, write_json_atomic
 from ufmstar_torch.eval.run.job import RunJob
@@ -48,7 +48,7 @@ def write_summary(
     """
     checkpoint, records = folder.checkpoint, folder.records
     done = [record for record in records if record["state"] == "done"]
-    figures = RunMetrics(UFM, checkpoint.metrics).figures()
+    figures = job.metrics(checkpoint).figures()
     summary = {
         "program": RUN.program,
         "state": state,

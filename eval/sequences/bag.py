@@ -135,7 +135,7 @@ def detect(path: Path) -> bool:
 def _bag_path(path: Path) -> Path | None:
     if path.is_file():
         return path if path.suffix in _SUFFIXES else None
-    files = [p for p in path.iterdir() if any(end in p.suffixes for end in _SUFFIXES)] if path.is_dir() else []
+    files = [p for p in path.glob("*") if any(end in p.suffixes for end in _SUFFIXES)]
     if files and (path / _METADATA).is_file():
         return path
     return files[0] if len(files) == 1 and files[0].suffix in _SUFFIXES else None

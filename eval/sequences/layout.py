@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ufmstar_torch.eval.sequences import (
     arkitscenes,
@@ -22,6 +23,7 @@ from ufmstar_torch.eval.sequences import (
     transforms,
     tum,
 )
+from ufmstar_torch.eval.sequences.plugins import load_plugins
 
 # Each module has ``detect(path)``, ``read(path, options)`` and LOOKED_FOR, the files that it detects.
 READERS: dict[str, ModuleType] = {
@@ -40,47 +42,63 @@ READERS: dict[str, ModuleType] = {
     "arkitscenes": arkitscenes,
     "generic": generic,
 }
-LAYOUTS = ("auto", *READERS)
 # Folders within one another have one name: ROOT/chess/seq-01 is "chess__seq-01".
 _BETWEEN = "__"
 
 
-def layout_of(layout: str, path: Path, explicit: bool) -> str:
+def readers(plugin: Sequence[str] = ()) -> dict[str, Any]:
+    """The readers by layout, with those of installed packages and of the files ``plugin``. Raises FileNotFoundError,
+    ValueError: a plug-in cannot be used, or has the name of a layout."""
+    own = load_plugins(plugin).readers
+    if taken := [name for name in own if name in (*READERS, "auto")]:
+        raise ValueError(f"plug-ins: there is a reader {taken[0]!r} already: give yours another name")
+    return {**READERS, **own}
+
+
+def require_layout(layout: str, plugin: Sequence[str] = ()) -> None:
+    """Raises ValueError: no reader is called so."""
+    names = ("auto", *readers(plugin))
+    if layout not in names:
+        raise ValueError(f"layout must be one of {', '.join(names)}, got {layout!r}")
+
+
+def layout_of(layout: str, path: Path, explicit: bool, plugin: Sequence[str] = ()) -> str:
     """The layout by name, or detected for "auto". Raises ValueError: unknown, ambiguous, or not that of the path."""
+    require_layout(layout, plugin)
+    known = readers(plugin)
     if layout == "auto":
-        layout = detect_layout(path, explicit=explicit)
-    if layout not in READERS:
-        raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
-    if layout != "generic" and not READERS[layout].detect(path):
-        raise ValueError(f"{path} has not the layout {layout!r}: looked for {READERS[layout].LOOKED_FOR}")
+        layout = detect_layout(path, explicit, plugin)
+    if layout != "generic" and not known[layout].detect(path):
+        raise ValueError(f"{path} has not the layout {layout!r}: looked for {known[layout].LOOKED_FOR}")
     return layout
 
 
-def detect_layout(path: Path, explicit: bool = False) -> str:
+def detect_layout(path: Path, explicit: bool = False, plugin: Sequence[str] = ()) -> str:
     """The one layout whose files lie in ``path``; ``generic`` only where no other fits.
 
     Args:
         path: existing folder or video file.
         explicit: the user names the images or the trajectory, so that generic always fits.
+        plugin: files with readers of one's own.
 
     Raises:
         ValueError: none or several fit.
     """
-    fitting = layouts_of(path)
+    fitting = layouts_of(path, plugin)
     if not fitting and explicit:
         return "generic"
     if len(fitting) == 1:
         return fitting[0]
     if fitting:
         raise ValueError(f"{path} fits the layouts {', '.join(fitting)}: pass layout")
-    expected = "\n".join(f"  {name}: {reader.LOOKED_FOR}" for name, reader in READERS.items())
+    expected = "\n".join(f"  {name}: {reader.LOOKED_FOR}" for name, reader in readers(plugin).items())
     inside = sorted(p.name for p in path.iterdir())[:8] if path.is_dir() else [path.name]
     raise ValueError(f"{path} has no known layout. Looked for\n{expected}\nand found {inside}")
 
 
-def layouts_of(path: Path) -> list[str]:
+def layouts_of(path: Path, plugin: Sequence[str] = ()) -> list[str]:
     """The layouts whose files lie in ``path``, all of them; ``generic`` only where no other fits."""
-    fitting = [name for name, reader in READERS.items() if name != "generic" and reader.detect(path)]
+    fitting = [name for name, reader in readers(plugin).items() if name != "generic" and reader.detect(path)]
     return fitting or (["generic"] if generic.detect(path) else [])
 
 
@@ -99,7 +117,9 @@ class Found(NamedTuple):
     layout: str
 
 
-def find_sequences(root: str | Path, max_depth: int = 4, layout: str = "auto") -> list[Found]:
+def find_sequences(
+    root: str | Path, max_depth: int = 4, layout: str = "auto", plugin: Sequence[str] = ()
+) -> list[Found]:
     """All sequences at or below ``root``, sorted by name.
 
     A folder that is a sequence is not looked into, so that its own folders of images are none. Each folder on disk
@@ -110,6 +130,7 @@ def find_sequences(root: str | Path, max_depth: int = 4, layout: str = "auto") -
         root: folder, or the file of one sequence.
         max_depth: levels of folders below ``root`` that are looked at, at least 0.
         layout: the only layout to look for; "auto": any.
+        plugin: files with readers of one's own.
 
     Returns:
         The sequences; empty where there is none.
@@ -123,8 +144,7 @@ def find_sequences(root: str | Path, max_depth: int = 4, layout: str = "auto") -
         raise FileNotFoundError(f"root: no such file or folder: {root}")
     if max_depth < 0:
         raise ValueError(f"max_depth must be at least 0, got {max_depth}")
-    if layout not in LAYOUTS:
-        raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
+    require_layout(layout, plugin)
     found: list[Found] = []
     seen: set[Path] = set()
     waiting = [(root, max_depth)]
@@ -133,7 +153,7 @@ def find_sequences(root: str | Path, max_depth: int = 4, layout: str = "auto") -
         if path.resolve() in seen:
             continue
         seen.add(path.resolve())
-        fitting = [name for name in layouts_of(path) if layout in ("auto", name)]
+        fitting = [name for name in layouts_of(path, plugin) if layout in ("auto", name)]
         if len(fitting) > 1:
             raise ValueError(f"{path} fits the layouts {', '.join(fitting)}: pass layout")
         if fitting:

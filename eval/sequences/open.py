@@ -10,7 +10,7 @@ from typing import Any
 from ufmstar_torch.eval.sequences import tum
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.images import within
-from ufmstar_torch.eval.sequences.layout import READERS, layout_of
+from ufmstar_torch.eval.sequences.layout import layout_of, readers
 from ufmstar_torch.eval.sequences.lens import OWN, parse_distortion, undistort
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
@@ -43,8 +43,8 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
     Args:
         path: the sequence's folder, a video file, or ``tour:SEED`` with the options of a rendered tour in its name.
         layout: ``auto``, ``tum``, ``7scenes``, ``scannet``, ``sens``, ``tartanair``, ``kitti360``, ``nyu``, ``colmap``,
-            ``transforms``, ``euroc``, ``bag``, ``stray``, ``arkitscenes`` or
-            ``generic``.
+            ``transforms``, ``euroc``, ``bag``, ``stray``, ``arkitscenes``,
+            ``generic``, or one of a plug-in.
         poses: how they are written: ``camera-to-world`` (x right, y down, z forward), ``world-to-camera``, ``ned``
             (camera-to-world, x forward, y right, z down) or ``opengl`` (x right, y up, z backward); what is
             customary for a layout (TartanAir's NED) is known.
@@ -72,12 +72,13 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
     chosen = Options(**options)
     if poses not in CONVENTIONS:
         raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
-    layout = layout_of(layout, path, explicit=chosen.images is not None or chosen.trajectory is not None)
-    chosen.reject(layout, *_REFUSED[layout].split(), *(("drive", "scans") if layout != "kitti360" else ()))
+    explicit = chosen.images is not None or chosen.trajectory is not None
+    layout = layout_of(layout, path, explicit, chosen.plugin)
+    chosen.reject(layout, *_REFUSED.get(layout, "").split(), *(("drive", "scans") if layout != "kitti360" else ()))
     chosen.reject(layout, *(("topics",) if layout != "bag" else ()))
     if chosen.trajectory is None and layout != "generic":
         chosen.reject(layout, "fps")
-    sequence = READERS[layout].read(path, chosen)
+    sequence = readers(chosen.plugin)[layout].read(path, chosen)
     if chosen.distortion is not None:
         own = chosen.distortion in (OWN, (OWN,), [OWN])
         if own and layout != "tum":

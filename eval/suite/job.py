@@ -12,8 +12,10 @@ import torch
 from ufmstar_torch.eval.engine.evaluate import Judge
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.methods.method import FUSIONS
 from ufmstar_torch.eval.methods.suite import Suite
 from ufmstar_torch.eval.run.machine import hardware, versions
+from ufmstar_torch.eval.sequences.plugins import load_plugins
 from ufmstar_torch.eval.suite.cache import PredictionCache
 from ufmstar_torch.eval.suite.folder import CACHE
 from ufmstar_torch.eval.suite.work_items import WorkItem
@@ -37,6 +39,7 @@ class EvalJob:
     device: str = "cpu"  # "cpu", "cuda", "cuda:1"
     bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
     examples: int = 3  # of each data set, sequences of which a few frames are stored for pictures
+    plugin: tuple[str, ...] = ()  # files with methods and metrics of one's own
     samples: int | None = None  # passes of MC-Dropout
     # runtime, precision: of the networks (``Inference``).
     runtime: str = "auto"
@@ -60,7 +63,7 @@ class EvalJob:
         """How sequences are judged by the loaded networks. Raises CacheError: the folder of predictions cannot be
         written."""
         store = PredictionCache(self.cache or self.out / CACHE)
-        return Judge(networks, device, store, self.frames, self.bins)
+        return Judge(networks, device, store, self.frames, self.bins, load_plugins(self.plugin))
 
     def about(self, networks: Mapping[str, DepthSource]) -> dict[str, Any]:
         """The content of eval.json."""
@@ -85,6 +88,17 @@ class EvalJob:
         """Whether the sequence is one of the first of its data set, from which pictures are drawn."""
         same = [other for other in self.items if other.dataset == item.dataset]
         return item in same[: self.examples]
+
+
+def require_methods(suite: Suite, plugin: Sequence[str]) -> None:
+    """Raises ValueError: a row's method is neither of this package nor of a plug-in, or its cost is to be measured."""
+    own = load_plugins(plugin).methods
+    for row in suite.rows:
+        fusion = row.method.fusion
+        if fusion not in FUSIONS and (fusion not in own or suite.efficiency):
+            known = f"there are {', '.join(own)}" if own else "--plugin FILE.py adds yours"
+            why = "the cost of a method of one's own is not measured" if fusion in own else known
+            raise ValueError(f"suite {suite.name}: row {row.method.name}: {why}")
 
 
 def with_recalibrations(suite: Suite, files: Sequence[str]) -> Suite:

@@ -92,6 +92,7 @@ def find_work(
     seed: int = 0,
     only: Iterable[str] | None = None,
     layout: str = "auto",
+    plugin: Sequence[str] = (),
 ) -> list[WorkItem]:
     """All sequences below the roots, sorted.
 
@@ -102,13 +103,14 @@ def find_work(
         seed: of the sample: the same names give the same sample, wherever they lie.
         only: names of sequences (or DATASET/NAME) to take, instead of all; the sample is drawn from them.
         layout: the only one to look for; "auto": any.
+        plugin: files with readers of one's own.
 
     Raises:
         FileNotFoundError: no such root.
         ValueError: no sequence below a root, a name in ``only`` that is not there, one name twice in a data set, a
             sample below 1.
     """
-    items = sorted({item for root in roots for item in _below(root, layout)})
+    items = sorted({item for root in roots for item in _below(root, layout, plugin)})
     twice = [key for key, n in Counter(item.folder for item in items).items() if n > 1]
     if twice:
         paths = ", ".join(item.path for item in items if item.folder == twice[0])
@@ -152,7 +154,7 @@ def content_digest(sequence: FrameSequence) -> str:
     return digest.hexdigest()
 
 
-def _below(root: str, layout: str) -> list[WorkItem]:
+def _below(root: str, layout: str, plugin: Sequence[str]) -> list[WorkItem]:
     """The sequences of one root."""
     match = _ROOT.fullmatch(root)
     dataset, path = (match["dataset"], match["path"]) if match else (None, root)
@@ -160,7 +162,7 @@ def _below(root: str, layout: str) -> list[WorkItem]:
         return [WorkItem(dataset or TOUR, path, path, "auto")]
     from ufmstar_torch.eval.sequences.layout import find_sequences
 
-    sequences = find_sequences(path, layout=layout)
+    sequences = find_sequences(path, layout=layout, plugin=plugin)
     if not sequences:
         raise ValueError(f"--root {root}: no sequence of a known layout is there or below")
     return [WorkItem(dataset or f.layout, f.name, str(f.path.absolute()), f.layout) for f in sequences]
