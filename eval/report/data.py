@@ -298,7 +298,7 @@ def _compute(total: Sums, file: Path) -> Merged:
     kinds = {key.split(".")[1] for key in states if key.startswith("metrics.")}
     many = "NLL" in kinds and states["metrics.ECEDelta.pixels"].numel() == 100
     bins = "authors" if many else "ours"
-    metrics = SequenceMetrics(with_variance="NLL" in kinds, ranking="Sparsification" in kinds, bins=bins)
+    metrics = SequenceMetrics(with_variance="NLL" in kinds, bins=bins)
     by_error = {name: NLLByError() for name in total if name != METRICS}
     try:
         metrics.load_state_dict({key: value for key, value in states.items() if not key.startswith("metrics.own_")})
