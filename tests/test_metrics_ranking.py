@@ -87,7 +87,7 @@ class TestRanking:
 
     def test_nll_by_error_is_that_of_sorted_pixels(self) -> None:
         d, v, g = maps(300, 400)
-        got = figures(NLLByError(percentiles=10), d, v, g)
+        got = figures(NLLByError(), d, v, g)
         error = (d - g).abs().numpy().ravel()
         nll = -stats.norm.logpdf(g.numpy(), d.numpy(), v.sqrt().numpy()).ravel()
         groups = np.array_split(np.argsort(error), 10)
@@ -100,8 +100,8 @@ class TestRanking:
     def test_nll_by_error_over_confident_pixels(self) -> None:
         d, v, g = maps(100, 100)
         sure = v.sqrt() <= 0.2
-        got = figures(NLLByError(4), d, v, g, sure)["nll_by_error"]
-        np.testing.assert_array_equal(got, figures(NLLByError(4), d[sure], v[sure], g[sure])["nll_by_error"])
+        got = figures(NLLByError(), d, v, g, sure)["nll_by_error"]
+        np.testing.assert_array_equal(got, figures(NLLByError(), d[sure], v[sure], g[sure])["nll_by_error"])
 
     @given(st.floats(0, 1e9))
     def test_log_bins_rise(self, value: float) -> None:

@@ -76,7 +76,7 @@ class DataConfig(Checked):
             try, to tours that training has never seen.
         tour_frames: frames of each tour.
         tour_stride: steps of the walk between two frames; a step is about 12 cm or 5 degrees.
-        tour_style: "home", "hall", "mixed" or "blank".
+        tour_style: "home", "hall", "mixed", "blank" or "scales".
         tour_size: (height, width) [px] of the rendered frames.
         tour_fov: horizontal field of view [degrees].
         cache: folder for rendered tours; empty = the user's cache folder.

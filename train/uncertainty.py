@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.figures_curves import write_curves
 from ufmstar_torch.eval.sequences import FrameSequence, open_sequence
 from ufmstar_torch.models.any_network import wrap_network
-from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.network import DepthNetwork, in_eval_mode
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.networks_in_turn import NetworksInTurn
 
@@ -71,7 +70,7 @@ def judge_network(
         raise ValueError(f"sequences and rows must hold {expected}, got {len(sequences)} and {list(rows)}")
     depth = network if isinstance(network, DepthNetwork) else wrap_network(network, preprocess=preprocess)
     where, totals = torch.device(device), dict[str, SequenceMetrics]()
-    with _evaluated(depth), torch.no_grad():
+    with in_eval_mode(depth):
         source = NetworkSource(NetworksInTurn([depth], preprocess=depth.preprocess), where, {})
         judge = Judge({_BASE: source}, where, limit=slice(frames))
         for sequence in sequences:
@@ -130,15 +129,3 @@ class UncertaintyCallback(pl.Callback):
             folder.mkdir(parents=True, exist_ok=True)
             title = f"epoch {trainer.current_epoch}, step {trainer.global_step}"
             write_curves(folder / f"epoch_{trainer.current_epoch}.png", curves, title=title)
-
-
-@contextmanager
-def _evaluated(network: nn.Module) -> Iterator[None]:
-    """The network in eval mode, and then each part in its own again."""
-    modes = {part: part.training for part in network.modules()}
-    network.eval()
-    try:
-        yield
-    finally:
-        for part, mode in modes.items():
-            part.training = mode

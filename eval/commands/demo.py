@@ -38,9 +38,12 @@ class DemoOptions:
         overwrite: replace an earlier demo there
         frames: number of frames of the walk through the rooms
         seed: of the rooms; the networks were trained on others
-        weights: other trained networks (.safetensors of `ufmstar train`)
+        weights: other trained networks (.safetensors of `ufmstar train`); with --onboard also a FastDepth (.onnx,
+            .tflite)
+        onboard: live instead, as on a small robot: one network, quantised, at 30 images/s among things of many sizes
+        seconds: of --onboard
         device: cpu, cuda or cuda:N
-        threads: number of CPU threads; default: all cores
+        threads: number of CPU threads; default: all cores, with --onboard but one
         debug: show tracebacks
     """
 
@@ -49,6 +52,8 @@ class DemoOptions:
     frames: int = 72
     seed: int = 100_003
     weights: Path | None = None
+    onboard: bool = False
+    seconds: float = 120.0
     device: str = "cpu"
     threads: int | None = None
     debug: bool = False
@@ -58,6 +63,10 @@ class DemoOptions:
             raise ValueError(f"--frames must be at least 2, got {self.frames}: one view has nothing to disagree with")
         if self.seed < 0:
             raise ValueError(f"--seed must be at least 0, got {self.seed}")
+        if not 1 <= self.seconds < float("inf"):
+            raise ValueError(f"--seconds must be at least 1, got {self.seconds}")
+        if self.onboard and self.device != "cpu":
+            raise ValueError(f"--onboard runs on the CPU, got --device {self.device}")
 
 
 read = reader(DemoOptions, "ufmstar demo")
@@ -66,14 +75,17 @@ read = reader(DemoOptions, "ufmstar demo")
 def main(options: DemoOptions) -> int:
     """Run the demo, and print its table; the exit code."""
     from ufmstar_torch.eval.commands.terminal import Bars
-    from ufmstar_torch.eval.report.text import demo_explanation, demo_table
+    from ufmstar_torch.eval.report.text import demo_explanation, demo_table, onboard_table
     from ufmstar_torch.eval.run.folder import FolderError
 
     try:
         with Bars() as bars:
-            summary = run_demo(options, bars.show)
+            summary = (run_onboard_demo if options.onboard else run_demo)(options, bars.show)
     except (FileNotFoundError, FolderError) as error:
         raise UsageError(error) from error
+    if options.onboard:
+        print(onboard_table(summary))
+        return 0
     print(demo_table(summary), demo_explanation(summary), sep="\n\n")
     return 0
 
@@ -148,6 +160,30 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     progress(Progress("pictures", 1, 1))
     plain: dict[str, Any] = to_json(summary)
     return plain
+
+
+def run_onboard_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda _: None) -> dict[str, Any]:
+    """Run ``--onboard`` into the folder; the content of summary.json. Raises FolderError, FileNotFoundError: as
+    :func:`run_demo`; ValueError, ModuleNotFoundError: as ``run_onboard``."""
+    from ufmstar_torch.eval.bench.onboard import GRAPH, PICTURE, run_onboard
+    from ufmstar_torch.eval.run.files import to_json, write_json_atomic
+    from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
+    from ufmstar_torch.eval.run.machine import hardware, share_threads
+    from ufmstar_torch.eval.run.summary import versions
+
+    if options.threads is None:
+        share_threads()
+    kind = FolderKind(
+        program="ufmstar demo --onboard", noun="demo", manifest="summary.json", clear=remover(GRAPH, PICTURE)
+    )
+    OutputFolder.open(options.out, kind, {}, overwrite=options.overwrite).close()
+    with _weights(options.weights) as file:
+        measured = run_onboard(options.out, file, options.seconds, options.seed, progress)
+    settings = {name: value for name, value in as_dict(options).items() if name not in ("debug", "frames", "device")}
+    about = {"program": kind.program, "out": str(options.out), "settings": settings}
+    summary: dict[str, Any] = to_json(about | measured | {"hardware": hardware(), "versions": versions()})
+    write_json_atomic(options.out / "summary.json", summary)
+    return summary
 
 
 def _networks(weights: Path | None, device: torch.device) -> tuple[NetworkSource, tuple[int, int], dict[str, Any]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig
-from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.opening import SequenceOptions
 from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, reader
 from ufmstar_torch.eval.sequences.frame import parse_slice
 
@@ -30,8 +30,10 @@ class SuiteOptions:
         suite: name of a suite (see --list), or a TOML file of your own
         base: the network that a figure or ablation is about, instead of the paper's: depth_only, ...
         ufm_preset: settings of UfM* in all its rows, instead of the suite's: paper (UfMStarConfig.paper) or default
-        network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable. With
-            paper-table-1, -2 and -4 a base may have a second one, whose time, energy and memory are measured as well
+        network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable. A FILE.json
+            is its spec. With paper-table-1, -2 and -4 a base may have a second one, whose time, energy and memory are
+            measured as well
+        spec: JSON file that declares what the weights of the networks without one do not say, as of ufmstar run
         samples: passes of MC-Dropout of a row that needs all of them; default: 10
         runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
         precision: of the networks; bf16: torch's autocast
@@ -44,6 +46,7 @@ class SuiteOptions:
     base: str | None = None
     ufm_preset: str | None = option(None, choices=PRESETS)
     network: tuple[str, ...] = option((), repeat=True)
+    spec: str | None = None
     samples: int | None = None
     runtime: str = option("auto", choices=("auto", "torch", "onnx"))
     precision: str = option("float32", choices=("float32", "bf16"))
@@ -123,7 +126,7 @@ class EvalOptions:
     debug: bool = False
     what: SuiteOptions
     data: DataOptions
-    opening: OpeningOptions
+    opening: SequenceOptions
     output: EvalOutputOptions
 
     def __post_init__(self) -> None:
@@ -177,7 +180,9 @@ def job_from(options: EvalOptions) -> EvalJob:
     suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), what.recalibration)
     require_methods(suite, options.opening.plugin)
     architectures: list[dict[str, NetworkChoice]] = [{}]
-    for choice in map(NetworkChoice.parse, what.network):  # a base's n-th network belongs to the n-th architecture
+    for choice in (
+        NetworkChoice.parse(text).with_spec(what.spec) for text in what.network
+    ):  # a base's n-th network belongs to the n-th architecture
         number = sum(choice.base in known for known in architectures)
         architectures += [{}] if number == len(architectures) else []
         architectures[number][choice.base] = choice

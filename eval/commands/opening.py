@@ -1,4 +1,4 @@
-"""The options of opening sequences: one vocabulary for ``data check``, ``run`` and ``eval``."""
+"""The options of opening sequences, which ``data check``, ``run``, ``eval`` and others share."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ _TRUTH = {"truth": "depth", "truth_scale": "depth_scale"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class OpeningOptions:
+class SequenceOptions:
     """How sequences are opened.
 
     Attributes:
         layout: as docs/data.md names it; auto: by its files
         intrinsics: of the images: a file, or fx fy cx cy [px]
         distortion: to undo: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or own (TUM RGB-D's)
+        depth_intrinsics: of the sequence's own depth maps: a file, or fx fy cx cy [px]
         truth_scale: metres per unit of the sequence's own depth
         max_truth: largest ground truth [m]
         trajectory: poses (TUM or KITTI) for the layout's own
@@ -29,14 +30,21 @@ class OpeningOptions:
         fps: frames per second of images without timestamps
         time_offset: added to image times [s]
         max_pose_gap: poses are interpolated over at most so long [s]
+        max_time_difference: largest, between a colour image and its depth map [s]
+        images: of a generic sequence: folder, or video file
+        truth: folder of the ground-truth depth maps of a generic sequence
+        register: leave 7-Scenes' depth in its own camera
+        T_color_depth: 7-Scenes: file, 4x4 from depth to colour camera [m]
         topics: of a ROS bag; a pose's with =FRAME, the frame that it moves
-        plugin: Python files with READERS (eval: also METHODS, METRICS)
+        drive: KITTI-360: name or number of a drive below the root
         scans: KITTI-360: also scans of so many frames around
+        plugin: Python files with READERS (eval: also METHODS, METRICS)
     """
 
     layout: str = "auto"
     intrinsics: tuple[str, ...] = ()
     distortion: tuple[str, ...] = ()
+    depth_intrinsics: tuple[str, ...] = ()
     truth_scale: float | None = None
     max_truth: float | None = None
     trajectory: str | None = None
@@ -45,47 +53,21 @@ class OpeningOptions:
     fps: float | None = None
     time_offset: float = 0.0
     max_pose_gap: float = 0.1
+    max_time_difference: float = 0.02
+    images: str | None = None
+    truth: str | None = None
+    register: bool = True
+    T_color_depth: str | None = None
     topics: tuple[str, ...] = ()
-    plugin: tuple[str, ...] = ()
+    drive: str | None = None
     scans: int | None = None
+    plugin: tuple[str, ...] = ()
 
     def given(self) -> dict[str, Any]:
-        """The arguments of ``open_sequence`` that differ from its defaults."""
+        """The arguments of ``open_sequence`` that differ from its defaults, as plain values. Raises ValueError:
+        intrinsics are neither a file nor four numbers."""
         changed = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
         for name in ("intrinsics", "depth_intrinsics"):
             if name in changed:
                 changed[name] = parse_intrinsics(changed[name], f"--{name.replace('_', '-')}")
-        return {_TRUTH.get(name, name): value for name, value in changed.items()}
-
-
-@dataclass(frozen=True, kw_only=True)
-class SequenceOptions(OpeningOptions):
-    """How the sequence is opened.
-
-    Attributes:
-        depth_intrinsics: of the sequence's own depth maps: a file, or fx fy cx cy [px]
-        images: of a generic sequence: folder, or video file
-        truth: folder of the ground-truth depth maps of a generic sequence
-        max_time_difference: largest, between a colour image and its depth map [s]
-        register: leave 7-Scenes' depth in its own camera
-        T_color_depth: 7-Scenes: file, 4x4 from depth to colour camera [m]
-        drive: KITTI-360: name or number of a drive below the root
-    """
-
-    depth_intrinsics: tuple[str, ...] = ()
-    images: str | None = None
-    truth: str | None = None
-    max_time_difference: float = 0.02
-    register: bool = True
-    T_color_depth: str | None = None
-    drive: str | None = None
-
-    def given(self) -> dict[str, Any]:
-        """The arguments of ``open_sequence`` that differ from its defaults. Raises OSError, ValueError: intrinsics are
-        neither a file nor four numbers, or a matrix file is missing or no 4x4 matrix."""
-        from ufmstar_torch.eval.sequences.poses import read_pose
-
-        changed = super().given()
-        if self.T_color_depth is not None:
-            changed["T_color_depth"] = read_pose(self.T_color_depth)
-        return changed
+        return {_TRUTH.get(name, name): list(v) if isinstance(v, tuple) else v for name, v in changed.items()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +73,14 @@ class NetworkChoice:
         if not (base and equals and model):
             raise ValueError(f"a network must be given as {_FORM}, got {text!r}")
         return cls(base, model, tuple(file for file in files.split(",") if file), label)
+
+    def with_spec(self, spec: str | None) -> NetworkChoice:
+        """The choice with that spec, unless it has one, or needs none as the sequence's own depth."""
+        if spec is None or self.spec is not None or self.model == TRUTH:
+            return self
+        if not spec.endswith(".json"):
+            raise ValueError(f"--spec must be a file *.json, got {spec!r}")
+        return replace(self, files=(*self.files, spec))
 
     @property
     def weights(self) -> tuple[str, ...]:

@@ -107,28 +107,20 @@ class NLLByError(SumMetric):
 
     The paper looks at pixels where another method is confident: pass these as ``valid``, and the same
     ones for every method that is compared.
-    ``compute()``: curve [percentiles] ``nll_by_error``, mean NLL over v > 0 of the pixels between one percentile and
+    ``compute()``: curve [10] ``nll_by_error``, mean NLL over v > 0 of the pixels between one decile and
     the next, NaN without a pixel. Errors that agree within a bin (4096 bins of squared error: .35 % of the error)
     count as equal.
-
-    Args:
-        percentiles: number of groups of equal size; 10 = deciles.
-        bins: of the logarithm of the squared error.
     """
 
     OF_VARIANCE = "NLL by error"
     ADD = add_nll_by_error
 
-    def __init__(self, percentiles: int = 10, bins: int = 4096, **kwargs: Any) -> None:
-        if min(percentiles, bins) < 1:
-            raise ValueError(f"percentiles and bins must be >= 1, got {percentiles} and {bins}")
-        super().__init__({"percentiles": percentiles, "bins": bins}, **kwargs)
-        self.percentiles = percentiles
-        self.add_counts("count", shape=(bins + 2,))
-        self.add_sums("nll", shape=(bins + 2,))
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_counts("count", shape=(BINS + 2,))
+        self.add_sums("nll", shape=(BINS + 2,))
 
     def compute(self) -> dict[str, Tensor]:
-        steps = torch.arange(1, self.percentiles + 1, dtype=torch.float64, device=self.count.device)
-        kept = steps / self.percentiles
+        kept = torch.arange(1, 11, dtype=torch.float64, device=self.count.device) / 10
         upto = mean_of_share(self.count, self.nll, kept) * kept
-        return {"nll_by_error": torch.diff(upto, prepend=upto.new_zeros(1)) * self.percentiles}
+        return {"nll_by_error": torch.diff(upto, prepend=upto.new_zeros(1)) * 10}

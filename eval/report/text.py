@@ -22,6 +22,7 @@ NLL_OF_FEW = 100.0
 _CALIBRATION = {"nll": "NLL", "ece_delta": "ECE_delta", "ece_q": "ECE_q"}
 _DEMO_COLUMNS = {"delta1": "delta1", **_CALIBRATION, "ause_rmse": "AUSE [m]"}
 _RUN_COLUMNS = {"delta1": "delta1", "abs_rel": "AbsRel", "rmse": "RMSE [m]", **_CALIBRATION, "spearman": "Spearman"}
+_TARGET_MS, _TARGET_LOST = 50.0, 0.01  # of the demo on board
 _CALIBRATED = 4.0  # mean z^2 of held-out anchors, and its inverse: sigma is right to a factor of two
 _UNSUPPORTED = "mean sigma not shown: neither truth nor held-out anchors (--posterior) support it"
 # The counts of a frame's anchors by their source: how many have a depth, and of how many.
@@ -178,6 +179,29 @@ def _anchor_lines(summary: Mapping[str, Any]) -> list[str]:
     rest = f"without anchors: {before + later} of {frames} frames ({why})"
     rest += f"; {before} before the first anchors: plain UfM*" if before else ""
     return [line, rest + (f"; {later} later: with what was learnt before" if later else "")]
+
+
+def onboard_table(summary: Mapping[str, Any]) -> str:
+    """The real-time table of ``ufmstar demo --onboard``, its target, and what disagreement adds."""
+    measured, network = summary["realtime"], summary["network"]
+    lines = [realtime_table(measured)]
+    latency = measured["latency_ms"] or {}
+    met = latency.get("p99", math.inf) < _TARGET_MS and (measured["lost_share"] or 0) < _TARGET_LOST
+    words = f"p99 below {_TARGET_MS:g} ms and less than {100 * _TARGET_LOST:g} % lost at 30 images/s"
+    lines.append(f"target, {words}: {'met' if met else 'missed'} (load average {number(summary['load_average'])})")
+    if shift := network.get("depth_shift"):
+        lines.append(
+            f"{network['quantised']}: depth shifted by {100 * shift['median']:.2g} % in the median, "
+            f"{100 * shift['p99']:.2g} % at most for 99 % of the pixels"
+        )
+    if found := summary.get("contrast"):
+        m = {name: number(value) for name, value in found.items()}
+        lines.append(
+            f"where the aleatoric variance is low: RMSE {m['rmse_high']} m at high disagreement "
+            f"({100 * found['share']:.0f} % of the pixels; aleatoric sigma {m['own_sigma_high']} m, sqrt(M) "
+            f"{m['disagreement_high']} m), {m['rmse_low']} m elsewhere"
+        )
+    return "\n".join([*lines, f"{summary['out']}: summary.json{', onboard.png' if found else ''}"])
 
 
 def realtime_table(summary: Mapping[str, Any]) -> str:

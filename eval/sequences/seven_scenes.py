@@ -22,7 +22,8 @@ from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence,
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
 from ufmstar_torch.eval.sequences.images import depth_size, first_image_size, natural_key, read_map
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
-from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.options import Options, resolve
+from ufmstar_torch.eval.sequences.poses import read_pose
 
 LOOKED_FOR = "frame-NNNNNN.pose.txt files"
 _NATIVE_SIZE = (480, 640)
@@ -62,6 +63,8 @@ def read(path: Path, options: Options) -> FrameSequence:
     K_color = camera_matrix(options.intrinsics, pinhole(*_K_COLOR), _NATIVE_SIZE, color_size)
     K_depth = camera_matrix(options.depth_intrinsics, pinhole(*_K_DEPTH), _NATIVE_SIZE, own_size)
     T_color_depth = _T_COLOR_DEPTH if options.T_color_depth is None else options.T_color_depth
+    if not isinstance(T_color_depth, np.ndarray):
+        T_color_depth = read_pose(resolve(path, T_color_depth))
     if options.register:
         cameras = K_depth, K_color, T_color_depth, color_size
         frames = [_registered(frame, *cameras) if isinstance(frame, Entry) else frame for frame in frames]

@@ -25,8 +25,8 @@ _KEPT = 4  # rendered frames kept, so that a frame's image and depth come from o
 def open_tour(name: str) -> FrameSequence:
     """The tour of a name.
 
-    Options: ``style`` (home, hall, mixed, blank), ``frames``, ``size`` (HxW), ``fov`` (degrees), ``path`` (seed of the
-    way), ``pan`` (1: the camera turns in place) and ``sensor`` (1, or 0 for a perfect camera).
+    Options: ``style`` (home, hall, mixed, blank, scales), ``frames``, ``size`` (HxW), ``fov`` (degrees), ``path`` (seed
+    of the way), ``pan`` (1: the camera turns in place) and ``sensor`` (1, or 0 for a perfect camera).
 
     Raises:
         ValueError: another form, an unknown option, or a value that it does not take.
@@ -66,7 +66,7 @@ def tour_sequence(
         seed: of the rooms, see :func:`make_tour`.
         frames: at least 1.
         size: (H, W) of images and depth maps.
-        style: ``home``, ``hall``, ``mixed`` or ``blank``.
+        style: ``home``, ``hall``, ``mixed``, ``blank`` or ``scales``.
         fov: horizontal field of view [degrees], 20 to 120.
         path_seed, pan: see :func:`tour_path`.
         sensor: whether images have a sensor's exposure, vignetting and noise.

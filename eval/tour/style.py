@@ -2,7 +2,8 @@
 
 ``home`` is the distribution that a network can be trained on; ``hall`` lies outside of it: larger rooms and
 things, darker and colder light, and textures that no home has. ``mixed`` begins at home and ends in a hall. ``blank``
-is a home of plain surfaces, full of furniture: most walls and floors show nothing to measure.
+is a home of plain surfaces, full of furniture: most walls and floors show nothing to measure. ``scales`` is a hall
+with furniture from a doll's size to the usual one.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ MIXED = TourStyle(
     last=replace(HALL, rooms=(1, 1), room_size=(7.0, 9.0), ceiling=(3.6, 4.6), scale=(1.4, 1.7), furniture=0.22),
 )
 BLANK = replace(HOME, name="blank", textures=("plain",) * 4 + ("stripes", "books", "painting", "window"), furniture=0.9)
-STYLES = {"home": HOME, "hall": HALL, "mixed": MIXED, "blank": BLANK}
+SCALES = replace(HALL, name="scales", scale=(0.25, 1.2), furniture=0.4)
+STYLES = {"home": HOME, "hall": HALL, "mixed": MIXED, "blank": BLANK, "scales": SCALES}
 
 
 def style_of(style: str) -> TourStyle:

@@ -70,7 +70,7 @@ def make_tour(seed: int, style: str = "home") -> Tour:
 
     Args:
         seed: at least 0.
-        style: ``home``, ``hall``, ``mixed`` or ``blank``.
+        style: ``home``, ``hall``, ``mixed``, ``blank`` or ``scales``.
 
     Raises:
         ValueError: a negative seed, or no such style.

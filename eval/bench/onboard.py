@@ -1,0 +1,207 @@
+"""The paper's last demonstration: a quantised FastDepth with an aleatoric head, live, among things of varying scale.
+
+Section "System demonstration": UfM* in real time on two cores, and disagreement that is high where the aleatoric
+variance is low.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.eval.engine.progress import Progress
+from ufmstar_torch.eval.engine.realtime import RealTime
+from ufmstar_torch.eval.engine.warm_up import warm_up_command
+from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
+from ufmstar_torch.eval.run.machine import load_average
+from ufmstar_torch.eval.run.panels import Bar, GridRow, Panel, draw_grid
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence, in_memory
+from ufmstar_torch.eval.sequences.ground_truth import truth_at
+from ufmstar_torch.eval.sequences.images import image_tensor
+from ufmstar_torch.eval.tour import tour_sequence
+from ufmstar_torch.live import LiveDepth, LiveResult
+from ufmstar_torch.models.load import load_network
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.quantise import quantise
+from ufmstar_torch.models.trained import load_trained
+from ufmstar_torch.pipeline import UncertainDepth
+
+FPS = 30.0
+GRAPH, PICTURE = "onboard_int8.onnx", "onboard.png"
+_PATH, _WALKED = 900, 300  # frames of the whole way, at a walking pace; and of the part that is gone to and fro
+_CALIBRATION = 24  # images of another tour, for the ranges of the activations
+_SIZES = {(160, 224): (160, 224)}  # of the images, by that of the network's input; else a VGA camera's half
+_HALF_VGA = (240, 320)
+_ROWS, _MARKED = 4, np.array([0, 213, 255])
+Report = Callable[[Progress], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Contrast:
+    """A frame's maps [h, w]: sigma of the network, sqrt(M), |error| [m], and where M is among its upper quarter while A
+    is in its lower half."""
+
+    image: NDArray[np.uint8]
+    own: NDArray[np.float32]
+    disagreement: NDArray[np.float32]
+    error: NDArray[np.float32]
+    usable: NDArray[np.bool_]
+
+    @property
+    def high(self) -> NDArray[np.bool_]:
+        """Where disagreement is in the frame's upper quarter."""
+        limit = np.quantile(self.disagreement[self.usable], 0.75) if self.usable.any() else math.inf
+        return self.usable & (self.disagreement > limit)
+
+    @property
+    def sure(self) -> NDArray[np.bool_]:
+        """Where the network's own variance is in the frame's lower half."""
+        limit = np.quantile(self.own[self.usable], 0.5) if self.usable.any() else -math.inf
+        return self.usable & (self.own <= limit)
+
+
+def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: Report) -> dict[str, Any]:
+    """Run live for some seconds, then judge the frames, and draw the picture.
+
+    Args:
+        out: folder, for the quantised graph and the picture.
+        weights: networks of ``ufmstar train``, of which the first is quantised; or a FastDepth (.onnx, .tflite) as it
+            is.
+        seconds: of 30 images each.
+        seed: of the rooms.
+        progress: called after every step.
+
+    Raises:
+        FileNotFoundError, ValueError, ModuleNotFoundError: the network cannot be loaded or quantised.
+    """
+    network, about = _network(weights, out, seed)
+    h, w = network.preprocess.size or _HALF_VGA
+    way = tour_sequence(seed, frames=_PATH, size=_SIZES.get((h, w), _HALF_VGA), style="scales")
+    part = replace(way, entries=way.entries[:_WALKED])
+    sequence = in_memory(part, lambda done: progress(Progress("rooms", done, _WALKED)))
+    config, cpu = UfMStarConfig(on_bad_frame="skip"), torch.device("cpu")
+    warm_up_command(config, cpu, lambda done, total: progress(Progress("kernels", done, total)))
+    model = UncertainDepth(network, config, preprocess=network.preprocess)
+    summary = {"network": about, "realtime": _live(model, sequence, seconds, progress), "load_average": load_average()}
+    contrasts = _contrasts(UncertainDepth(network, config, preprocess=network.preprocess), sequence)
+    if contrasts:
+        summary["contrast"] = contrast_figures(contrasts)
+        draw_contrasts(out / PICTURE, contrasts)
+    return summary
+
+
+def _network(weights: Path, out: Path, seed: int) -> tuple[DepthNetwork, dict[str, Any]]:
+    """The network, and its description with the depth shift of quantisation."""
+    threads = torch.get_num_threads()
+    if weights.suffix in (".onnx", ".tflite"):
+        return load_network("fastdepth", weights, threads=threads), {"file": weights.name, "threads": threads}
+    network = load_trained(weights)[0]
+    size = network.preprocess.size or _HALF_VGA
+    others = tour_sequence(seed + 1, frames=2 * _CALIBRATION, size=size, style="mixed")
+    inputs = [_input(network, frame) for frame in others]
+    graph = quantise(network, inputs[::2], out / GRAPH, threads=threads)
+    with torch.no_grad():
+        pairs = [(network(x).depth, graph(x).depth) for x in inputs[1::2]]
+    shift = torch.cat([((b - a).abs() / a).flatten() for a, b in pairs])
+    levels = torch.tensor([0.5, 0.99])
+    about = dict(zip(("median", "p99"), shift.quantile(levels).tolist(), strict=True))
+    return graph, {"file": weights.name, "quantised": "int8, ONNX Runtime", "threads": threads, "depth_shift": about}
+
+
+def _input(network: DepthNetwork, frame: Frame) -> torch.Tensor:
+    return network.preprocess(image_tensor(frame), torch.from_numpy(frame.intrinsics)[None])[0]
+
+
+def _live(model: UncertainDepth, sequence: FrameSequence, seconds: float, progress: Report) -> dict[str, Any]:
+    """Walk to and fro at 30 images/s; the figures of :class:`RealTime`."""
+    frames, times, total = list(sequence), RealTime(model), round(seconds * FPS)
+    there_and_back = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
+
+    def on_result(result: LiveResult) -> None:
+        times.take(result)
+
+    with LiveDepth(model, on_result, frames[0].intrinsics) as live:
+        started = time.perf_counter()
+        for n in count():
+            if n == total:
+                break
+            time.sleep(max(0.0, started + n / FPS - time.perf_counter()))
+            frame = frames[there_and_back[n % len(there_and_back)]]
+            live.push_pose(n / FPS, frame.T_world_cam)
+            live.push_image(n / FPS, frame.image)
+            if n % round(FPS) == 0:
+                progress(Progress("live", n, total))
+        live.wait_idle()
+        progress(Progress("live", total, total))
+    return times.summary(live.statistics)
+
+
+def _contrasts(model: UncertainDepth, sequence: FrameSequence) -> list[Contrast]:
+    """Every fifth frame's maps, from a pass over all frames; none where the network states no variance."""
+    found = []
+    for n, frame in enumerate(sequence):
+        out = model(image_tensor(frame), frame.T_world_cam, frame.intrinsics)
+        own = out.prediction.aleatoric_variance
+        if own is None:
+            return []
+        if n % 5 or n < 30:
+            continue
+        depth = out.depth[0].numpy()
+        truth = truth_at(frame, out.intrinsics[0].numpy(), depth.shape)
+        assert truth is not None
+        usable = (truth > 0) & (out.ufm.measured[0].numpy() > 0.5) & np.isfinite(out.variance[0].numpy())
+        image = image_tensor(frame)[0].permute(1, 2, 0).numpy()
+        roots = (own[0].sqrt().numpy(), np.nan_to_num(out.disagreement[0].sqrt().numpy()))
+        found.append(Contrast(image, *roots, np.abs(depth - truth), usable))
+    return found
+
+
+def contrast_figures(contrasts: list[Contrast]) -> dict[str, float]:
+    """RMSE [m] where A is in the lower half of its frame, with M in the upper quarter and without; the network's own
+    sigma [m] there; and the share of pixels with both."""
+    both = np.concatenate([c.error[c.sure & c.high] for c in contrasts])
+    other = np.concatenate([c.error[c.sure & ~c.high] for c in contrasts])
+    own = np.concatenate([c.own[c.sure & c.high] for c in contrasts])
+    M = np.concatenate([c.disagreement[c.sure & c.high] for c in contrasts])
+    pixels = sum(int(c.usable.sum()) for c in contrasts)
+
+    def rms(values: NDArray[np.float32]) -> float:
+        return float(np.sqrt(np.square(values, dtype=np.float64).mean())) if values.size else math.nan
+
+    return {
+        "share": both.size / max(pixels, 1),
+        "rmse_high": rms(both),
+        "rmse_low": rms(other),
+        "own_sigma_high": rms(own),
+        "disagreement_high": rms(M),
+    }
+
+
+def draw_contrasts(path: Path, contrasts: list[Contrast]) -> None:
+    """One frame from each quarter of the walk: that with the most pixels of low A and high M."""
+    parts = [part for part in np.array_split(np.arange(len(contrasts)), _ROWS) if part.size]
+    chosen = [max((contrasts[n] for n in part), key=lambda c: int((c.sure & c.high).sum())) for part in parts]
+    maps = [value for c in chosen for value in (c.own, c.disagreement, c.error)]
+    scale = ColourScale(0.0, robust_range(maps, from_zero=True)[1], ERROR_MAP)
+    rows = []
+    for number, c in enumerate(chosen):
+        marked = c.image.copy()
+        if marked.shape[:2] == c.own.shape:
+            where = c.sure & c.high
+            marked[where] = (0.4 * marked[where] + 0.6 * _MARKED).astype(np.uint8)
+        panels = [Panel(c.image), *(Panel(scale.rgb(v)) for v in (c.own, c.disagreement, c.error)), Panel(marked)]
+        rows.append(GridRow(f"{number + 1}", [], panels))
+    rows[0] = rows[0].captioned(["image", "σ, aleatoric", "√M, disagreement", "|error|", "A low and M high"])
+    height, width = chosen[0].own.shape
+    title = "Disagreement is high where the aleatoric variance is low"
+    draw_grid(path, rows, [Bar("σ, √M and |error| [m]", scale, 1, 3)], aspect=height / width, title=title, words=0.4)
