@@ -27,7 +27,7 @@ def test_its_table_has_every_row(tmp_path, capsys, monkeypatch):
     figures = example.main(["--out", str(tmp_path / "out"), "--epochs", "1"])
     rows = ["constant", "UfM* without head", "head: network", "head: ufmstar", "head: posterior"]
     assert list(figures) == rows
-    assert all(math.isfinite(row[name]) for row in figures.values() for name in example.FIGURES)
+    assert all(math.isfinite(row[name]) for row in figures.values() for name in example.LOGGED)
     assert [line[:18].strip() for line in capsys.readouterr().out.splitlines() if line.startswith(tuple(rows))] == rows
     # The head leaves the depth as it is.
     assert figures["constant"]["rmse"] == pytest.approx(figures["head: network"]["rmse"], rel=1e-6)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +34,6 @@ ROWS: dict[str, Row] = {
 LOGGED = ("delta1", "nll", "ece_delta", "ece_q", "ause_rmse")
 
 
-@dataclass(frozen=True)
-class Judged:
-    """A row's figures and curves over all pixels of all sequences, by name; see ``SequenceMetrics``."""
-
-    figures: Mapping[str, float]
-    curves: Mapping[str, Any]
-
-
 def judge_network(
     network: nn.Module,
     sequences: Sequence[FrameSequence | str | Path],
@@ -51,7 +42,7 @@ def judge_network(
     preprocess: Preprocess | None = None,
     frames: int | None = None,
     device: torch.device | str = "cpu",
-) -> dict[str, Judged]:
+) -> dict[str, SequenceMetrics]:
     """A network's uncertainty on sequences: its own, that of UfM*, and that of the posterior.
 
     Args:
@@ -61,6 +52,9 @@ def judge_network(
         preprocess: what the input of a module needs; None = images in [0, 1] as they are.
         frames: of each sequence at most.
         device: where everything runs.
+
+    Returns:
+        By row, the metrics over all pixels of all sequences; ``compute()`` and ``curves()`` return them.
 
     Raises:
         ValueError: no sequence, or no such row; others as ``evaluate_sequence``.
@@ -79,7 +73,7 @@ def judge_network(
                 metrics = SequenceMetrics(with_variance="nll" in result.figures)
                 metrics.load_state_dict(result.sums[METRICS])
                 totals.setdefault(name, SequenceMetrics(with_variance=metrics.with_variance)).merge_state(metrics)
-    return {name: Judged(total.compute(), total.curves()) for name, total in totals.items()}
+    return totals
 
 
 class UncertaintyCallback(pl.Callback):
@@ -119,11 +113,10 @@ class UncertaintyCallback(pl.Callback):
         if trainer.sanity_checking or self._validations % self._every or not trainer.is_global_zero:
             return
         judged = judge_network(self._network(pl_module), self._sequences, device=pl_module.device, **self._how)
-        figures = {
-            f"{row}/{name}": one.figures[name] for row, one in judged.items() for name in LOGGED if name in one.figures
-        }
-        pl_module.log_dict(figures, rank_zero_only=True)
-        curves = {name: one.curves for name, one in judged.items() if "nll" in one.figures}
+        figures = {row: metrics.compute() for row, metrics in judged.items()}
+        logged = {f"{row}/{name}": own[name] for row, own in figures.items() for name in LOGGED if name in own}
+        pl_module.log_dict(logged, rank_zero_only=True)
+        curves = {name: metrics.curves() for name, metrics in judged.items() if metrics.with_variance}
         if curves:
             folder = Path(trainer.log_dir or trainer.default_root_dir) / "uncertainty"
             folder.mkdir(parents=True, exist_ok=True)
