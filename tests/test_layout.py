@@ -209,6 +209,11 @@ def test_every_module_has_a_docstring():
         assert ast.get_docstring(tree(path)) or path.read_text() == "", path
 
 
+def test_the_module_and_the_step_are_read_at_once():
+    for name, most in (("ufmstar.py", 350), ("step.py", 300)):
+        assert len((ROOT / "ufmstar_torch" / name).read_text().splitlines()) < most, name
+
+
 def test_no_utility_rooms_no_blanket_excepts():
     for path in sources():
         assert path.stem not in ("utils", "helpers", "common", "misc"), path

@@ -18,7 +18,8 @@ from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels import regress_cpu
 from ufmstar_torch.kernels.vectors_cpu import vectors
-from ufmstar_torch.regress import regress, regress_image, sample_pixels, shares
+from ufmstar_torch.regress import regress, regress_image, shares
+from ufmstar_torch.sample import sample_pixels
 
 pytestmark = pytest.mark.numerics
 

@@ -6,7 +6,6 @@ average of m_k with weights w_k(x), a weak prior (pi_0, mu_0) taking over where 
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +18,6 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import total
 from ufmstar_torch.gaussian import cholesky3, inverse_lower3
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.output import SampleStatistics
 
 # Points x components evaluated at a time: bounds the temporary memory to some 100 MB in float32. On CUDA as many as a
 # quarter of the free memory holds, if that is more, with _NUMBERS for each pair: 3 of the offset, its distance, density
@@ -245,79 +243,3 @@ def moving_average(
     flat = memory.flatten(1)
     mixed, shown = kernel(torch.gather(flat, 1, pixels), disagreement, alpha)
     return flat.scatter(1, pixels, mixed).view(memory.shape), shown
-
-
-def sample_size(size: tuple[int, int], pixels: int | None, fraction: float | None) -> int:
-    """Pixels to sample of an image of ``size`` (H, W): ``pixels``, or a share of all; neither: 1000.
-
-    Raises:
-        ValueError: both, or one out of range.
-    """
-    total = size[0] * size[1]
-    if pixels is not None and fraction is not None:
-        raise ValueError("give pixels or fraction, not both")
-    if fraction is not None:
-        if not 0 < fraction <= 1:
-            raise ValueError(f"fraction must lie in (0, 1], got {fraction}")
-        return max(1, round(fraction * total))
-    if pixels is None:
-        return min(1000, total)
-    if isinstance(pixels, bool) or not isinstance(pixels, int) or not 1 <= pixels <= total:
-        raise ValueError(f"pixels must be a whole number from 1 to H*W = {total}, got {pixels!r}")
-    return pixels
-
-
-def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """A uniform sample of the valid pixels of each image, without replacement.
-
-    The seed and the number of pixels alone decide in which random order an image's pixels are asked, and the first
-    ``count`` valid ones are taken: equal streams of a batch draw the same pixels.
-
-    Args:
-        valid: [B, H, W] bool.
-        count: pixels per image, 1 <= count <= H W.
-        seed: of the random order, drawn on the CPU so that every device samples alike.
-
-    Returns:
-        index [B, count] into the flattened image and used [B, count]; fewer than ``count`` valid pixels
-        leave the rest of ``used`` False.
-    """
-    flat = valid.flatten(1)
-    pixels, on_cpu = flat.shape[1], valid.device.type == "cpu"
-    requested = 2 * count if on_cpu else pixels  # elsewhere a look at how many were valid would wait for the device
-    while True:
-        order = random_order(pixels, seed)[:requested].to(valid.device, non_blocking=not on_cpu)
-        usable = flat[:, order]
-        if requested >= pixels or bool((usable.sum(1) >= count).all()):
-            break
-        requested *= 2
-    behind = usable.sum(1, keepdim=True) + (~usable).cumsum(1) - 1
-    place = torch.where(usable, usable.cumsum(1) - 1, behind)  # the valid ones first, each part in the random order
-    index = torch.empty_like(place).scatter_(1, place, order.expand_as(place))[:, :count]
-    return index, torch.gather(flat, 1, index)
-
-
-def sample_statistics(values: Tensor) -> SampleStatistics:
-    """Statistics of maps over a sample of pixels.
-
-    Args:
-        values: [..., B, n], NaN where a pixel has no value.
-
-    Returns:
-        [..., B] of each.
-    """
-    known = ~values.isnan()
-    count = known.sum(-1)
-    mean = total(torch.where(known, values, 0), -1) / count  # 0/0 = NaN without a pixel
-    squares = total(torch.where(known, (values - mean[..., None]) ** 2, 0), -1)
-    variance = torch.where(count > 1, squares / (count - 1).clamp_min(1), torch.nan)
-    largest = torch.where(known, values, -torch.inf).amax(-1)
-    return SampleStatistics(
-        mean, variance, values.nanmedian(-1).values, torch.where(count > 0, largest, torch.nan), count
-    )
-
-
-@functools.lru_cache(maxsize=4)  # the draw costs more than a sample
-def random_order(pixels: int, seed: int) -> Tensor:
-    """A permutation of the numbers below ``pixels``; not to be modified."""
-    return torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))

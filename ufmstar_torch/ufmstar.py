@@ -20,17 +20,16 @@ from ufmstar_torch.fixed_order import apply
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
 from ufmstar_torch.kernels.select import LateStep, select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.output import MeanUncertainty, SampleStatistics, StepOutput, UfMStarOutput
-from ufmstar_torch.regress import Regression, regress, sample_pixels, sample_size, sample_statistics
+from ufmstar_torch.network_variance import NetworkVariance
+from ufmstar_torch.output import MeanUncertainty, StepOutput, UfMStarOutput
+from ufmstar_torch.regress import Regression, regress
+from ufmstar_torch.sample import mean_uncertainty, sample_pixels, sample_size
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
 from ufmstar_torch.step import Step
 from ufmstar_torch.step_parts import StepObserver
 from ufmstar_torch.stream_warnings import StreamWarnings
 from ufmstar_torch.warm_up import warm_up
-
-# Maps of which mean_uncertainty has statistics.
-_AVERAGED = ("variance", "disagreement", "aleatoric", "epistemic", "anchored", "depth")
 
 
 class UfMStar(StatefulModule):
@@ -179,20 +178,7 @@ class UfMStar(StatefulModule):
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
         out, maps = self._observe(frame, inputs, index, average=average)
-        maps["depth"] = torch.gather(frame.depth.flatten(1), 1, index)
-        of = {name: torch.where(used, maps[name], torch.nan) for name in _AVERAGED if maps.get(name) is not None}
-        each = sample_statistics(torch.stack(list(of.values())))
-        by_name: dict[str, Any] = dict.fromkeys(_AVERAGED)
-        by_name |= {name: SampleStatistics(*(x[i] for x in vars(each).values())) for i, name in enumerate(of)}
-        total, sampled = by_name.pop("variance"), used.sum(1)
-        left = 1 - sampled / out.statistics.valid_pixels.clamp_min(1)  # without replacement: all pixels, no error
-        return MeanUncertainty(
-            total=total,
-            **by_name,
-            standard_error=(total.variance / total.pixels * left).sqrt(),
-            measured=((out.measured >= unmeasured.HALF) & used).sum(1) / sampled,
-            statistics=out.statistics,
-        )
+        return mean_uncertainty(out, maps | {"depth": torch.gather(frame.depth.flatten(1), 1, index)}, used)
 
     def warm_up(
         self, size: tuple[int, int], *, streams: int = 1, progress: Callable[[int, int], object] | None = None
@@ -294,30 +280,16 @@ class UfMStar(StatefulModule):
         """Run the step, and keep its state. Returns its output, and by name V, M, A and E as far as they count [m^2]
         (None = not) and the maps of extensions, at every pixel [B, H, W], or at ``pixels`` [B, n] of the flattened
         image. ``inputs``: what a frame brings for extensions."""
-        parts = (frame.aleatoric, self.config.add_aleatoric), (frame.epistemic, self.config.add_epistemic)
-        own = [value for value, counts in parts if value is not None and counts]
+        of_network = NetworkVariance.of(frame, self.config)
 
         def chosen(value: Tensor) -> Tensor:
             return value if pixels is None else torch.gather(value.flatten(1), 1, pixels)
 
-        def counted(features: Tensor) -> tuple[Tensor | None, Tensor | None]:
-            """A and E as far as they count; A of the mixture is the pixel's own as far as no component explains it."""
-            a, e = (chosen(value) if value is not None and counts else None for value, counts in parts)
-            if a is not None and self.config.aleatoric_in_h:
-                mixed, explained = features[..., -2:].unbind(-1)
-                a = mixed + (1 - explained) * a
-            return a, e
-
         def total(disagreement: Tensor, features: Tensor) -> Tensor:
-            """V = M + A + E, at least the floor (section "Uncertainty Regression"); NaN stays NaN."""
-            variance = disagreement
-            for value in counted(features):
-                variance = variance if value is None else variance + value
-            if self.config.variance_floor:
-                variance = variance.clamp_min(self.config.variance_floor)
+            variance = of_network.at(chosen, features, self.config).total(disagreement, self.config.variance_floor)
             return extensions.map_variance(self._extensions.map_variance(variance), chosen)
 
-        extensions = self._extensions.of_frame(frame, own, inputs, dense=pixels is None)
+        extensions = self._extensions.of_frame(frame, of_network.maps(), inputs, dense=pixels is None)
         # Normal tensors also under the caller's inference_mode: the state must outlive it.
         with outliving(), torch.no_grad(), full_precision(frame.depth.device):
             state = self._state_for(frame)
@@ -332,14 +304,8 @@ class UfMStar(StatefulModule):
             state, out = extensions.after_frame(state, out, partial(total, features=out.features))
             disagreement = extensions.disagreement(out.disagreement, chosen(frame.depth))
             out = replace(out, statistics=replace(out.statistics, single_view=(state.count == 1).sum(1)))
-        aleatoric, epistemic = counted(out.features)
-        maps = {
-            "disagreement": out.disagreement,
-            "aleatoric": aleatoric,
-            "epistemic": epistemic,
-            **extensions.outputs(),
-        }
-        maps["variance"] = total(disagreement, out.features)
+        maps = {"disagreement": out.disagreement, **vars(of_network.at(chosen, out.features, self.config))}
+        maps |= {**extensions.outputs(), "variance": total(disagreement, out.features)}
         self._store(state.tensors())  # last, so that an error before it, or a warning that is one, changes nothing
         self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
         return out, maps

@@ -18,7 +18,7 @@ from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink
 from ufmstar_torch.eval.run.panels import FramePanel
 from ufmstar_torch.eval.run.pictures import panel_of
-from ufmstar_torch.regress import sample_statistics
+from ufmstar_torch.sample import sample_statistics
 
 # By what images are ranked: V, M, A, E or B, and the map of ``RowResult`` that has it.
 PARTS = {

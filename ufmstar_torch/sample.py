@@ -1,0 +1,117 @@
+"""Means over some pixels of an image, for active learning (section "Compute- and memory efficiency")."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch import unmeasured
+from ufmstar_torch.fixed_order import total
+from ufmstar_torch.output import MeanUncertainty, SampleStatistics, StepOutput
+
+_MAPS = ("variance", "disagreement", "aleatoric", "epistemic", "anchored", "depth")
+
+
+def mean_uncertainty(out: StepOutput, maps: Mapping[str, Tensor | None], used: Tensor) -> MeanUncertainty:
+    """Averages of V, M, A, E and B over the sampled pixels.
+
+    Args:
+        out: of the step on the sample [B, n].
+        maps: [B, n] the variance, its parts and the depth, by name; those that are missing have no statistics.
+        used: [B, n] which pixels count.
+    """
+    sampled = {name: torch.where(used, value, torch.nan) for name in _MAPS if (value := maps.get(name)) is not None}
+    each = sample_statistics(torch.stack(list(sampled.values())))
+    of = {name: SampleStatistics(*(value[i] for value in vars(each).values())) for i, name in enumerate(sampled)}
+    count, variance = used.sum(1), of["variance"]
+    left = 1 - count / out.statistics.valid_pixels.clamp_min(1)  # without replacement: all pixels, no error
+    return MeanUncertainty(
+        total=variance,
+        disagreement=of["disagreement"],
+        aleatoric=of.get("aleatoric"),
+        epistemic=of.get("epistemic"),
+        anchored=of.get("anchored"),
+        depth=of["depth"],
+        standard_error=(variance.variance / variance.pixels * left).sqrt(),
+        measured=((out.measured >= unmeasured.HALF) & used).sum(1) / count,
+        statistics=out.statistics,
+    )
+
+
+def sample_size(size: tuple[int, int], pixels: int | None, fraction: float | None) -> int:
+    """Pixels to sample of an image of ``size`` (H, W): ``pixels``, or a share of all; neither: 1000.
+
+    Raises:
+        ValueError: both, or one out of range.
+    """
+    every = size[0] * size[1]
+    if pixels is not None and fraction is not None:
+        raise ValueError("give pixels or fraction, not both")
+    if fraction is not None:
+        if not 0 < fraction <= 1:
+            raise ValueError(f"fraction must lie in (0, 1], got {fraction}")
+        return max(1, round(fraction * every))
+    if pixels is None:
+        return min(1000, every)
+    if isinstance(pixels, bool) or not isinstance(pixels, int) or not 1 <= pixels <= every:
+        raise ValueError(f"pixels must be a whole number from 1 to H*W = {every}, got {pixels!r}")
+    return pixels
+
+
+def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """A uniform sample of the valid pixels of each image, without replacement.
+
+    The seed and the number of pixels alone decide in which random order an image's pixels are asked, and the first
+    ``count`` valid ones are taken: equal streams of a batch draw the same pixels.
+
+    Args:
+        valid: [B, H, W] bool.
+        count: pixels per image, 1 <= count <= H W.
+        seed: of the random order, drawn on the CPU so that every device samples alike.
+
+    Returns:
+        index [B, count] into the flattened image and used [B, count]; fewer than ``count`` valid pixels
+        leave the rest of ``used`` False.
+    """
+    flat = valid.flatten(1)
+    pixels, on_cpu = flat.shape[1], valid.device.type == "cpu"
+    requested = 2 * count if on_cpu else pixels  # elsewhere a look at how many were valid would wait for the device
+    while True:
+        order = random_order(pixels, seed)[:requested].to(valid.device, non_blocking=not on_cpu)
+        usable = flat[:, order]
+        if requested >= pixels or bool((usable.sum(1) >= count).all()):
+            break
+        requested *= 2
+    behind = usable.sum(1, keepdim=True) + (~usable).cumsum(1) - 1
+    place = torch.where(usable, usable.cumsum(1) - 1, behind)  # the valid ones first, each part in the random order
+    index = torch.empty_like(place).scatter_(1, place, order.expand_as(place))[:, :count]
+    return index, torch.gather(flat, 1, index)
+
+
+def sample_statistics(values: Tensor) -> SampleStatistics:
+    """Statistics of maps over a sample of pixels.
+
+    Args:
+        values: [..., B, n], NaN where a pixel has no value.
+
+    Returns:
+        [..., B] of each.
+    """
+    known = ~values.isnan()
+    count = known.sum(-1)
+    mean = total(torch.where(known, values, 0), -1) / count  # 0/0 = NaN without a pixel
+    squares = total(torch.where(known, (values - mean[..., None]) ** 2, 0), -1)
+    variance = torch.where(count > 1, squares / (count - 1).clamp_min(1), torch.nan)
+    largest = torch.where(known, values, -torch.inf).amax(-1)
+    return SampleStatistics(
+        mean, variance, values.nanmedian(-1).values, torch.where(count > 0, largest, torch.nan), count
+    )
+
+
+@functools.lru_cache(maxsize=4)  # the draw costs more than a sample
+def random_order(pixels: int, seed: int) -> Tensor:
+    """A permutation of the numbers below ``pixels``; not to be modified."""
+    return torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))
