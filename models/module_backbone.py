@@ -19,7 +19,7 @@ from ufmstar_torch.models.dropout import DecoderDropout
 from ufmstar_torch.models.heads import resized
 from ufmstar_torch.models.hugging_face import Checkpoint, HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
 from ufmstar_torch.models.monodepth2 import INITIAL_DEPTH
-from ufmstar_torch.models.network import Backbone
+from ufmstar_torch.models.network import Backbone, in_eval_mode
 from ufmstar_torch.models.outputs import as_map
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction, takes_intrinsics
@@ -77,17 +77,14 @@ class ModuleSpec(Checked):
                 read[name] = value.shape[1]
 
         hooks = [m.register_forward_pre_hook(lambda _, x, name=n: note(name, x[0])) for n, m in named.items()]
-        modes = {module: module.training for module in network.modules()}
         image = preprocess.apply_image(torch.full((1, 3, *_PROBE), 128, dtype=torch.uint8))
+        first = next(network.parameters(), image)
         try:
-            with torch.no_grad():
-                first = next(network.parameters(), image)
-                output = network.eval()(image.to(first.device, first.dtype))
+            with in_eval_mode(network):
+                output = network(image.to(first.device, first.dtype))
         finally:
             for hook in hooks:
                 hook.remove()
-            for module, mode in modes.items():
-                module.training = mode
         source = about.pop("source", type(network).__name__)
         if _is_features(output):
             return cls(source, preprocess, None, output.shape[1], **about)

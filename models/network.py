@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.models.preprocess import Preprocess
@@ -81,6 +83,19 @@ class Backbone(DepthNetwork):
     def forward(self, image: Tensor) -> DepthPrediction:
         """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it; no variances."""
         return DepthPrediction(self.depth(self.features(image)))
+
+
+@contextmanager
+def in_eval_mode(network: nn.Module) -> Iterator[None]:
+    """Without gradients and in eval mode; then each part is in its own mode again."""
+    modes = {part: part.training for part in network.modules()}
+    network.eval()
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        for part, mode in modes.items():
+            part.training = mode
 
 
 def require_image(image: Tensor, multiple: int = 1, smallest: int = 1) -> tuple[int, int]:

@@ -147,6 +147,11 @@ class OnnxNetwork(DepthNetwork):
         return self.K_input is not None or self.spec.outputs.focal is not None
 
     @property
+    def states_confidence(self) -> bool:
+        """Whether the spec names one."""
+        return self.spec.outputs.confidence is not None
+
+    @property
     def max_depth(self) -> float | None:
         """[m] As declared."""
         return self.spec.outputs.max_depth

@@ -87,3 +87,16 @@ def test_a_constant_of_the_posterior_variance_leaves_the_depth(script: Any) -> N
         slow, fast = (dict(zip(posterior.FIGURES, row, strict=True)) for row in rows)
         assert fast["rmse"] == slow["rmse"] > 0
         assert abs(fast["nll"] - slow["nll"]) > 0.01
+
+
+@pytest.mark.slow
+def test_the_table_of_confidences(script: Any, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+    """A tiny tour: every unit and source has a row, and what is not used yet changes nothing."""
+    words = ["measure_confidence.py", "--tours", "1?style=home", "--frames", "2"]
+    monkeypatch.setattr("sys.argv", words)
+    script("measure_confidence").main()
+    rows = {
+        line.split("|")[1].strip(): line.split("|")[2:] for line in capsys.readouterr().out.splitlines() if "|" in line
+    }
+    assert len(rows) == 14
+    assert rows["dense: random"] == rows["dense: today"] != rows["dense: A, in metres"]

@@ -23,7 +23,6 @@ from ufmstar_torch.eval.metrics import (
     ECEDelta,
     ECEQuantile,
     EntropyHistogram,
-    NLLByError,
     SequenceMetrics,
     mean_and_ci,
 )
@@ -82,18 +81,19 @@ class TestAgainstIndependentImplementations:
 
     def test_entropy_is_scipys(self) -> None:
         d, v, g = maps(30, 30)
+        v[0, :2] = torch.tensor([1e-12, 1e8])
         oracle = stats.norm(0, np.sqrt(v.numpy())).entropy().ravel()
-        got = figures(EntropyHistogram(bins=5, low=-2.0, high=0.5), d, v, g)
+        got = figures(EntropyHistogram(), d, v, g)
         assert float(got["entropy"]) == pytest.approx(oracle.mean())
-        edges = np.concatenate([[-np.inf], np.linspace(-2.0, 0.5, 6), [np.inf]])
+        edges = np.concatenate([[-np.inf], np.linspace(-8.0, 8.0, 65), [np.inf]])
         counts = np.histogram(oracle, edges)[0]
-        assert counts.min() > 0  # under and over the range too
+        assert (counts[0], counts[-1]) == (1, 1)  # under and over the range
         np.testing.assert_array_equal(got["entropy_counts"].numpy(), counts)
 
     def test_the_authors_bins(self) -> None:
         """100 bins of the confidence; 101 levels, of which 0 and 1 are right by definition."""
         d, v, g = maps(30, 40, scale=1.7)
-        metrics = SequenceMetrics(bins="authors", ranking=False)
+        metrics = SequenceMetrics(bins="authors")
         metrics.update(d, v, g)
         got, curves = metrics.compute(), metrics.curves()
         dn, vn, gn = (x.numpy().ravel() for x in (d, v, g))
@@ -246,13 +246,11 @@ class TestStreaming:
 
     def test_memory_does_not_grow(self) -> None:
         d, v, g = maps(30, 30)
-        for ranking, limit in ((False, 2048), (True, 2.4e6)):
-            metrics = SequenceMetrics(ranking=ranking)
-            sizes = []
-            for _ in range(3):
-                metrics.update(d, v, g)
-                sizes.append(sum(x.nelement() * x.element_size() for x in metrics.state_dict().values()))
-            assert sizes[0] == sizes[1] == sizes[2] < limit
+        metrics, sizes = SequenceMetrics(), []
+        for _ in range(3):
+            metrics.update(d, v, g)
+            sizes.append(sum(x.nelement() * x.element_size() for x in metrics.state_dict().values()))
+        assert sizes[0] == sizes[1] == sizes[2] < 2.4e6
 
     def test_half_precision_is_computed_in_double(self) -> None:
         d, v, g = (x.half() for x in maps(20, 20))
@@ -292,8 +290,6 @@ class TestSequence:
         assert mean_and_ci([0.5, math.nan])[0] == 0.5
         assert math.isnan(mean_and_ci([0.5])[1])
         assert all(math.isnan(x) for x in mean_and_ci([]))
-        with pytest.raises(ValueError, match="level"):
-            mean_and_ci([1.0, 2.0], level=95)
 
 
 class TestErrors:
@@ -319,8 +315,6 @@ class TestErrors:
         [
             (lambda: ECEDelta(1.0), "delta must lie"),
             (lambda: ECEQuantile([0.5, 0.5]), "levels must rise"),
-            (lambda: EntropyHistogram(low=1.0, high=1.0), "low < high"),
-            (lambda: NLLByError(0), "percentiles and bins must be >= 1"),
         ],
     )
     def test_settings(self, make: Callable[[], SumMetric], match: str) -> None:

@@ -10,6 +10,7 @@ from torch.nn.functional import interpolate
 from trainings import tiny_job, write_frames
 
 from ufmstar_torch import cli
+from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.models import (
     AleatoricHead,
     EvidentialHead,
@@ -107,6 +108,19 @@ def test_every_head_on_a_module(frames, tmp_path, head, members, fine_tune):
             assert torch.equal(kept[key], start[key]) != fine_tune, key
 
 
+def test_a_training_goes_on_and_starts_another(frames, tmp_path):
+    """A finished one is resumed without a change; its weights are the start of an ensemble and below another head."""
+    train(Own(), "aleatoric", frames, tmp_path / "a")
+    first = (tmp_path / "a" / "trained.safetensors").read_bytes()
+    train(Own(), "aleatoric", frames, tmp_path / "a", resume=True)
+    assert len((tmp_path / "a" / "trained.safetensors").read_bytes()) == len(first)
+    start = {"settings": {**QUIET, "init": tmp_path / "a" / "trained.safetensors"}, "max_steps": 1}
+    trained = load_network("trained", tmp_path / "a" / "trained.safetensors", backbone=Own())
+    members = train(Own(), "ensemble", frames, tmp_path / "b", members=2, learning_rate=1e-9, **start)
+    torch.testing.assert_close(members(image()).aleatoric_variance, trained(image()).variance, rtol=1e-3, atol=1e-5)
+    assert train(Own(), "evidential", frames, tmp_path / "c", **start)(image()).epistemic_variance is not None
+
+
 def test_members_of_a_frozen_module_learn_their_factors(frames, tmp_path):
     job = own_job(Own(), "batch-ensemble", data_of(frames), FitSettings(out=tmp_path), preprocess=INPUT)
     named = dict(new_network(job, 0).named_parameters())
@@ -149,6 +163,7 @@ def test_a_checkpoint_from_the_command_line(frames, tmp_path, kind, capsys):
     x = torch.rand(1, 3, 70, 84, generator=torch.Generator().manual_seed(0))
     prediction = network(x)
     assert prediction.variance.isfinite().all()
+    assert network_source("trained", [tmp_path / "out" / "trained.safetensors"]).label == "checkpoint"
     declared = network.backbone.network
     if kind == "metric":
         expected = load_network("huggingface", tmp_path / "gone", spec={"size": [70, 84], "keep_aspect": False})

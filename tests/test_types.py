@@ -39,6 +39,8 @@ def trajectory():
 def hugging_face():
     from ufmstar_torch.models import from_hugging_face
     from_hugging_face("a/b")
+def train_module():
+    from ufmstar_torch.train import train_module
 def corners():
     from ufmstar_torch.anchors import LandmarkTracker
     LandmarkTracker().update(np.zeros((48, 64, 3), np.uint8), np.eye(4), np.eye(3) + np.eye(3, k=2) * 9)
@@ -59,7 +61,7 @@ def metrics():
 def ranking():
     from ufmstar_torch.cli import main
     main(["rank", "a", "--depth", "self", "--out", "c"])
-for call in (choosing, metrics, ranking, own_network, trajectory, hugging_face, corners, command):
+for call in (choosing, metrics, ranking, own_network, trajectory, hugging_face, train_module, corners, command):
     try:
         call()
     except ModuleNotFoundError as error:
@@ -89,6 +91,7 @@ def test_what_is_missing_without_extras_is_named():
     for who, package, extra in (
         ("trajectory ufmstar_torch.eval.sequences.read_trajectory", "scipy", "eval"),
         ("hugging_face", "transformers", "models"),
+        ("train_module ufmstar_torch.train.train_module", "lightning", "train"),
         ("ufmstar run: failed: this command", "scipy", "eval"),
         ("ufmstar rank: failed: this command", "scipy", "eval"),
         ("metrics ufmstar_torch.eval.metrics.mean_and_ci", "torchmetrics", "eval"),

@@ -187,9 +187,8 @@ class Stub:
 def _drawn(sequence, row):
     seed = int(hashlib.sha256(f"{sequence.name} {row.slug}".encode()).hexdigest()[:8], 16)
     target = torch.rand(50, generator=torch.Generator().manual_seed(seed)) + 1
-    metrics = SequenceMetrics(with_variance=row.method.name != "DepthOnly", ranking=False)
-    variance = torch.full_like(target, 0.01) if metrics.with_variance else None
-    metrics.update(target + 0.1, variance, target)
+    metrics = SequenceMetrics(with_variance=False)  # small sums: a forked process must not use torch's threads
+    metrics.update(target + 0.1, None, target)
     counts = {"selected": len(sequence), "done": len(sequence), "skipped": 0, "reasons": {}}
     return RowFigures(row, counts, metrics.compute(), metrics.curves(), {}, {}, {"metrics": metrics.state_dict()})
 

@@ -42,10 +42,7 @@ def train_module(
     with ``backbone=`` where that is a module.
 
     Args:
-        backbone: a module that returns metric depth or features (``ModuleSpec.of``), which stays as it is; or the
-            directory or hub name of a depth model of ``transformers``.
-        head, options: see :func:`own_job`.
-        data: to train and validate on.
+        backbone, head, data, options: see :func:`own_job`.
         out: folder for all results.
         resume, overwrite: as ``fit``.
         settings: other fields of ``FitSettings``.
@@ -81,7 +78,9 @@ def own_job(
     """The training of a head on a network.
 
     Args:
-        backbone, data: as :func:`train_module`.
+        backbone: a module that returns metric depth or features (``ModuleSpec.of``), which stays as it is; or the
+            directory or hub name of a depth model of ``transformers``.
+        data: to train and validate on.
         head: "aleatoric", "evidential", "mc-dropout", "ensemble", "batch-ensemble" or "depth-only"; or a class of head.
         settings: of the session.
         fine_tune: train the network too; otherwise it is frozen.

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.figures_curves import write_curves
 from ufmstar_torch.eval.sequences import FrameSequence, open_sequence
 from ufmstar_torch.models.any_network import wrap_network
-from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.network import DepthNetwork, in_eval_mode
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.networks_in_turn import NetworksInTurn
 
@@ -36,14 +34,6 @@ ROWS: dict[str, Row] = {
 LOGGED = ("delta1", "nll", "ece_delta", "ece_q", "ause_rmse")
 
 
-@dataclass(frozen=True)
-class Judged:
-    """A row's figures and curves over all pixels of all sequences, by name; see ``SequenceMetrics``."""
-
-    figures: Mapping[str, float]
-    curves: Mapping[str, Any]
-
-
 def judge_network(
     network: nn.Module,
     sequences: Sequence[FrameSequence | str | Path],
@@ -52,7 +42,7 @@ def judge_network(
     preprocess: Preprocess | None = None,
     frames: int | None = None,
     device: torch.device | str = "cpu",
-) -> dict[str, Judged]:
+) -> dict[str, SequenceMetrics]:
     """A network's uncertainty on sequences: its own, that of UfM*, and that of the posterior.
 
     Args:
@@ -63,6 +53,9 @@ def judge_network(
         frames: of each sequence at most.
         device: where everything runs.
 
+    Returns:
+        By row, the metrics over all pixels of all sequences; ``compute()`` and ``curves()`` return them.
+
     Raises:
         ValueError: no sequence, or no such row; others as ``evaluate_sequence``.
     """
@@ -71,7 +64,7 @@ def judge_network(
         raise ValueError(f"sequences and rows must hold {expected}, got {len(sequences)} and {list(rows)}")
     depth = network if isinstance(network, DepthNetwork) else wrap_network(network, preprocess=preprocess)
     where, totals = torch.device(device), dict[str, SequenceMetrics]()
-    with _evaluated(depth), torch.no_grad():
+    with in_eval_mode(depth):
         source = NetworkSource(NetworksInTurn([depth], preprocess=depth.preprocess), where, {})
         judge = Judge({_BASE: source}, where, limit=slice(frames))
         for sequence in sequences:
@@ -80,7 +73,7 @@ def judge_network(
                 metrics = SequenceMetrics(with_variance="nll" in result.figures)
                 metrics.load_state_dict(result.sums[METRICS])
                 totals.setdefault(name, SequenceMetrics(with_variance=metrics.with_variance)).merge_state(metrics)
-    return {name: Judged(total.compute(), total.curves()) for name, total in totals.items()}
+    return totals
 
 
 class UncertaintyCallback(pl.Callback):
@@ -120,25 +113,12 @@ class UncertaintyCallback(pl.Callback):
         if trainer.sanity_checking or self._validations % self._every or not trainer.is_global_zero:
             return
         judged = judge_network(self._network(pl_module), self._sequences, device=pl_module.device, **self._how)
-        figures = {
-            f"{row}/{name}": one.figures[name] for row, one in judged.items() for name in LOGGED if name in one.figures
-        }
-        pl_module.log_dict(figures, rank_zero_only=True)
-        curves = {name: one.curves for name, one in judged.items() if "nll" in one.figures}
+        figures = {row: metrics.compute() for row, metrics in judged.items()}
+        logged = {f"{row}/{name}": own[name] for row, own in figures.items() for name in LOGGED if name in own}
+        pl_module.log_dict(logged, rank_zero_only=True)
+        curves = {name: metrics.curves() for name, metrics in judged.items() if metrics.with_variance}
         if curves:
             folder = Path(trainer.log_dir or trainer.default_root_dir) / "uncertainty"
             folder.mkdir(parents=True, exist_ok=True)
             title = f"epoch {trainer.current_epoch}, step {trainer.global_step}"
             write_curves(folder / f"epoch_{trainer.current_epoch}.png", curves, title=title)
-
-
-@contextmanager
-def _evaluated(network: nn.Module) -> Iterator[None]:
-    """The network in eval mode, and then each part in its own again."""
-    modes = {part: part.training for part in network.modules()}
-    network.eval()
-    try:
-        yield
-    finally:
-        for part, mode in modes.items():
-            part.training = mode

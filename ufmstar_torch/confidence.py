@@ -117,7 +117,8 @@ def factors(learnt: Learnt, config: ConfidenceConfig) -> tuple[Tensor, Tensor, T
     w, wy = (torch.zeros_like(ordered[:, :bins]).scatter_add(1, at, v) for v in (learnt.w, learnt.w * learnt.y))
     prior = config.shrinkage
     weight, mean = w + prior, (wy + prior) / (w + prior)
-    rising, falling = isotonic(mean, weight), isotonic(mean.flip(1), weight.flip(1)).flip(1)
+    rising, falling = isotonic(*(torch.cat([v, v.flip(1)]) for v in (mean, weight))).chunk(2)
+    falling = falling.flip(1)
     misfit = [(weight * (mean - fitted).square()).sum(1, keepdim=True) for fitted in (rising, falling)]
     h = torch.where(misfit[0] <= misfit[1], rising, falling)
     one = (wy.sum(1, keepdim=True) + prior) / (w.sum(1, keepdim=True) + prior)

@@ -35,24 +35,17 @@ class NLL(SumMetric):
 class EntropyHistogram(SumMetric):
     """Histogram of the predictive entropy 0.5 ln(2 pi e v) over all predicted pixels, with ground truth or without.
 
-    ``compute()``: ``entropy_counts`` [bins + 2], first and last = under and over the range (v = 0 lies
-    under it); ``entropy_edges`` [bins + 1] [nats]; ``entropy`` the mean over v > 0.
-
-    Args:
-        bins: equal-width bins over ``low`` to ``high``.
-        low: [nats]; the default range is sigma = 81 um to 721 m.
-        high: [nats].
+    ``compute()``: ``entropy_counts`` [66], first and last = under and over the range (v = 0 lies
+    under it), which is sigma = 81 um to 721 m; ``entropy_edges`` [65] [nats]; ``entropy`` the mean over v > 0.
     """
 
     OF_VARIANCE = "the entropy"
     ADD = add_entropy
 
-    def __init__(self, bins: int = 64, low: float = -8.0, high: float = 8.0, **kwargs: Any) -> None:
-        if bins < 1 or not low < high:
-            raise ValueError(f"bins must be >= 1 and low < high, got bins={bins}, low={low}, high={high}")
-        self.edges = torch.linspace(low, high, bins + 1, dtype=torch.float64)
-        super().__init__({"bins": bins, "low": low, "high": high}, (self.edges.numpy(),), **kwargs)
-        self.add_counts("counts", shape=(bins + 2,))
+    def __init__(self, **kwargs: Any) -> None:
+        self.edges = torch.linspace(-8.0, 8.0, 65, dtype=torch.float64)
+        super().__init__(constants=(self.edges.numpy(),), **kwargs)
+        self.add_counts("counts", shape=(66,))
         self.add_sums("total")
         self.add_counts("pixels")
 

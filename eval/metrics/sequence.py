@@ -25,12 +25,11 @@ _AUTHORS: dict[type[SumMetric], dict[str, Any]] = {ECEDelta: {"bins": 100}, ECEQ
 class SequenceMetrics(nn.Module):
     """delta1, AbsRel, RMSE and, with a variance, NLL, ECE_delta, ECE_q, entropy, AUSE, AURG, Spearman of one sequence.
 
-    Memory is 2.4 MB (2 kB without ``ranking``) however many frames are added. ``state_dict`` saves the sums;
+    Memory is 2.4 MB however many frames are added. ``state_dict`` saves the sums;
     ``merge_state`` adds those of another part of the sequence.
 
     Args:
         with_variance: False for a network that predicts depth alone.
-        ranking: with AUSE, AURG and Spearman's correlation.
         bins: of the calibration errors: "ours", 10 of the confidence and 10 levels, or "authors", 100 and 101.
         own: classes of ``SumMetric`` by name, whose figures are called "own.FIGURE"; without a variance, those that
             need none.
@@ -40,7 +39,6 @@ class SequenceMetrics(nn.Module):
         self,
         *,
         with_variance: bool = True,
-        ranking: bool = True,
         bins: str = OURS,
         own: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
@@ -50,8 +48,7 @@ class SequenceMetrics(nn.Module):
         self.with_variance = with_variance
         kinds: list[type[SumMetric]] = [Delta1, AbsRel, RMSE]
         if with_variance:
-            kinds += [NLL, ECEDelta, ECEQuantile, EntropyHistogram]
-            kinds += [Sparsification, SpearmanCorrelation] if ranking else []
+            kinds += [NLL, ECEDelta, ECEQuantile, EntropyHistogram, Sparsification, SpearmanCorrelation]
         finer = _AUTHORS if bins == AUTHORS else {}
         made = {kind.__name__: kind(**finer.get(kind, {}), sync_on_compute=False) for kind in kinds}
         usable = {name: kind for name, kind in own.items() if with_variance or not kind.OF_VARIANCE}
@@ -116,24 +113,18 @@ class SequenceMetrics(nn.Module):
         }
 
 
-def mean_and_ci(values: Iterable[float], *, level: float = 0.95) -> tuple[float, float]:
-    """Mean over sequences and the half-width of its confidence interval, t_(n-1) s / sqrt(n).
+def mean_and_ci(values: Iterable[float]) -> tuple[float, float]:
+    """Mean over sequences and the half-width of its 95 % confidence interval, t_(n-1) s / sqrt(n).
 
     Student's t, because sequences are few; at the paper's 100 sequences it is within 1.3 %
     of 1.96 s / sqrt(n). NaN values (a sequence without ground truth) are left out.
 
     Args:
         values: one figure per sequence.
-        level: of the interval.
 
     Returns:
         (mean, half-width); the half-width is NaN for fewer than two values, both for none.
-
-    Raises:
-        ValueError: level is outside (0, 1).
     """
-    if not 0 < level < 1:
-        raise ValueError(f"level must lie in (0, 1), got {level}")
     finite = [float(v) for v in values if not math.isnan(v)]
     if len(finite) < 2:
         return (finite[0] if finite else math.nan), math.nan
@@ -141,4 +132,4 @@ def mean_and_ci(values: Iterable[float], *, level: float = 0.95) -> tuple[float,
 
     n, mean = len(finite), math.fsum(finite) / len(finite)
     deviation = math.sqrt(math.fsum((v - mean) ** 2 for v in finite) / (n - 1))
-    return mean, float(t.ppf(0.5 + level / 2, n - 1)) * deviation / math.sqrt(n)
+    return mean, float(t.ppf(0.975, n - 1)) * deviation / math.sqrt(n)

@@ -35,10 +35,6 @@ class Mean(NamedTuple):
 def value_of(record: Record, key: str) -> float:
     """A figure of a record by ``Quantity.key``; NaN where it has none."""
     group, _, name = key.rpartition(".")
-    if key == "ms.total":
-        parts = [record.ms.get(part) for part in ("network", "uncertainty")] + [record.ms.get("anchors", 0.0)]
-        # Predictions from the cache were not timed: without them there is no sum.
-        return math.nan if None in parts else math.fsum(float(part) for part in parts if part is not None)
     if key in (NO_SEGMENT.key, NO_MATCH.key):  # as a share
         return record.frames.get(name, math.nan) / max(1, record.frames.get("done", 0))
     if group == OWN:

@@ -43,7 +43,6 @@ SPEARMAN = Quantity("spearman", "Spearman", 2, HIGHER)
 AUSE = Quantity("ause_rmse", "AUSE", 3, LOWER, "m")
 UNCERTAINTY_MS = Quantity("ms.uncertainty", "uncertainty", 1, None, "ms")
 NETWORK_MS = Quantity("ms.network", "network", 1, None, "ms")
-TOTAL_MS = Quantity("ms.total", "time per frame", 1, None, "ms")
 # Shares of UfM*'s frames: without a segment; after the first, without a segment that met a component.
 NO_SEGMENT = Quantity("frames.without_segment", "no segment", 1, None, "%", 100.0)
 NO_MATCH = Quantity("frames.without_match", "no match", 1, None, "%", 100.0)

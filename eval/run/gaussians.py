@@ -38,7 +38,7 @@ def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_fir
 
     Attributes in the order and with the meaning that 3D Gaussian splatting viewers expect: x y z [m],
     nx ny nz (the shortest axis), f_dc_0..2 (colour, see below), opacity (logit), scale_0..2 = ln sigma
-    [ln m], rot_0..3 = unit quaternion w x y z, so that Sigma = R diag(exp(scale))^2 R^T. WriterThread them our
+    [ln m], rot_0..3 = unit quaternion w x y z, so that Sigma = R diag(exp(scale))^2 R^T. Behind them our
     own: weight [px], disagreement [m^2], count.
     The colour is sqrt(disagreement) in magma from 0 to its 99th percentile, which the header states; grey where it was
     seen from one view alone, so that its disagreement of 0 compares nothing.
