@@ -215,6 +215,7 @@ def realtime_table(summary: Mapping[str, Any]) -> str:
 
     rows = [["[ms]", "p50", "p99", "max"], ["image to variance", *ms("latency_ms")]]
     rows += [["  network, with its input", *ms("network_ms")], ["  UfM*", *ms("ours_ms")]]
+    rows += [["processor time of the thread", *ms("processor_ms")]]
     counts = [f"{summary['results']} of {summary['images']} images in {summary['seconds']:.1f} s"]
     counts += [f"{count} {reason}" for reason, count in (summary["dropped"] | summary["skipped"]).items()]
     lost, ours = (None if summary[name] is None else 100 * summary[name] for name in ("lost_share", "ours_share"))
