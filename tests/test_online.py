@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -107,11 +110,23 @@ def test_what_makes_no_sense_is_refused():
 
 @pytest.mark.slow
 def test_the_example_counts_its_updates(capsys):
-    example.main(walks=1, frames=10, cost=9.0)
-    said = capsys.readouterr().out.splitlines()
-    counts = {line.split()[0]: int(line.split()[1]) for line in said[1:]}
-    errors = {line.split()[0]: line.split()[4] for line in said[1:]}
-    assert counts == {"decided": 8, "random": 8, "all": 10, "none": 0}
-    assert errors["random"] == errors["decided"], "the same images, the same error"
-    assert len(set(errors.values())) == 3
-    assert len(Path(example.__file__).read_text().splitlines()) <= 60
+    results = example.main(walks=1, frames=10, cost=9.0)
+    assert {name: row[0] for name, [row] in results.items()} == {"decided": 8, "random": 8, "all": 10, "none": 0}
+    assert results["random"] == results["decided"], "the same images, the same error"
+    assert len({row[1] for [row] in results.values()}) == 3
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(results)
+    assert len([line for line in Path(example.__file__).read_text().splitlines() if line]) < 60
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", ["online_training", "train_own_head"])
+def test_the_short_examples_pass_a_strict_type_checker(tmp_path, script):
+    """Against the package as a wheel has it."""
+    root, package = Path(example.__file__).parents[1], tmp_path / "ufmstar_torch"
+    package.mkdir()
+    for part in [*(root / "ufmstar_torch").iterdir(), *(root / name for name in ("models", "eval", "train"))]:
+        (package / part.name).symlink_to(part)
+    own = Path(shutil.copy(root / "examples" / f"{script}.py", tmp_path))
+    mypy = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", own.name]
+    done = subprocess.run(mypy, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout

@@ -104,8 +104,8 @@ class TestError:
         figure = draw_error(results, "rooms")
         shown = [axes for axes in figure.axes if axes.get_visible()]
         assert [axes.get_title(loc="left") for axes in shown] == [
-            "Ensemble: where it is confident",
-            "Ensemble: where UfM-100K is confident",
+            "Ensemble: where it is confident in each frame",
+            "Ensemble: where UfM-100K is confident in each frame",
         ]
         for axes, reference in zip(shown, ("Ensemble", "UfM-Ensemble-100K"), strict=True):
             for row in (ALONE, UFM, UFM_STAR):

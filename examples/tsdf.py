@@ -1,0 +1,70 @@
+"""A TSDF of a run's depth, every pixel weighted alike or by 1/sigma^2: error of the surface in cm.
+
+    ufmstar run "tour:5?frames=60&size=120x160" --model trained --weights models/weights/demo.safetensors --posterior \\
+        --out out/tour
+    python examples/tsdf.py out/tour
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ufmstar_torch.eval.run.export import gated_frames, run_settings
+from ufmstar_torch.eval.sequences import open_sequence
+
+VOXEL, TRUNCATION = 0.08, 0.4  # [m]; the second is about the posterior's mean sigma
+WEIGHTS = {"all alike": np.ones_like, "1/sigma^2": lambda sigma: 1 / np.maximum(sigma, 0.01) ** 2}
+
+
+def fuse(frames, low, shape):
+    """By name of the weights: sums of weight x signed distance [truncations], and of weights, [2, X, Y, Z]."""
+    centres = low + VOXEL * np.indices(shape).reshape(3, -1).T
+    sums = {name: np.zeros((2, len(centres))) for name in WEIGHTS}
+    for frame in frames:
+        camera = (centres - frame.T_world_cam[:3, 3]) @ frame.T_world_cam[:3, :3]
+        seen = np.flatnonzero(camera[:, 2] > 0.1)
+        u, v = np.rint((camera[seen] @ frame.intrinsics.T)[:, :2] / camera[seen, 2:]).astype(int).T
+        inside = (u >= 0) & (v >= 0) & (u < frame.depth.shape[1]) & (v < frame.depth.shape[0])
+        seen, pixels = seen[inside], (v[inside], u[inside])
+        distance = (frame.depth[pixels] - camera[seen, 2]) / TRUNCATION
+        near = distance > -1  # a pixel that was left out is NaN, and not near
+        for name, weigh in WEIGHTS.items():
+            weight = weigh(frame.sigma[pixels][near])
+            sums[name][:, seen[near]] += weight * np.minimum(distance[near], 1), weight
+    return {name: total.reshape(2, *shape) for name, total in sums.items()}
+
+
+def surface(total, weight, low):
+    """[P, 3] points where the mean distance is 0 between two voxels, those with the largest weight first."""
+    field, points, support = total / np.where(weight > 0, weight, np.nan), [], []
+    for axis in range(3):
+        (a, b), (wa, wb) = ([np.delete(x, i, axis) for i in (-1, 0)] for x in (field, weight))
+        at = np.nonzero((a * b < 0) & (np.abs(a) < 1) & (np.abs(b) < 1))
+        share = (a[at] / (a[at] - b[at]))[:, None] * np.eye(3)[axis]
+        points.append(low + VOXEL * (np.stack(at, -1) + share))
+        support.append(np.minimum(wa, wb)[at])
+    return np.concatenate(points)[np.argsort(-np.concatenate(support))]
+
+
+def main(out):
+    """Print and return, by weights: mean error [cm] and share of the true surface within 10 cm, best half and all."""
+    frames, sequence, true = list(gated_frames(out, np.inf, np.inf)), open_sequence(run_settings(out)["sequence"]), []
+    for frame in (sequence[frame.index] for frame in frames):
+        v, u = (one[::4] for one in np.nonzero(frame.depth))
+        rays = np.linalg.inv(frame.intrinsics) @ np.stack([u, v, np.ones_like(u)])
+        true.append((rays * frame.depth[v, u]).T @ frame.T_world_cam[:3, :3].T + frame.T_world_cam[:3, 3])
+    tree, results = cKDTree(np.concatenate(true)), {}
+    low = tree.mins - 2 * VOXEL
+    for name, sums in fuse(frames, low, tuple(np.ceil((tree.maxes - low) / VOXEL).astype(int) + 2)).items():
+        points = surface(*sums, low)
+        for part, chosen in (("best half", points[: len(points) // 2]), ("all", points)):
+            covered = float(np.mean(cKDTree(chosen).query(tree.data[::40])[0] < 0.1))
+            results[name, part] = 100 * float(tree.query(chosen)[0].mean()), covered
+            print(f"{name:10} {part:10} {results[name, part][0]:5.1f} cm, {covered:.0%} of the surface")
+    return results
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
