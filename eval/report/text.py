@@ -171,6 +171,8 @@ def _anchor_lines(summary: Mapping[str, Any]) -> list[str]:
         way = "nearer" if anchors["mean_bias"] < 0 else "farther"
         expected = f"{abs(anchors['mean_bias']):.0%} {way} than predicted"
         line += f"; mean B {number(anchors['mean_anchored'])} m^2, true depth expected {expected}"
+    if (confident := anchors.get("frames_with_confidence")) is not None:
+        line += f"; confidence: used in {confident} frames, in the others ignored"
     without, before = anchors["frames_without"], anchors["frames_before_the_first"]
     if not without:
         return [line]
