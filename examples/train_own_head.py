@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from ufmstar_torch import DepthPrediction
 from ufmstar_torch.eval.sequences import open_sequence
@@ -42,12 +42,9 @@ def main(words: list[str] | None = None) -> dict[str, dict[str, float]]:
     depth = train_module(network(), "depth-only", DATA, o.out / "depth", fine_tune=True, **how)
     head = train_module(depth, AleatoricHead, replace(DATA, first_tour=20_000), o.out / "head", **how)
     rmse = json.loads((o.out / "depth" / "summary.json").read_text())["mean"]["val_rmse"]
-
-    def constant(image: Tensor) -> DepthPrediction:
-        predicted = depth(image).depth
-        return DepthPrediction(predicted, torch.full_like(predicted, rmse**2))
-
-    judged = {"constant": judge_network(wrap_network(constant), rooms, rows=("network",))["network"]}
+    # The same depth with one variance for all pixels.
+    constant = wrap_network(lambda x: DepthPrediction(depth(x).depth, torch.full_like(x[:, 0], rmse**2)))
+    judged = {"constant": judge_network(constant, rooms, rows=("network",))["network"]}
     judged["UfM* without head"] = judge_network(depth, rooms, rows=("ufmstar",))["ufmstar"]
     judged |= {f"head: {name}": row for name, row in judge_network(head, rooms).items()}
     figures = {name: metrics.compute() for name, metrics in judged.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,6 +20,7 @@ from ufmstar_torch import (
     UfMStar,
     UfMStarConfig,
     UncertainDepth,
+    cli,
 )
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.confidence import isotonic
@@ -229,6 +231,37 @@ def test_the_engine_passes_it(tmp_path):
             assert samples.shape == (3 * 384, 3)
             assert bool(((samples[:, 0] >= 0) & (samples[:, 0] <= 1)).all())
     assert fit_confidence([samples.numpy()]).covariate == "confidence"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:`torch.jit:FutureWarning", "ignore:`torch.jit:DeprecationWarning")
+def test_the_commands_pass_it(tmp_path, capsys):
+    """``ufmstar run`` counts the frames in which it is used; ``eval`` and ``recalibrate`` fit a map of it to truth."""
+    spec = {"outputs": {"kind": "metric", "depth": 0, "confidence": 1}, "preprocess": {"size": [48, 64]}}
+    (tmp_path / "spec.json").write_text(json.dumps(spec))
+    both = torch.jit.trace(Tuple(), torch.rand(1, 3, 48, 64))
+    torch.jit.save(both, str(tmp_path / "n.ts"))
+    tour, words = "tour:3?frames=4&size=96x128", ["--spec", str(tmp_path / "spec.json")]
+    run = ["run", tour, "--model", "torchscript", "--weights", str(tmp_path / "n.ts"), "--anchors", "corners", *words]
+    assert cli.main([*run, "--no-video", "--no-sheet", "--out", str(tmp_path / "run")]) == 0
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["anchors"]["frames_with_confidence"] == 0
+    assert "confidence: used in 0 frames" in capsys.readouterr().out
+    suite = tmp_path / "s.toml"
+    suite.write_text('title = "s"\n[[rows]]\nmethods = ["UfM*-DepthOnly"]\n')
+    network = ["--network", f"depth_only=torchscript:{tmp_path / 'n.ts'}", *words]
+    assert cli.main(["eval", "--suite", str(suite), "--root", f"a={tour}", *network, "--out", str(tmp_path / "e")]) == 0
+    file = tmp_path / "m.json"
+    fit = ["recalibrate", str(tmp_path / "e"), "--row", "UfM*-DepthOnly", "--to", str(file)]
+    assert cli.main([*fit, "--covariate", "confidence"]) == 0
+    assert Recalibration.from_json(file).covariate == "confidence"
+
+
+class Tuple(nn.Module):
+    """As :class:`Stated`, without names."""
+
+    def forward(self, x):
+        return 1 + x.mean(1), x[:, 0]
 
 
 REFUSED = {

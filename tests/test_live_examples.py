@@ -57,7 +57,10 @@ def image_message(**values):
 def test_the_ros_node_publishes_depth_and_sigma():
     node = Node()
     sensor = SimpleNamespace(Image=image_message, CameraInfo=None)
-    with ros_node.attach(node, UncertainDepth(Flat()), sensor, SimpleNamespace(PoseStamped=None)) as live:
+    model = UncertainDepth(Flat())
+    model(np.zeros((48, 64, 3), np.uint8), np.eye(4), (50.0, 50.0, 31.5, 23.5))  # compiles
+    model.reset()
+    with ros_node.attach(node, model, sensor, SimpleNamespace(PoseStamped=None)) as live:
         x, y, z, w = Rotation.from_euler("y", 30, degrees=True).as_quat()
         pose = SimpleNamespace(
             position=SimpleNamespace(x=1.0, y=2.0, z=3.0), orientation=SimpleNamespace(x=x, y=y, z=z, w=w)

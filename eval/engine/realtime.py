@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, thread_time
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,9 @@ class RealTime:
 
     def __init__(self, model: UncertainDepth) -> None:
         self.latency, self.compute, self.network = array("d"), array("d"), array("d")  # [s]
+        self.processor = array("d")  # [s] of the worker's thread between two results: without the waits for a core
         self._predicted = 0.0
+        self._thread: float | None = None
         self._memory: int | None = None
         self._first = self._last = 0.0
         for network in model.networks:
@@ -40,6 +42,9 @@ class RealTime:
         self.latency.append(result.latency)
         self.compute.append(result.finished - result.started)
         self.network.append(self._predicted - result.started)
+        if self._thread is not None:
+            self.processor.append(thread_time() - self._thread)
+        self._thread = thread_time()
         if len(self.latency) == _SETTLED:
             self._memory = resident_bytes()
 
@@ -60,6 +65,7 @@ class RealTime:
             "latency_ms": _quantiles(np.array(self.latency)),
             "network_ms": _quantiles(network),
             "ours_ms": _quantiles(compute - network),
+            "processor_ms": _quantiles(np.array(self.processor)),
             "ours_share": float(1 - network.sum() / compute.sum()) if len(compute) else None,
             "memory_bytes": now,
             "memory_growth_bytes": None if self._memory is None or now is None else now - self._memory,

@@ -171,6 +171,8 @@ def _anchor_lines(summary: Mapping[str, Any]) -> list[str]:
         way = "nearer" if anchors["mean_bias"] < 0 else "farther"
         expected = f"{abs(anchors['mean_bias']):.0%} {way} than predicted"
         line += f"; mean B {number(anchors['mean_anchored'])} m^2, true depth expected {expected}"
+    if (confident := anchors.get("frames_with_confidence")) is not None:
+        line += f"; confidence: used in {confident} frames, in the others ignored"
     without, before = anchors["frames_without"], anchors["frames_before_the_first"]
     if not without:
         return [line]
@@ -213,6 +215,7 @@ def realtime_table(summary: Mapping[str, Any]) -> str:
 
     rows = [["[ms]", "p50", "p99", "max"], ["image to variance", *ms("latency_ms")]]
     rows += [["  network, with its input", *ms("network_ms")], ["  UfM*", *ms("ours_ms")]]
+    rows += [["processor time of the thread", *ms("processor_ms")]]
     counts = [f"{summary['results']} of {summary['images']} images in {summary['seconds']:.1f} s"]
     counts += [f"{count} {reason}" for reason, count in (summary["dropped"] | summary["skipped"]).items()]
     lost, ours = (None if summary[name] is None else 100 * summary[name] for name in ("lost_share", "ours_share"))

@@ -114,7 +114,8 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
     """With anchors: the frame's counts, and the means of B [m^2] and of r.
 
     ``tracked`` corners were followed from the frame before, ``found`` of them triangulated; ``usable`` lie on a pixel
-    with a depth, and ``used`` agree with others. ``without`` is the reason where none is used. Of a map of landmarks,
+    with a depth, and ``used`` agree with others. ``without`` is the reason where none is used.
+    ``confidence``: whether the network's one was used. Of a map of landmarks,
     ``tracked`` counts all, and ``found`` those in view.
     """
     landmarks, statistics = row.landmarks, row.statistics
@@ -124,7 +125,9 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
     assert statistics.anchors_used is not None
     used, usable = int(statistics.anchors_used[0]), int(statistics.anchors[0])
     found = len(landmarks.depth)
-    counts = {"tracked": landmarks.tracked, "found": found, "usable": usable, "used": used}
+    counts: dict[str, Any] = {"tracked": landmarks.tracked, "found": found, "usable": usable, "used": used}
+    if statistics.confidence is not None:
+        counts["confidence"] = bool(statistics.confidence[0] > 0)
     return {
         "anchors": {**counts, "without": None if used else why_none(found, usable, landmarks.none)},
         "mean_anchored": _mean(row.anchored, row.valid),

@@ -187,11 +187,13 @@ def _anchors(done: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     if not records:
         return None
     first = next((number for number, record in enumerate(records) if record["used"]), None)
+    stated = [record for record in records if "confidence" in record]
     means = {f"{key}_per_frame": mean(r[key] for r in records) for key in ("tracked", "found", "usable", "used")}
     return {
         **means,
         "frames_before_the_first": len(records) if first is None else first,
         "frames_without": dict(Counter(record["without"] for record in records if record["without"] is not None)),
+        **({"frames_with_confidence": sum(r["confidence"] for r in stated)} if stated else {}),
         "mean_anchored": _pixel_mean(done, "mean_anchored"),
         "mean_bias": _pixel_mean(done, "mean_bias"),
         "units": "mean_anchored m^2 (B), mean_bias 1 (r: true depth over predicted, less 1)",
