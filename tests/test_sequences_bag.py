@@ -125,6 +125,15 @@ def test_topics_are_named_where_there_are_several(tmp_path):
     assert cli.main(["data", "check", str(path), "--topics", "/camera/image", "/odom"]) == 0
 
 
+def test_depth_of_another_camera_is_left_out_and_named(tmp_path, caplog):
+    def left(bag):
+        bag.write("/left/depth", written.START, bag.image(written.START, "left", np.ones((4, 5), "<u2"), "16UC1"))
+
+    path, _ = written.write_bag(tmp_path, depth=None, change=left)
+    assert open_sequence(path)[0].depth is None
+    assert "no depth: /left/depth is of 'left' and not registered to 'optical'" in caplog.text
+
+
 def test_the_frame_of_a_pose_can_be_named(tmp_path, capfd):
     """A pose of the body without its name, and the world of tf."""
     path, truth = written.write_bag(tmp_path / "tf", poses="tf")

@@ -23,6 +23,7 @@ from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import associate
 from ufmstar_torch.optional import optional
+from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.trajectory import interpolate_pose
 
 LOOKED_FOR = "a .bag, .db3 or .mcap file, or a folder that holds one"
@@ -224,6 +225,9 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         raise ValueError(
             f"topics: {other[0]!r} shows another camera's view ({depths[other[0]]!r}, not {images[image]!r})"
         )
+    if depths and not depth:
+        name, frame = next(iter(depths.items()))
+        LOGGER.warning("%s: no depth: %s is of %r and not registered to %r", bag.path, name, frame, images[image])
     pose = ""
     if options.trajectory is None:
         by_tf = [name for name in named if types[name] == _TF]
