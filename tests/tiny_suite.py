@@ -120,7 +120,7 @@ class Biased:
     """The truth, but what is farther than 2 m is put 40 % too far; as much of a ``DepthSource`` as is asked of it."""
 
     digest, passes, needs_image, cacheable, networks, runtime = "biased", 1, False, False, (), None
-    max_depth = None
+    max_depth, states_confidence = None, False
 
     def prepared(self, how):
         return self
