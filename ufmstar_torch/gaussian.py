@@ -83,12 +83,6 @@ def symmetric_eigh(S: Tensor) -> tuple[Tensor, Tensor]:
     return values, torch.gather(V, -1, order[..., None, :].expand_as(V))
 
 
-def sqrt_psd(S: Tensor) -> Tensor:
-    """The symmetric square root S^(1/2) of positive semidefinite S [..., 3, 3]; rounding below 0 counts as 0."""
-    values, V = symmetric_eigh(S)
-    return product(V * values.clamp_min(0).sqrt()[..., None, :], V.mT)
-
-
 def cholesky3(S: Tensor) -> Tensor:
     """Lower Cholesky factor of positive semidefinite S [..., 3, 3], without a check that would wait for the device.
 
