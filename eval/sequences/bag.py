@@ -204,7 +204,9 @@ def _choose(bag: Bag, options: Options) -> _Topics:
     images: dict[str, str] = {}
     depths: dict[str, str] = {}
     for name in (name for name, kind in types.items() if kind in (_IMAGE, _COMPRESSED)):
-        first = next(bag.messages([name]))[1]
+        first = next((message for _, message in bag.messages([name])), None)
+        if first is None:
+            raise FrameError(bag.path, f"{name} should have messages, but has none: the bag is damaged")
         is_depth = getattr(first, "encoding", "") in ros.DEPTH_ENCODINGS or ros.COMPRESSED_DEPTH in getattr(
             first, "format", ""
         )
