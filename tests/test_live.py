@@ -184,6 +184,24 @@ def test_a_reset_forgets_views_and_times(model):
     assert int(model.image_index) == 1
 
 
+def test_a_reset_after_an_image_was_taken_holds_for_the_next_one(model):
+    """The image that is computed then is still of the old poses."""
+    with LiveDepth(model, lambda _: None, K) as live:
+        process = live._process
+
+        def reset_first(*chosen):
+            live._process = process
+            live.reset()
+            return process(*chosen)
+
+        live._process = reset_first
+        for stamp in (0, 1):
+            live.push_pose(stamp, at(0))
+            live.push_image(stamp, PICTURE)
+            assert live.wait_idle(20)
+    assert int(model.image_index) == 1
+
+
 @pytest.mark.parametrize("what", ["model", "on_result", "exit"])
 def test_an_error_reaches_every_thread_that_pushes(model, what):
     def on_result(_):
@@ -266,6 +284,7 @@ def test_many_threads(model):
     ("call", "error", "text"),
     [
         (lambda live: live.push_image(float("nan"), PICTURE), ValueError, "stamp must be finite"),
+        (lambda live: live.push_pose(10**400, np.eye(4)), ValueError, "stamp must be finite"),
         (lambda live: live.push_image("1.0", PICTURE), TypeError, "stamp must be a number of seconds, got str"),
         (lambda live: live.push_image(0, PICTURE[..., 0]), ValueError, r"\[H, W, 3\] RGB"),
         (lambda live: live.push_image(0, np.stack([PICTURE] * 2)), ValueError, "must be one image"),
@@ -353,6 +372,11 @@ def test_sigterm_saves_and_comes_again_to_the_handler_before(model, tmp_path):
         with LiveDepth(model, print, K, at_sigterm=True):
             assert signal.getsignal(signal.SIGTERM) != handler
         assert signal.getsignal(signal.SIGTERM) == handler
+        first, second = (LiveDepth(model, print, K, at_sigterm=True) for _ in range(2))
+        for one in (first, second):  # the first one's handler is beneath the second's
+            one.close()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert received == [signal.SIGTERM] * 2
     finally:
         signal.signal(signal.SIGTERM, before)
 

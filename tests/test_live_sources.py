@@ -95,6 +95,7 @@ def test_a_folder_that_grows(tmp_path):
     (folder / "2.0.png").write_bytes(content(image)[:40])  # still being written
     (folder / "3.0.png").write_bytes(content(image))
     (folder / "notes.txt").write_text("no image")
+    (folder / "0.png").symlink_to("nowhere.png")
     (tmp_path / "poses.txt").write_text("2.5 0 0 0 0 0 0 1\n")
     time.sleep(0.1)
     (folder / "2.0.png").write_bytes(content(image))
@@ -139,6 +140,11 @@ def test_lines_of_json(tmp_path):
         ('{"stamp": 1, "pose": [[1, 2], [3]]}', "line 1: "),
         ('{"stamp": 1, "image": "none.png"}', r"line 1: .*none\.png"),
         ('{"stamp": 1, "image": "data:;base64,%"}', "line 1: "),
+        *(
+            (f'{{"stamp": {stamp}, "pose": [1, 2, 3, 0, 0, 0, 1]}}', "line 1: .*(finite|too large)")
+            for stamp in ("NaN", "1e999", 10**400)
+        ),
+        ("[" * 100000, "line 1: "),
         ('{"stamp": 1, "image": 5}', "line 1: an image is the name of a file, got 5"),
     ],
 )

@@ -104,8 +104,17 @@ def test_what_makes_no_sense_is_refused():
     decision = TrainDecision(0.1)
     decision.learn(torch.ones(3), 1.0)
     for statistics, gain in ((torch.ones(4), 1.0), (torch.ones(3), math.nan)):
-        with pytest.raises(ValueError, match="3 finite values as before"):
+        with pytest.raises(ValueError, match=r"3 finite values as before|gain and statistics must be finite"):
             decision.learn(statistics, gain)
+    huge = torch.full((3,), 1e200, dtype=torch.float64)
+    for call, message in (
+        (lambda: decision.learn(huge, 1.0), "so their squares"),
+        (lambda: decision.expected(torch.ones(4)), "3 finite values as before"),
+        (lambda: decision.expected(torch.full((3,), math.nan)), "3 finite values as before"),
+        (lambda: TrainDecision(0.1).expected(torch.ones(3)), r"needs learn\(\) before"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 @pytest.mark.slow

@@ -92,6 +92,8 @@ def test_the_reader_is_everywhere(walk, tmp_path, capfd):
     [
         ("x = 1", "has none of READERS, METHODS, METRICS"),
         ("READERS = {'mine': 3}", "readers: 'mine' lacks detect"),
+        ("READERS = ['mine']", "READERS must be a dict by name"),
+        ("METHODS = {3: print}", "METHODS must be a dict by name"),
         ("METRICS = {'Mine': 3}", "metrics: 'Mine' lacks add"),
         ("METHODS = {'My-one': print}", "methods: 'My-one' needs small letters"),
     ],

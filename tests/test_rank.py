@@ -81,6 +81,7 @@ def test_the_best_come_first():
     assert choose([1.0, 3.0, math.nan, 3.0, 2.0]) == [1, 3, 4, 0]
     assert choose([1.0, 3.0, math.nan, 3.0, 2.0], 2) == [1, 3]
     assert choose([]) == []
+    assert choose([math.nan, -math.inf, 1.0], 3) == [2], "a score of -inf is none"
 
 
 def test_a_diverse_choice_leaves_out_neighbours():
@@ -103,6 +104,11 @@ def test_choices_that_make_no_sense_are_refused():
         choose([1.0, 2.0], poses=torch.eye(4)[None])
     with pytest.raises(ValueError, match="scores of at least 0"):
         choose([1.0, -2.0], poses=along([0.0, 1.0]))
+    with pytest.raises(ValueError, match="count must lie in"):
+        choose([1.0, 2.0], 1.5)
+    with pytest.raises(ValueError, match="poses must be finite"):
+        choose([1.0, 2.0], poses=along([0.0, math.nan]))
+    assert choose([1.0, math.nan], poses=along([0.0, math.nan])) == [0], "a pose without a score does not count"
 
 
 def test_a_sampler_follows_the_scores():
@@ -116,9 +122,15 @@ def test_a_sampler_follows_the_scores():
     assert set(sampler) == {0}
     best = UncertaintySampler([1.0, 5.0, 3.0, 4.0], 2, top=True)
     assert sorted(best) == [1, 3]
-    for scores, count, message in (([-1.0, 2.0], 1, "at least 0"), ([math.nan], 1, "some above"), ([1.0], 0, "count")):
+    for scores, count, message in (
+        ([-1.0, 2.0], 1, "at least 0"),
+        ([math.nan], 1, "some above"),
+        ([1.0], 1.5, "count"),
+    ):
         with pytest.raises(ValueError, match=message):
             UncertaintySampler(scores, count)
+    with pytest.raises(ValueError, match="count must be a whole number of at least 1"):
+        UncertaintySampler([1.0], 0)
     with pytest.raises(ValueError, match="at most the 1 scored"):
         UncertaintySampler([1.0, 0.0], 2, top=True)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import random
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,9 +12,10 @@ import layouts
 import layouts_bag as written
 import numpy as np
 import pytest
+from PIL import Image
 
 from ufmstar_torch import cli
-from ufmstar_torch.eval.sequences import FrameError, open_sequence, ros_messages
+from ufmstar_torch.eval.sequences import FrameError, bag, open_sequence, ros_messages
 from ufmstar_torch.eval.sequences.lens import Lens
 
 KINDS = ("ros1", "db3", "mcap")
@@ -67,6 +69,10 @@ def test_encodings(encoding):
     np.testing.assert_allclose(ros_messages.colour(message, Path("a.bag")).astype(int), expected, atol=4)
     message.data = message.data[:-1]
     with pytest.raises(FrameError, match="an image of 6x4"):
+        ros_messages.colour(message, Path("a.bag"))
+    message.height, message.width, message.encoding = 1, 5, "yuv422_yuy2"
+    message.step, message.data = 10, np.zeros(10, np.uint8)
+    with pytest.raises(FrameError, match="must have an even width, got 5"):
         ros_messages.colour(message, Path("a.bag"))
     message.encoding = "rgb16"
     with pytest.raises(FrameError, match=r"encoding must be one of rgb8, .* got 'rgb16'"):
@@ -195,6 +201,23 @@ def test_a_trajectory_replaces_the_poses(tmp_path):
     lines = [f"{t:.9f} {layouts.quaternion_line(T)}" for t, T in zip(times, truth.T_world_cam, strict=True)]
     (tmp_path / "slam.txt").write_text("\n".join(lines))
     require_same(open_sequence(path, trajectory=tmp_path / "slam.txt"), truth, 6e-4)
+
+
+@pytest.mark.parametrize("mode", ["1", "P", "L", "RGB"])
+def test_compressed_depth_of_fewer_bits_is_no_depth(mode):
+    content = BytesIO(bytes(12))
+    content.seek(12)
+    Image.new(mode, (4, 4)).save(content, "png")
+    message = SimpleNamespace(data=np.frombuffer(content.getvalue(), np.uint8), format="16UC1; compressedDepth png")
+    with pytest.raises(FrameError, match="one channel of 16 bits"):
+        ros_messages.depth(message, None, Path("a.bag"))
+
+
+def test_a_topic_whose_messages_are_missing_is_named(tmp_path, monkeypatch):
+    path, _ = written.write_bag(tmp_path)
+    monkeypatch.setattr(bag.Bag, "messages", lambda *_: iter(()))
+    with pytest.raises(ValueError, match="should have messages, but has none"):
+        open_sequence(path)
 
 
 @pytest.mark.parametrize("kind", KINDS)

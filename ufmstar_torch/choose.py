@@ -18,7 +18,8 @@ def choose(
     distance: float = 1.0,
     sequences: Sequence[object] | None = None,
 ) -> list[int]:
-    """The images with the highest scores, best first; of equal ones the earlier. NaN = no score: never chosen.
+    """The images with the highest scores, best first; of equal ones the earlier. NaN or -inf = no score: never
+    chosen.
 
     With ``poses`` the choice is diverse, a greedy farthest-point choice weighted by the scores: the next image is the
     one with the largest s_i min(1, min_j d_ij) over the chosen j, where d_ij = |t_i - t_j| / distance + the angle
@@ -27,20 +28,22 @@ def choose(
     Args:
         scores: [N], with ``poses`` not negative.
         count: None = all that have a score.
-        poses: [N, 4, 4] camera-to-world [m].
+        poses: [N, 4, 4] camera-to-world [m], finite where there is a score.
         distance: to what the camera sees, its median depth, say [m].
         sequences: which sequence each image is of; views of different ones are as far as can be. None = one.
 
     Raises:
-        ValueError: shapes that disagree, a negative score or distance with poses, or a count out of range.
+        ValueError: shapes that disagree, a negative score or distance with poses, a pose that is not finite, or a count
+            that is no whole number or out of range.
     """
     score = torch.as_tensor(scores, dtype=torch.float64)
     if score.dim() != 1:
         raise ValueError(f"scores must be [N], got {tuple(score.shape)}")
-    known = int((~score.isnan()).sum())
-    if count is not None and not 0 <= count <= len(score):
-        raise ValueError(f"count must lie in 0 to the number of images {len(score)}, got {count}")
     left = torch.where(score.isnan(), -torch.inf, score)
+    scored = left > -torch.inf
+    known = int(scored.sum())
+    if count is not None and not (isinstance(count, int) and 0 <= count <= len(score)):
+        raise ValueError(f"count must lie in 0 to the number of images {len(score)}, got {count}")
     count = known if count is None else min(count, known)
     if poses is None:
         order: list[int] = left.argsort(descending=True, stable=True)[:count].tolist()
@@ -49,6 +52,8 @@ def choose(
         raise ValueError(f"poses must be [{len(score)}, 4, 4], one of each score, and sequences as many")
     if bool((score < 0).any()) or not distance > 0:
         raise ValueError(f"a diverse choice needs scores of at least 0 and a positive distance, got {distance}")
+    if not bool(poses[scored].isfinite().all()):
+        raise ValueError("poses must be finite where there is a score")
     position, direction = poses[:, :3, 3].double(), poses[:, :3, 2].double()
     names = {name: number for number, name in enumerate(dict.fromkeys(sequences or ()))}
     sequence = torch.tensor([names[name] for name in sequences]) if sequences is not None else torch.zeros(len(score))
@@ -97,8 +102,9 @@ class UncertaintySampler(Sampler[int]):
         taken = int((score > 0).sum())
         if score.dim() != 1 or not bool((score.isfinite() & (score >= 0)).all()) or not taken:
             raise ValueError(f"scores must be [N] of at least 0, some above, or NaN, got {tuple(score.shape)}")
-        if self.count < 1 or (self.top and self.count > taken):
-            raise ValueError(f"count must be at least 1, with top at most the {taken} scored images, got {self.count}")
+        if not isinstance(self.count, int) or self.count < 1 or (self.top and self.count > taken):
+            most = f"with top at most the {taken} scored images, got {self.count}"
+            raise ValueError(f"count must be a whole number of at least 1, {most}")
         self.scores = score
 
     def __iter__(self) -> Iterator[int]:

@@ -76,7 +76,8 @@ class Learnt:
     def added(self, c: Tensor, y: Tensor, w: Tensor, limit: int) -> Learnt:
         """With the anchors of a frame [B, n], of which at most ``limit`` are taken, evenly; the oldest go."""
         taken = evenly(w > 0, limit)
-        every = [torch.cat(pair, 1) for pair in ((self.c, c), (self.y, y), (self.w, torch.where(taken, w, 0)))]
+        pairs = ((self.c, c), (self.y, y), (self.w, w))
+        every = [torch.cat([own, torch.where(taken, new, 0)], 1) for own, new in pairs]
         order = (every[2] > 0).to(torch.int8).argsort(dim=1, stable=True)[:, c.shape[1] :]
         return replace(self, **dict(zip("cyw", (value.gather(1, order) for value in every), strict=True)))
 
@@ -234,4 +235,4 @@ def as_confidence(given: Any, frame: FrameInput) -> Tensor:
     size = tuple(frame.depth.shape)
     c = require_float("confidence", given, [size, (size[0], 1, *size[1:])], frame.depth).detach()
     limit = torch.finfo(torch.float32).max
-    return c.reshape(size).clamp(-limit, limit).float()
+    return c.reshape(size).float().clamp(-limit, limit)

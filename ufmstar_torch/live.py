@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import signal
+import sys
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -118,8 +119,8 @@ class LiveDepth:
         TypeError, ValueError: an argument is impossible.
         FileNotFoundError: the folder of ``state`` does not exist.
 
-    An error of the model or of ``on_result`` ends the worker; every later ``push_*``, ``reset``, ``wait_idle`` and
-    ``close`` raises it.
+    An error of the model, of ``on_result`` or of saving ends the worker; every later ``push_*``, ``reset``,
+    ``wait_idle`` and ``close`` raises it.
 
     Example::
 
@@ -278,10 +279,10 @@ class LiveDepth:
             self._changed.notify_all()
         if current_thread() is not self._worker:
             self._worker.join()
-        if self._before is not None and current_thread() is main_thread():
-            before, self._before = self._before, None
-            if signal.getsignal(signal.SIGTERM) == self._terminate:
-                signal.signal(signal.SIGTERM, before)
+        ours = current_thread() is main_thread() and signal.getsignal(signal.SIGTERM) == self._terminate
+        if self._before is not None and ours:  # else a later handler may lead to ours
+            signal.signal(signal.SIGTERM, self._before)
+            self._before = None
 
     def _terminate(self, number: int, _: FrameType | None) -> None:
         """Handler of SIGTERM: the worker ends, saves, and sends the signal again, to the handler before."""
@@ -313,14 +314,14 @@ class LiveDepth:
         if unsaved:
             self._save()
 
-    def _next(self) -> tuple[_Waiting, np.ndarray] | None:
-        """The next image and its pose, as soon as there is one; None = the end."""
+    def _next(self) -> tuple[_Waiting, np.ndarray, bool] | None:
+        """The next image, its pose, and whether to reset the model before, as soon as there is one; None = the end."""
         with self._changed:
             self._busy = False
             while not self._ending:
                 if (chosen := self._choose(perf_counter())) is not None:
-                    self._busy = True
-                    return chosen
+                    self._busy, resetting, self._resetting = True, self._resetting, False
+                    return *chosen, resetting
                 self._changed.notify_all()
                 oldest = self._waiting[0].received if self._waiting else math.inf
                 wait = oldest + self._max_wait - perf_counter()
@@ -353,10 +354,9 @@ class LiveDepth:
         trajectory = Trajectory(np.array(self._times[around]), np.stack(self._poses[around]))
         return interpolate_pose(trajectory, stamp, self._max_gap)
 
-    def _process(self, frame: _Waiting, T: np.ndarray) -> bool:
+    def _process(self, frame: _Waiting, T: np.ndarray, resetting: bool) -> bool:
         """Predict and deliver an image; whether the state has changed."""
-        if self._resetting:
-            self._resetting = False
+        if resetting:
             self.model.reset()
         started = perf_counter()
         out = self.model(frame.image, T, frame.intrinsics)
@@ -395,7 +395,7 @@ def _seconds(stamp: float) -> float:
     """A finite stamp. Raises TypeError, ValueError: it is none."""
     if isinstance(stamp, bool) or not isinstance(stamp, float | int | np.floating | np.integer):
         raise TypeError(f"stamp must be a number of seconds, got {type(stamp).__name__}")
-    if not math.isfinite(stamp):
+    if not abs(stamp) < sys.float_info.max:
         raise ValueError(f"stamp must be finite [s], got {stamp}")
     return float(stamp)
 

@@ -42,7 +42,7 @@ def image_statistics(result: MeanUncertainty, motion: Tensor) -> Tensor:
     used = result.statistics.anchors_used
     landmarks = 0.0 if used is None else float(used) / max(1, int(result.statistics.valid_pixels))
     more = [float(result.measured), float(T[:3, 3].norm()) / max(depth, _TINY), angle, landmarks]
-    return torch.tensor([*values, *more], dtype=torch.float64).nan_to_num(0.0)
+    return torch.tensor([*values, *more], dtype=torch.float64).nan_to_num(0.0, 0.0, 0.0)
 
 
 def _logarithms(part: SampleStatistics) -> list[float]:
@@ -94,22 +94,36 @@ class TrainDecision:
         Raises:
             ValueError: another number of statistics than before, or a value that is not finite.
         """
-        z = torch.cat([torch.ones(1), statistics.flatten(), torch.tensor([gain])]).double()
-        if not bool(z.isfinite().all()) or len(self._sums) not in (0, len(z)):
-            expected = len(self._sums) - 2 if len(self._sums) else "some"
-            raise ValueError(f"statistics must be {expected} finite values as before, and gain finite; got {z[1:]}")
-        self._sums = self._keep * (self._sums if len(self._sums) else torch.zeros_like(z).outer(z)) + z.outer(z)
+        z = torch.cat([torch.ones(1), self._checked(statistics), torch.tensor([gain], dtype=torch.float64)])
+        if not bool((squares := z.outer(z)).isfinite().all()):
+            raise ValueError(f"gain and statistics must be finite, and so their squares, got {z[1:].tolist()}")
+        self._sums = self._keep * (self._sums if len(self._sums) else torch.zeros_like(squares)) + squares
         self.updates += 1
 
     def expected(self, statistics: Tensor) -> tuple[float, float]:
-        """The expected gain of an update on an image with these statistics [F], and its standard error."""
+        """The expected gain of an update on an image with these statistics [F], and its standard error.
+
+        Raises:
+            ValueError: as :meth:`learn`, or nothing was learnt yet.
+        """
+        if not self.updates:
+            raise ValueError("an expected gain needs learn() before")
+        statistics = self._checked(statistics)
         n, mean = self._sums[0, 0], self._sums[0, 1:] / self._sums[0, 0]
         covariance = self._sums[1:, 1:] / n - mean.outer(mean)
         scale = covariance.diagonal().clamp_min(_TINY**2).sqrt()
         correlation = covariance / scale.outer(scale)
         precision = n * correlation[:-1, :-1] + torch.eye(len(scale) - 1, dtype=torch.float64)
-        x = ((statistics.double() - mean[:-1]) / scale[:-1]).clamp(-3, 3)
+        x = ((statistics - mean[:-1]) / scale[:-1]).clamp(-3, 3)
         weights = torch.linalg.solve(precision, n * correlation[:-1, -1])
         unexplained = (1 - weights @ correlation[:-1, -1]).clamp(0, 1)
         spread = (unexplained * (1 / n + x @ torch.linalg.solve(precision, x))).sqrt()
         return float(mean[-1] + scale[-1] * (x @ weights)), float(scale[-1] * spread)
+
+    def _checked(self, statistics: Tensor) -> Tensor:
+        """[F] float64. Raises ValueError: not as many as before, or not finite."""
+        values, known = statistics.detach().flatten().double(), len(self._sums) - 2
+        if not bool(values.isfinite().all()) or known not in (-2, len(values)):
+            expected = known if known > 0 else "some"
+            raise ValueError(f"statistics must be {expected} finite values as before, got {values.tolist()}")
+        return values

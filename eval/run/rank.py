@@ -93,7 +93,7 @@ class ImageScores(FrameSink):
         """Numbers of the images to label, the first one first (``ufmstar_torch.choose``)."""
         score = torch.tensor([image.score for image in self.images], dtype=torch.float64)
         count = None if count is None else min(count, len(score))
-        if not diverse or not len(score):
+        if not diverse or bool(score.isnan().all()):
             return choose(score, count)
         poses = torch.from_numpy(np.stack([image.T_world_cam for image in self.images]))
         distance = float(np.nanmedian([image.depth for image in self.images]))

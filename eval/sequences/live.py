@@ -141,7 +141,10 @@ def growing_folder(
         for path in sorted(folder.iterdir()):
             if path.name in seen or path.suffix.lower() not in IMAGE_SUFFIXES:
                 continue
-            written = path.stat().st_mtime
+            try:
+                written = path.stat().st_mtime
+            except OSError:  # it was removed, or is a link to nothing
+                continue
             try:
                 image = read_color(path)
             except FrameError:
@@ -181,10 +184,12 @@ def json_lines(
             if "stamp" not in about or not about.keys() & {"pose", "image"}:
                 raise ValueError("a stamp and a pose or an image are needed")
             stamp = float(about["stamp"])
+            if not math.isfinite(stamp):
+                raise ValueError(f"stamp must be finite [s], got {stamp}")
             pose = _pose(about["pose"], convert, scale) if "pose" in about else None
             image = _image(about["image"], Path(folder)) if "image" in about else None
             K = None if "intrinsics" not in about else np.array(about["intrinsics"], dtype=np.float64)
-        except (ValueError, TypeError, FrameError, binascii.Error) as error:
+        except (ValueError, TypeError, OverflowError, RecursionError, FrameError, binascii.Error) as error:
             raise ValueError(f"line {number}: {error}") from error
         yield LiveEvent(stamp, image, pose, K)
 

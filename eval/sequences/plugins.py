@@ -50,7 +50,10 @@ def _load(files: tuple[str, ...]) -> Plugins:
     for file in files:
         module, before = _module(Path(file)), sum(map(len, found.values()))
         for kind in _NEEDED:
-            for name, value in getattr(module, kind.upper(), {}).items():
+            named = getattr(module, kind.upper(), {})
+            if not isinstance(named, Mapping) or not all(isinstance(name, str) for name in named):
+                raise ValueError(f"{file}: {kind.upper()} must be a dict by name, got {named!r:.80}")
+            for name, value in named.items():
                 _add(found[kind], kind, name, value, file)
         if sum(map(len, found.values())) == before:
             raise ValueError(f"--plugin {file} has none of {', '.join(kind.upper() for kind in _NEEDED)}")

@@ -53,6 +53,8 @@ def colour(message: Any, path: Path) -> np.ndarray:
         raise FrameError(path, f"an image's encoding must be one of {', '.join(_COLOURS)}, got {message.encoding!r}")
     channels, conversion = _COLOURS[message.encoding]
     pixels = _rows(message, np.dtype(np.uint8), channels, path)
+    if "YUV" in (conversion or "") and pixels.shape[1] % 2:  # two pixels share their colour
+        raise FrameError(path, f"an image in {message.encoding} must have an even width, got {pixels.shape[1]}")
     if conversion is None:
         return pixels
     import cv2
@@ -80,11 +82,11 @@ def _compressed_depth(data: bytes, form: str, path: Path) -> np.ndarray:
     try:
         _, a, b = struct.unpack_from("<iff", data)
         with Image.open(BytesIO(data[12:])) as image:
-            values = np.array(image)
+            values, mode = np.array(image), image.mode
     except (struct.error, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise FrameError(path, f"compressed depth ({form[:40]!r}) must be PNG: {error}") from error
-    if values.ndim != 2:
-        raise FrameError(path, f"compressed depth must have one channel, got {list(values.shape)}")
+    if not mode.startswith("I"):
+        raise FrameError(path, f"compressed depth must have one channel of 16 bits, got {mode!r}")
     if not form.startswith("32FC1"):
         return values.astype(np.uint16)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -97,7 +99,7 @@ def _rows(message: Any, kind: np.dtype, channels: int, path: Path) -> np.ndarray
     used, data = width * channels * kind.itemsize, np.asarray(message.data, np.uint8)
     if not (0 < used <= step and height > 0 and data.size == step * height):
         raise FrameError(path, f"an image of {width}x{height} {message.encoding} has {data.size} bytes, {step} a row")
-    pixels = np.ascontiguousarray(data.reshape(height, step)[:, :used]).view(kind)
+    pixels = data.reshape(height, step)[:, :used].copy().view(kind)  # of a bag's own memory, which is read-only
     return pixels if channels == 1 else pixels.reshape(height, width, channels)
 
 
