@@ -17,6 +17,7 @@ from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence, read_trajectory
 from ufmstar_torch.eval.sequences.bag import Bag
+from ufmstar_torch.eval.sequences.images import read_depth
 
 
 @pytest.fixture(scope="module")
@@ -111,13 +112,21 @@ def test_transforms_are_read_back(finished):
         np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-9)
         np.testing.assert_allclose(frame.intrinsics, truth.K, atol=1e-9)
         np.testing.assert_array_equal(frame.image, truth.images[i])
-        np.testing.assert_allclose(frame.depth[20:], truth.depths[i][20:], atol=1.1e-3)
-        assert not frame.depth[:20].any()
+        assert frame.depth is None  # a prediction is no ground truth
+        depth = read_depth(out / "export" / "transforms" / "depth" / f"{frame.name}.png")
+        np.testing.assert_allclose(depth[20:], truth.depths[i][20:], atol=1.1e-3)
+        assert not depth[:20].any()
 
 
 def test_what_is_no_run_is_named(finished, tmp_path, capfd):
-    assert cli.main(["export", str(tmp_path), "--to", "depth"]) == 2
-    assert "no output of `ufmstar run`" in capfd.readouterr().err
+    for kind in ("depth", "mcap"):
+        assert cli.main(["export", str(tmp_path), "--to", kind]) == 2
+        said = capfd.readouterr()
+        assert said.out == ""
+        assert said.err.count("\n") == 1
+        assert "no output of `ufmstar run`" in said.err
+    assert cli.main(["export", str(finished[0])]) == 2
+    assert "required: --to" in capfd.readouterr().err
     assert cli.main(["export", str(finished[0]), "--to", "cloud", "--voxel", "0"]) == 2
     assert "--voxel must be positive" in capfd.readouterr().err
     assert cli.main(["export", str(finished[0]), "--to", "mesh"]) == 2
@@ -127,13 +136,15 @@ def test_a_bag_is_read_back(finished):
     out, _, truth = finished
     for _ in range(2):  # the second replaces the first
         assert cli.main(["export", str(out), "--to", "mcap", "--max-sigma", "0.9"]) == 0
-    again = open_sequence(out / "export" / "bag")
+    assert open_sequence(out / "export" / "bag")[0].depth is None  # a prediction is no ground truth
+    again = open_sequence(out / "export" / "bag", topics=["/camera/depth"])
     assert (again.layout, len(again), again.skipped) == ("bag", 6, ())
     for i, frame in enumerate(again):
         assert frame.timestamp == 7 + i
         np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-7)
         np.testing.assert_allclose(frame.intrinsics, truth.K, atol=1e-9)
         np.testing.assert_array_equal(frame.image, truth.images[i])
+        assert frame.image.flags.writeable  # torch warns of others
         np.testing.assert_allclose(frame.depth[20:], truth.depths[i][20:], atol=1e-3)
         assert not frame.depth[:20].any()
     sigma = open_sequence(out / "export" / "bag", topics=["/camera/sigma"])

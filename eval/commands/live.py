@@ -252,7 +252,7 @@ def _say(result: LiveResult, live: LiveDepth, times: RealTime, *, as_json: bool)
         return
     depth, std, counts = result.out.depth, result.out.std, live.statistics
     about = {
-        "stamp": result.stamp,
+        "stamp": round(result.stamp, 6),
         "latency_ms": round(1000 * result.latency, 2),
         "depth_m": round(float(depth.median()), 3),
         "sigma_m": round(float(std.nanmedian()), 3),
@@ -263,7 +263,7 @@ def _say(result: LiveResult, live: LiveDepth, times: RealTime, *, as_json: bool)
     if as_json:
         print(json.dumps(about), flush=True)
     else:
-        print("  ".join(f"{name} {value:g}" for name, value in about.items()), file=sys.stderr, flush=True)
+        print("  ".join(f"{name} {value}" for name, value in about.items()), file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -220,12 +220,12 @@ def realtime_table(summary: Mapping[str, Any]) -> str:
     counts += [f"{count} {reason}" for reason, count in (summary["dropped"] | summary["skipped"]).items()]
     lost, ours = (None if summary[name] is None else 100 * summary[name] for name in ("lost_share", "ours_share"))
     memory = ("memory", summary["memory_bytes"]), ("growth", summary["memory_growth_bytes"])
-    megabytes = ", ".join(f"{name} {'-' if value is None else f'{value / 1e6:.1f}'} MB" for name, value in memory)
+    megabytes = [f"{name} {value / 1e6:.1f} MB" for name, value in memory if value is not None]
     return "\n".join(
         [
             *aligned(rows),
             f"{'; '.join(counts)}: {number(lost)} % dropped or skipped, {number(summary['per_second'])} per second",
-            f"UfM*'s share of the time: {number(ours)} %; {megabytes}",
+            "; ".join([f"UfM*'s share of the time: {number(ours)} %", *megabytes]),
         ]
     )
 

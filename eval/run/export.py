@@ -56,6 +56,10 @@ def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iter
     """
     if not (out / RECORDS).is_file():
         raise ValueError(f"{out} is no output of `ufmstar run`: it has no {RECORDS}")
+    return _gated(out, max_sigma, max_relative_sigma)
+
+
+def _gated(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
     for record in read_records((out / RECORDS).read_bytes(), out / RECORDS):
         if record["state"] != "done":
             continue

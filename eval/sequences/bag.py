@@ -221,6 +221,12 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         raise ValueError(f"{bag.path} has no camera info: pass intrinsics")
     same_view = [name for name, frame in depths.items() if frame == images[image]]
     so_called = [name for name in same_view if name in named or "depth" in name.lower()]  # not a map of sigma
+    predicted = [name for name in so_called if name.rsplit("/", 1)[0] + "/sigma" in depths and name not in named]
+    if predicted:
+        LOGGER.warning("%s: no ground truth: %s is a prediction, with a sigma beside it", bag.path, predicted[0])
+        same_view = [name for name in same_view if name in named]
+        depths = {name: depths[name] for name in same_view}
+        so_called = [name for name in so_called if name not in predicted]
     depth = _one("the depth", bag, so_called or same_view, named, types)
     other = [name for name in named if name in depths and name not in same_view]
     if other:

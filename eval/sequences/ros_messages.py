@@ -99,7 +99,7 @@ def _rows(message: Any, kind: np.dtype, channels: int, path: Path) -> np.ndarray
     used, data = width * channels * kind.itemsize, np.asarray(message.data, np.uint8)
     if not (0 < used <= step and height > 0 and data.size == step * height):
         raise FrameError(path, f"an image of {width}x{height} {message.encoding} has {data.size} bytes, {step} a row")
-    pixels = np.ascontiguousarray(data.reshape(height, step)[:, :used]).view(kind)
+    pixels = data.reshape(height, step)[:, :used].copy().view(kind)  # of a bag's own memory, which is read-only
     return pixels if channels == 1 else pixels.reshape(height, width, channels)
 
 

@@ -20,11 +20,13 @@ from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, depth_loader, im
 from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS
+from ufmstar_torch.stream_warnings import LOGGER
 
 FILE = "transforms.json"
 LOOKED_FOR = f"{FILE}, also in one of its own name *.json"
 # Of a file or of one of its frames that structure from motion made.
 _NOT_METRIC = ("aabb_scale", "colmap_im_id")
+_SIGMA = "sigma_file_path"  # of a frame of `ufmstar export`
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
 _MODELS = (*_FISHEYES, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "")
@@ -64,9 +66,11 @@ def read(path: Path, options: Options) -> FrameSequence:
         except FrameError:
             entries.append(Skipped(name, "the image's header cannot be read"))
             continue
-        depth = frame.get("depth_file_path")
+        depth = None if _SIGMA in frame else frame.get("depth_file_path")
         load_depth = depth_loader(file.parent / depth, scale, scale) if isinstance(depth, str) else None
         entries.append(Entry(name, _pose(frame, file), partial(read_color, found), load_depth))
+    if any(_SIGMA in frame for frame in frames):
+        LOGGER.warning("%s: no ground truth: its depth is a prediction, with a sigma beside it", file)
     metric = not any(key in part for part in (content, *frames) for key in _NOT_METRIC)
     name = file.parent.resolve().name if file.name == FILE else file.stem
     return sequence_of_lenses(name, "transforms", entries, lenses, file.parent, options, metric=metric)
