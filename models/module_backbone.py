@@ -76,7 +76,12 @@ class ModuleSpec(Checked):
                 read.pop(name, None)  # the order is that of the last calls
                 read[name] = value.shape[1]
 
-        hooks = [m.register_forward_pre_hook(lambda _, x, name=n: note(name, x[0])) for n, m in named.items()]
+        hooks = [
+            m.register_forward_pre_hook(
+                lambda _, x, by_name, name=n: note(name, next(iter((*x, *by_name.values())), None)), with_kwargs=True
+            )
+            for n, m in named.items()
+        ]
         image = preprocess.apply_image(torch.full((1, 3, *_PROBE), 128, dtype=torch.uint8))
         first = next(network.parameters(), image)
         try:
@@ -143,12 +148,16 @@ class ModuleBackbone(Backbone):
         its specification says."""
         size, read = (image.shape[-2], image.shape[-1]), [image]
 
-        def replace(_: nn.Module, inputs: tuple[Any, ...]) -> tuple[Any, ...]:
-            read[0] = self.dropout(inputs[0])
-            return (read[0], *inputs[1:])
+        def replace(_: nn.Module, inputs: tuple[Any, ...], by_name: dict[str, Any]) -> Any:
+            first, *others = (*inputs, *by_name.values())
+            read[0] = self.dropout(first)
+            values = [read[0], *others]
+            named = dict(zip(by_name, values[len(inputs) :], strict=True))
+            return tuple(values[: len(inputs)]), named
 
         # For the length of a call: a copy of the network, or one of its layers, would take a lasting hook with it.
-        hooks = [self.network.get_submodule(self.part).register_forward_pre_hook(replace)] if self.part else []
+        part = self.network.get_submodule(self.part) if self.part else None
+        hooks = [] if part is None else [part.register_forward_pre_hook(replace, with_kwargs=True)]
         try:
             output = self.network(image)
         finally:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import layouts
 import numpy as np
@@ -171,6 +172,25 @@ def test_a_bag_without_the_recording_has_the_maps_own_pixels(finished, tmp_path)
         open_sequence(tmp_path / "export" / "bag")
     _, info = next(Bag(tmp_path / "export" / "bag").messages(["/camera/camera_info"]))
     np.testing.assert_allclose(info.k.reshape(3, 3), truth.K, atol=1e-9)
+
+
+def test_a_bag_that_cannot_be_written_leaves_the_one_before(finished, tmp_path):
+    from ufmstar_torch.eval.run.export import gated_frames
+    from ufmstar_torch.eval.run.export_bag import export_bag
+
+    frames, folder = list(gated_frames(finished[0], np.inf, np.inf))[:2], tmp_path / "export" / "bag"
+    for _ in range(2):
+        export_bag(iter(frames), tmp_path, None)
+    for seconds in (np.nan, np.inf, 1e12):
+        with pytest.raises(ValueError, match=f"{frames[1].name}: a bag's times are within 0 to"):
+            export_bag(iter([frames[0], replace(frames[1], timestamp=seconds)]), tmp_path, None)
+    assert len(list(Bag(folder).messages(["/tf"]))) == 2
+    assert [path.name for path in folder.parent.iterdir()] == ["bag"]
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "export").mkdir()
+    (tmp_path / "linked" / "export" / "bag").symlink_to(folder)
+    with pytest.raises(ValueError, match="is no folder of an earlier export"):
+        export_bag(iter(frames), tmp_path / "linked", None)
 
 
 def test_a_rerun_recording(finished):

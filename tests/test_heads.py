@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from onnx_files import small_network
 from scipy import stats
 from tiny_networks import Linear, constant_head
-from torch import Tensor
+from torch import Tensor, nn
 
 from ufmstar_torch.models import (
     EvidentialDepth,
@@ -21,6 +21,8 @@ from ufmstar_torch.models import (
     with_head,
 )
 from ufmstar_torch.models.heads import BETA_FLOOR, EVIDENCE_FLOOR, HEADS, LOG_VARIANCE_RANGE, soft_range
+from ufmstar_torch.models.module_backbone import ModuleBackbone, ModuleSpec
+from ufmstar_torch.models.preprocess import Preprocess
 
 DTYPES = (torch.float32, torch.float16, torch.bfloat16)
 LOW, HIGH = LOG_VARIANCE_RANGE
@@ -151,3 +153,23 @@ def test_coarse_heads_learn_and_do_not_predict(method: str) -> None:
     assert torch.equal(network(x).depth, single(x).depth)
     with pytest.raises(ValueError, match="scales must be from 1 to 5 of this backbone, got 6"):
         with_head(small_network(), method, 6)
+
+
+def test_a_part_that_is_called_by_keyword_is_read_as_any_other() -> None:
+    class Network(nn.Module):
+        def __init__(self, named: bool) -> None:
+            super().__init__()
+            self.widen, self.last, self.named = nn.Conv2d(3, 5, 1), nn.Conv2d(5, 1, 1), named
+
+        def forward(self, image: torch.Tensor) -> torch.Tensor:
+            x = self.widen(image)
+            return 1 + (self.last(input=x) if self.named else self.last(x)).square()
+
+    image, found = torch.rand(2, 3, 7, 9, generator=torch.Generator().manual_seed(0)), []
+    for named in (False, True):
+        torch.manual_seed(0)
+        network = Network(named)
+        spec = ModuleSpec.of(network, Preprocess(size=(24, 32)))
+        assert (spec.part, spec.channels) == ("last", 5)
+        found.append(ModuleBackbone(network, spec).eval().features(image))
+    assert torch.equal(*found)

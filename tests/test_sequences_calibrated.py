@@ -340,6 +340,8 @@ def test_hostile_arkit_folders(tmp_path):
         (good.replace(" qw", " q"), "must name the column 'qw'"),
         ("\n".join([lines[0], lines[1] + ", 1"]), "odometry.csv:2: expected 9 numbers as in the first line, got 10"),
         (good.replace("000003", "3.5"), "odometry.csv:5: the frame must be a number from 0 on, got 3.5"),
+        (good.replace("000003", "inf"), "odometry.csv:5: the frame must be a number from 0 on, got inf"),
+        (good.replace("\n100.0,", "\nnan,"), "odometry.csv:2: the timestamp must be finite"),
         (lines[0], "has no usable frame"),
     ):
         (path / "odometry.csv").write_text(text)
@@ -365,6 +367,7 @@ def test_hostile_arkit_folders(tmp_path):
     sequence = open_sequence(path / "41048190_frames")
     assert [skipped.reason for skipped in sequence.skipped] == ["no camera at its time"]
     np.testing.assert_allclose(sequence[0].T_world_cam, truth.T_world_cam[0], atol=1e-9)
-    cameras[2].write_text("64 48 50 -50 31 23")
-    with pytest.raises(ValueError, match="expected width height fx fy cx cy"):
-        open_sequence(path)
+    for content in ("64 48 50 -50 31 23", "0.5 48 50 50 31 23"):
+        cameras[2].write_text(content)
+        with pytest.raises(ValueError, match="expected width height fx fy cx cy"):
+            open_sequence(path)

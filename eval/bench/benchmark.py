@@ -13,11 +13,12 @@ from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.parts import MULTIVIEW
 from ufmstar_torch.eval.bench.settings import ARCHITECTURES, TOUR, BenchSettings
+from ufmstar_torch.eval.bench.timing import most_threads
 from ufmstar_torch.eval.engine.load import load_members
 from ufmstar_torch.eval.methods.method import BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.run.machine import available_cores, require_device
+from ufmstar_torch.eval.run.machine import require_device
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.models import FastDepth, FastDepthWidths, MonodepthResNet, Preprocess
@@ -41,7 +42,7 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
         FileNotFoundError, ModuleNotFoundError: a file or a package is missing.
     """
     device = torch.device(require_device(options.device))
-    threads = options.threads or available_cores()
+    threads = options.threads or most_threads()
     plan = Plan(frames=options.frames, warm_up=options.history, threads=threads, windows=1)
     networks = (
         [_loaded(options, threads, device)] if options.weights else (_random(options, s, device) for s in options.sizes)

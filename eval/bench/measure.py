@@ -20,13 +20,13 @@ import torch
 from ufmstar_torch.eval.bench.energy import CPU, GPU, Energy, EnergyMeter, difference, measure_energy, summary
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
 from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, Part, TimedParts, inference_of, time_parts
-from ufmstar_torch.eval.bench.timing import paired_ratio, pinned_threads, spread
+from ufmstar_torch.eval.bench.timing import most_threads, paired_ratio, pinned_threads, spread
 from ufmstar_torch.eval.engine.clock import synchronize
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.files import write_json_atomic
-from ufmstar_torch.eval.run.machine import available_cores, device_of, hardware, load_average, versions
+from ufmstar_torch.eval.run.machine import device_of, hardware, load_average, versions
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.suite.job import EvalJob
 
@@ -75,7 +75,7 @@ def measure(
         ValueError: no row can be measured, or too few frames can be read.
     """
     plan = plan or Plan()
-    plan = replace(plan, threads=plan.threads or available_cores())
+    plan = replace(plan, threads=plan.threads or most_threads())
     device, multiview_device = torch.device(device), torch.device(multiview_device)
     left_out = {row.label: why for row in rows if (why := _obstacle(row, networks)) is not None}
     chosen = [row for row in rows if row.label not in left_out]

@@ -17,10 +17,17 @@ import torch
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.engine.clock import StageTimer
+from ufmstar_torch.eval.run.machine import available_cores
 
 # Every moment of a step belongs to one of these; see ``ufmstar_torch.step_parts.StepObserver``.
 STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
 _CPU = torch.device("cpu")
+
+
+def most_threads() -> int:
+    """The cores of this process, or as many threads as numba may start (``NUMBA_NUM_THREADS``)."""
+    numba: Any = import_module("numba")
+    return min(available_cores(), int(numba.config.NUMBA_NUM_THREADS))
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -24,33 +25,51 @@ WORLD, CAMERA = "world", "camera"
 IMAGE, INFO, DEPTH, SIGMA = "/camera/image", "/camera/camera_info", "/camera/depth", "/camera/sigma"
 CLOUD, TF = "/camera/points", "/tf"
 _FIELDS = ("x", "y", "z", "variance")
+_LATEST = 2.0**31 - 1  # [s], of builtin_interfaces/Time
 _FLOAT32 = 7  # of sensor_msgs/PointField
 
 
 def export_bag(frames: Iterator[Gated], out: Path, sequence: FrameSequence | None) -> str:
     """OUT/export/bag: of each frame the image (where the recording can be read), camera info, depth and sigma (32FC1,
-    [m]), its points in the camera's axes with their variance [m^2], and the camera's pose in tf.
+    [m]), its points in the camera's axes with their variance [m^2], and the camera's pose in tf. An earlier bag is
+    replaced when the new one is whole.
 
     Raises:
         ModuleNotFoundError: rosbags is not installed.
+        ValueError: a frame's time is not within ROS's 0 to 2^31 s, or the bag's place is not a folder.
     """
     how = ("ROS bags need rosbags", "'ufmstar-torch[recordings]'")
     rosbag2, stores = optional("rosbags.rosbag2", *how), optional("rosbags.typesys", *how)
-    folder, count = export_folder(out) / "bag", 0
-    if folder.exists():
-        shutil.rmtree(folder)  # an earlier export's: rosbags writes into a new folder only
+    folder = export_folder(out) / "bag"
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise ValueError(f"{folder} is no folder of an earlier export: move it away")
     ros = _Messages(stores.get_typestore(stores.Stores.ROS2_HUMBLE))
+    with TemporaryDirectory(dir=folder.parent, prefix=".bag") as new:
+        count = _write_bag(rosbag2, ros, Path(new) / "bag", frames, sequence)
+        if folder.exists():
+            shutil.rmtree(folder)
+        (Path(new) / "bag").rename(folder)
+    return f"{folder}: {count} frames"
+
+
+def _write_bag(
+    rosbag2: Any, ros: _Messages, folder: Path, frames: Iterator[Gated], sequence: FrameSequence | None
+) -> int:
+    """Write the bag into a new folder; the number of frames."""
+    count = 0
     with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
         for count, frame in enumerate(frames, start=1):  # noqa: B007
             # without times, frames are a second apart
             seconds = float(frame.index) if frame.timestamp is None else frame.timestamp
-            stamp = max(0, round(seconds * 1e9))
+            if not seconds < _LATEST:
+                raise ValueError(f"{frame.name}: a bag's times are within 0 to 2^31 s, got {seconds}")
+            stamp = round(max(0.0, seconds) * 1e9)
             for topic, message in _of_frame(ros, stamp, frame, sequence).items():
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=ros.store)
                 writer.write(connections[topic], stamp, ros.store.serialize_cdr(message, message.__msgtype__))
-    return f"{folder}: {count} frames"
+    return count
 
 
 def _of_frame(ros: _Messages, stamp: int, frame: Gated, sequence: FrameSequence | None) -> dict[str, Any]:

@@ -78,8 +78,10 @@ def _times(files: list[Path]) -> np.ndarray:
 
 def _lens(file: Path) -> Lens:
     values = read_matrix(file).ravel()
-    if len(values) != 6 or not np.isfinite(values).all() or min(values) <= 0:
-        raise ValueError(f"{file}: expected width height fx fy cx cy [px], got {values.tolist()}")
+    if len(values) != 6 or not np.isfinite(values).all() or min(values) <= 0 or not (values[:2] % 1 == 0).all():
+        raise ValueError(
+            f"{file}: expected width height fx fy cx cy [px], the size in whole ones, got {values.tolist()}"
+        )
     width, height, fx, fy, cx, cy = values.tolist()
     return Lens((fx, fy, cx, cy), (int(height), int(width)))
 

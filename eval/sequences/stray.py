@@ -56,8 +56,10 @@ def read(path: Path, options: Options) -> FrameSequence:
     lenses = {}
     for row, T in enumerate(poses):
         number = column["frame"][row]
-        if not (number >= 0 and number == np.floor(number)):
+        if not (0 <= number < np.inf and number == np.floor(number)):
             raise ValueError(f"{lines[row]}: the frame must be a number from 0 on, got {number}")
+        if not np.isfinite(column["timestamp"][row]):
+            raise ValueError(f"{lines[row]}: the timestamp must be finite [s], got {column['timestamp'][row]}")
         name = f"{int(number):06d}"
         if number >= len(video):
             frames.append(Skipped(name, "beyond the end of the video"))
