@@ -151,6 +151,7 @@ def test_a_pool_of_two_sequences(ufmstar, tmp_path, weights):
     code, out, err = ufmstar(*words)
     assert code == 0, err
     assert "6 images, " in out
+    assert str(tmp_path) not in out.split("\n")[1]
     assert (tmp_path / "out" / "contact_sheet.png").stat().st_size > 1000
     with (tmp_path / "out" / "scores.csv").open() as file:
         rows = list(csv.DictReader(file))

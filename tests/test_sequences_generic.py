@@ -69,7 +69,7 @@ def test_missing_or_doubled_pieces_are_named(tmp_path):
         open_sequence(path)
     (path / "k0.txt").rename(path / "K.txt")
     (path / "trajectory.txt").write_text("0 0 0 0 0 0 0 1")
-    with pytest.raises(ValueError, match=r"pass trajectory, .*found \['poses\.txt', 'trajectory\.txt'\]"):
+    with pytest.raises(ValueError, match=r"several .*found \['poses\.txt', 'trajectory\.txt'\]\): pass trajectory"):
         open_sequence(path)
     assert len(open_sequence(path, trajectory="poses.txt")) == 6
     with pytest.raises(FileNotFoundError, match=r"orb\.txt"):

@@ -24,7 +24,7 @@ from ufmstar_torch.eval.engine.realtime import RealTime
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.machine import load_average
-from ufmstar_torch.eval.run.panels import Bar, GridRow, Panel, draw_grid
+from ufmstar_torch.eval.run.panels import DECADES, Bar, GridRow, Panel, draw_grid
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence, in_memory
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
@@ -192,7 +192,8 @@ def draw_contrasts(path: Path, contrasts: list[Contrast]) -> None:
     parts = [part for part in np.array_split(np.arange(len(contrasts)), _ROWS) if part.size]
     chosen = [max((contrasts[n] for n in part), key=lambda c: int((c.sure & c.high).sum())) for part in parts]
     maps = [value for c in chosen for value in (c.own, c.disagreement, c.error)]
-    scale = ColourScale(0.0, robust_range(maps, from_zero=True)[1], ERROR_MAP)
+    high = robust_range(maps, from_zero=True)[1]
+    scale = ColourScale(high / 10**DECADES, high, ERROR_MAP, logarithmic=True)  # M would be black beside the error
     rows = []
     for number, c in enumerate(chosen):
         marked = c.image.copy()

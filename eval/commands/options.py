@@ -114,8 +114,8 @@ def parse(options: type[T], words: Sequence[str], prog: str, defaults: Mapping[s
         values = parser.parse_args(list(words)).as_dict()
     except (ArgumentError, TypeError) as error:  # TypeError: a list where a configuration file should have a mapping
         message, required, names = " ".join(str(error).split()).partition("the following arguments are required: ")
-        words = {f.name: f.name if f.metadata.get("positional") else _form(f, str)[0][0] for f in fields(options)}
-        listed = ", ".join(words.get(name, name) for name in names.split(", "))
+        typed = {f.name: f.name if f.metadata.get("positional") else _form(f, str)[0][0] for f in fields(options)}
+        listed = ", ".join(typed.get(name, name) for name in names.split(", "))
         raise ValueError(f"{message}{required}{listed}") from error
     return _build(options, values)
 

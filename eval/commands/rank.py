@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.run.rank import ImageScores
 
 SCORES, SETTINGS = "scores.csv", "rank.json"
+_SHOWN = 10  # lines of the printed table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,9 +144,12 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
         contact_sheet(panels, out / SHEET, title=f"the least and the most certain of {len(lines)} images")
         files.append(SHEET)
     shown = [["rank", "sequence", "frame", f"{options.by} [m²]", "measured"]]
-    mean = f"{options.by}_mean_m2"
-    shown += [[*(str(line[k]) for k in ("rank", "sequence", "frame")), *(f"{line[k]:.3g}" for k in (mean, "measured"))]
-              for line in lines[: min(len(chosen), 10)]]  # fmt: skip
+    mean, names = f"{options.by}_mean_m2", [Path(path).name for path in options.sequences]
+    for line in lines[: min(len(chosen), _SHOWN)]:
+        name = Path(line["sequence"]).name  # a path where two are called alike
+        name = name if names.count(name) == 1 else line["sequence"]
+        shown.append([str(line["rank"]), name, line["frame"], *(f"{line[k]:.3g}" for k in (mean, "measured"))])
     print("\n".join(aligned(shown)))
-    print(f"{out}: {', '.join(files)}; {len(lines)} images, {len(chosen)} with a rank")
+    above = f", the first {_SHOWN} above" if len(chosen) > _SHOWN else ""
+    print(f"{out}: {', '.join(files)}; {len(lines)} images, {len(chosen)} with a rank{above}")
     return 0 if chosen else 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,9 @@ def endpoint(model: Any, word: str) -> np.ndarray:
     name, _, pixel = word.partition(":")
     image = next((i for i in model.images.values() if _is(i.name, name)), None)
     if image is None:
-        raise ValueError(f"--length: image {name!r} has no pose in the model; choose another")
+        names = sorted(Path(i.name).stem for i in model.images.values())
+        listed = f"{', '.join(names[:3])}, ... {names[-1]}" if len(names) > 4 else ", ".join(names)
+        raise ValueError(f"--length: image {name!r} has no pose; choose one of the {len(names)} that have: {listed}")
     if not pixel:
         return np.array(image.projection_center())
     try:

@@ -185,7 +185,7 @@ MAPS = {
     "posterior_sigma": ("σ, posterior", "length"),
     "posterior_error": ("|error|, posterior", "length"),
 }
-_DECADES = 2  # of the logarithmic scale of lengths: beside the network's errors the posterior's would all be black
+DECADES = 2  # of the logarithmic scale of lengths: beside the network's errors the posterior's would all be black
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +250,7 @@ def fit_scales(panels: Sequence[FramePanel]) -> dict[str, ColourScale]:
     depth = colours.robust_range([*of["depth"], *of["posterior"]], from_zero=False)
     lengths = [of[name] for name in ("sigma", "error", "posterior_sigma", "posterior_error") if of[name]]
     high = max(colours.robust_range(maps, from_zero=True)[1] for maps in lengths)
-    length = ColourScale(high / 10**_DECADES, high, colours.ERROR_MAP, logarithmic=True)
+    length = ColourScale(high / 10**DECADES, high, colours.ERROR_MAP, logarithmic=True)
     return {"depth": ColourScale(*depth, colours.DEPTH_MAP), "length": length}
 
 

@@ -27,6 +27,7 @@ PARTS = {
 }  # fmt: skip
 _COMPARED = ("total", "disagreement")  # they rest on other views
 _PICTURES = 3  # at each end of the ranking
+_LETTERS = 20  # of a sequence's name beside a picture
 _UNITS = {"mean": "m2", "variance": "m4", "median": "m2", "maximum": "m2"}
 
 
@@ -84,7 +85,9 @@ class ImageScores(FrameSink):
         depth = float(row.depth[row.valid].median()) if bool(row.valid.any()) else float("nan")
         self.images.append(RankedImage(line, score, row.T_world_cam, depth))
         if score == score and result.frame.image is not None:
-            note = f"{Path(self.sequence).name[-20:]}, {self._by}, {score**0.5:.3g} m"
+            name = Path(self.sequence).name
+            name = name if len(name) <= _LETTERS else f"…{name[1 - _LETTERS :]}"
+            note = f"{name}, {self._by}, {score**0.5:.3g} m"
             insort(self._shown, _Shown(score, len(self.images), panel_of(result.name, note, result.frame, row)))
             if len(self._shown) > 2 * _PICTURES:
                 del self._shown[_PICTURES]

@@ -213,5 +213,6 @@ def _given_or_found(root: Path, given: str | Path | None, names: tuple[str, ...]
     if len(result) != 1:
         listing = f"found {[file.name for file in result]}" if result else f"looked for {', '.join(names)}"
         hint = "; `ufmstar poses` computes poses from images alone" if option == "trajectory" and not result else ""
-        raise ValueError(f"{root}: pass {option}, exactly one file must be it ({listing}){hint}")
+        count = "several files of" if result else "no file of"
+        raise ValueError(f"{root.resolve().name}: {count} {option} ({listing}): pass {option}{hint}")
     return result[0]

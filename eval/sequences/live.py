@@ -178,12 +178,17 @@ def json_lines(
         if not line.strip():
             continue
         try:
-            about = json.loads(line)
+            try:
+                about = json.loads(line)
+            except json.JSONDecodeError:
+                raise ValueError(f"no JSON: {line.strip():.60}") from None
             if not isinstance(about, dict) or about.keys() - {"stamp", "pose", "image", "intrinsics"}:
                 raise ValueError('expected {"stamp": s, "pose": [...], "image": "file", "intrinsics": [...]}')
             if "stamp" not in about or not about.keys() & {"pose", "image"}:
                 raise ValueError("a stamp and a pose or an image are needed")
-            stamp = float(about["stamp"])
+            if not isinstance(stamp := about["stamp"], int | float):
+                raise ValueError(f"a stamp is a number [s], got {stamp!r:.40}")
+            stamp = float(stamp)
             if not math.isfinite(stamp):
                 raise ValueError(f"stamp must be finite [s], got {stamp}")
             pose = _pose(about["pose"], convert, scale) if "pose" in about else None
