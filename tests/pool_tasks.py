@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import struct
 import time
 from functools import partial
+from logging.handlers import QueueHandler
 from pathlib import Path
 
 from ufmstar_torch.eval.suite.shards import run_pool
@@ -19,9 +21,13 @@ def pool(folder, items, stop=lambda: False):
 
 
 def task(folder, item):
-    """Writes a file ITEM-PROCESS; then ends the process where the item is "kill", fails, waits or warns."""
+    """Writes a file ITEM-PROCESS; then ends the process where the item is "kill" or "half", fails, waits or warns."""
     Path(folder, f"{item}-{os.getpid()}").touch()
     if item == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if item == "half":  # a record is begun, and never ended
+        (handler,) = (h for h in logging.getLogger("ufmstar_torch").handlers if isinstance(h, QueueHandler))
+        os.write(handler.queue._writer.fileno(), struct.pack("!i", 1000) + b"half")
         os.kill(os.getpid(), signal.SIGKILL)
     while item.startswith("wait"):
         time.sleep(0.02)

@@ -7,6 +7,7 @@ import os
 import pickle
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -101,6 +102,15 @@ def test_a_pool_ends_in_good_order_by_a_stop_by_an_error_and_by_a_kill(tmp_path)
     assert pool(tmp_path, ["kill", "wait2"]) == (False, [KILLED])
     assert pool(tmp_path, ["wait3", "wait4"], lambda: len(list(tmp_path.glob("wait[34]-*"))) == 2) == (False, [])
     assert all_end(at_work(tmp_path))
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_while_it_logs_does_not_hold_up_the_pool(tmp_path):
+    ended: list[object] = []
+    thread = threading.Thread(target=lambda: ended.append(pool(tmp_path, ["half", "wait2"])), daemon=True)
+    thread.start()
+    thread.join(60)
+    assert ended == [(False, [KILLED])]
 
 
 @pytest.mark.slow

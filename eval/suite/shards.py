@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
-import queue
 import signal
 import threading
 import time
@@ -38,6 +37,7 @@ from ufmstar_torch.stream_warnings import LOGGER
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
 _POLL_SECONDS = 0.1
+_LAST_RECORDS = 2.0  # [s] for what was sent before the end
 KILLED = "a process was killed (for want of memory?), which ends the others too"
 # submitit's own names of parameters; others are SLURM's, as partition, account, constraint.
 _SUBMITIT = ("name", "timeout_min", "mem_gb", "cpus_per_task", "gpus_per_node")
@@ -139,7 +139,11 @@ def run_pool(
     end with this one, also when it is killed. Their warnings are logged here. Raises what the task raises."""
     spawn = multiprocessing.get_context("spawn")
     parent_alive, alive = spawn.Pipe(duplex=False)
-    warnings: multiprocessing.Queue[logging.LogRecord] = spawn.Queue()
+    warnings: multiprocessing.Queue[logging.LogRecord | None] = spawn.Queue()
+    # A process that is killed while it writes leaves half a record, for whose end a reader waits for ever.
+    reader = threading.Thread(target=_log, args=(warnings,), daemon=True)
+    reader.start()
+    warnings.cancel_join_thread()
     pool = ProcessPoolExecutor(processes, spawn, initializer=_begin, initargs=(parent_alive, warnings, threads))
     try:
         waiting = {pool.submit(task, item) for item in items}
@@ -148,7 +152,6 @@ def run_pool(
         pool.submit(os.getpid)
         while waiting and not stop():
             done, waiting = wait(waiting, _POLL_SECONDS, FIRST_COMPLETED)
-            _log(warnings)
             for line in filter(None, [one.result() for one in done]):
                 report(line)
         if not waiting:
@@ -161,17 +164,17 @@ def run_pool(
     finally:
         alive.close()  # ends those processes that are at work
         pool.shutdown(cancel_futures=True)
-        _log(warnings)
+        warnings.put(None)
+        reader.join(_LAST_RECORDS)
 
 
-def _log(warnings: multiprocessing.Queue[logging.LogRecord]) -> None:
-    """Log in this process what others have sent."""
-    with suppress(queue.Empty):
-        while True:
-            LOGGER.handle(warnings.get_nowait())
+def _log(warnings: multiprocessing.Queue[logging.LogRecord | None]) -> None:
+    """Log in this process what others send, up to a None."""
+    while (record := warnings.get()) is not None:
+        LOGGER.handle(record)
 
 
-def _begin(parent_alive: Connection, warnings: multiprocessing.Queue[logging.LogRecord], threads: int) -> None:
+def _begin(parent_alive: Connection, warnings: multiprocessing.Queue[logging.LogRecord | None], threads: int) -> None:
     """In each process, before its first task."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal: the parent decides
     LOGGER.addHandler(QueueHandler(warnings))
