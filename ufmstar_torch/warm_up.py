@@ -112,7 +112,8 @@ def warm_up(
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Collect no garbage: it takes a tenth of a compilation's time."""
+    """Collect no garbage, which takes a tenth of a compilation's time; then all of it, or a later frame would wait half
+    a second for that."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -120,6 +121,7 @@ def _no_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
+            gc.collect()
 
 
 def _camera(height: int, width: int) -> torch.Tensor:
