@@ -65,7 +65,7 @@ def test_intrinsics_in_every_form(tmp_path, form):
 def test_missing_or_doubled_pieces_are_named(tmp_path):
     path, _ = layouts.write_generic(tmp_path)
     (path / "K.txt").rename(path / "k0.txt")
-    with pytest.raises(ValueError, match=r"pass intrinsics, .*looked for K\.txt"):
+    with pytest.raises(ValueError, match=r"looked for K\.txt.*: pass intrinsics"):
         open_sequence(path)
     (path / "k0.txt").rename(path / "K.txt")
     (path / "trajectory.txt").write_text("0 0 0 0 0 0 0 1")
