@@ -12,14 +12,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.models.network import DepthNetwork, require_image
+from ufmstar_torch.models.network import ProgramNetwork, require_image
 from ufmstar_torch.models.outputs import ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.optional import optional
 from ufmstar_torch.prediction import DepthPrediction
 
 
-class LiteRTNetwork(DepthNetwork):
+class LiteRTNetwork(ProgramNetwork):
     """A .tflite file as a module, on the CPU and without gradients; quantised tensors are converted by the scale and
     zero point in the file.
 
@@ -69,21 +69,6 @@ class LiteRTNetwork(DepthNetwork):
             raise ValueError(f"{self.path}: the outputs are {list(self.outputs)}; it has no {absent}")
         if self.spec.takes_intrinsics:
             raise ValueError(f"{self.path}: takes_intrinsics is not supported for .tflite files")
-
-    @property
-    def takes_intrinsics(self) -> bool:
-        """Whether the unit of its depth depends on the focal length."""
-        return self.spec.outputs.focal is not None
-
-    @property
-    def states_confidence(self) -> bool:
-        """Whether the spec names one."""
-        return self.spec.outputs.confidence is not None
-
-    @property
-    def max_depth(self) -> float | None:
-        """[m] As declared."""
-        return self.spec.outputs.max_depth
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth [B, H, W] [m], on the image's device, of ``image`` [B, 3, H, W] as ``preprocess`` returns it. Raises

@@ -13,6 +13,9 @@ from torch import Tensor, nn
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction, stated_range, states_confidence, takes_intrinsics
 
+if TYPE_CHECKING:
+    from ufmstar_torch.models.outputs import ProgramSpec
+
 
 class DepthNetwork(nn.Module, ABC):
     """A monocular network that predicts metric depth.
@@ -83,6 +86,27 @@ class Backbone(DepthNetwork):
     def forward(self, image: Tensor) -> DepthPrediction:
         """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it; no variances."""
         return DepthPrediction(self.depth(self.features(image)))
+
+
+class ProgramNetwork(DepthNetwork):
+    """A network in a file that runs by itself; a specification declares its outputs."""
+
+    spec: ProgramSpec
+
+    @property
+    def takes_intrinsics(self) -> bool:
+        """Whether the unit of its depth depends on the focal length."""
+        return self.spec.outputs.focal is not None
+
+    @property
+    def states_confidence(self) -> bool:
+        """Whether the spec names one."""
+        return self.spec.outputs.confidence is not None
+
+    @property
+    def max_depth(self) -> float | None:
+        """[m] As declared."""
+        return self.spec.outputs.max_depth
 
 
 @contextmanager

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.checked import choice
-from ufmstar_torch.models.network import DepthNetwork, require_image
+from ufmstar_torch.models.network import ProgramNetwork, require_image
 from ufmstar_torch.models.outputs import ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.optional import optional
@@ -62,7 +62,7 @@ class OnnxSpec(ProgramSpec):
             raise ValueError(f"OnnxSpec.outputs must name ONNX outputs, got position {self.outputs.depth}")
 
 
-class OnnxNetwork(DepthNetwork):
+class OnnxNetwork(ProgramNetwork):
     """An ONNX depth network as a module; no gradients, and the computation runs where ONNX Runtime does.
 
     Args:
@@ -76,6 +76,8 @@ class OnnxNetwork(DepthNetwork):
         FileNotFoundError: there is no such file.
         ValueError: the file is broken, or spec and graph do not fit; the message names the tensor.
     """
+
+    spec: OnnxSpec
 
     def __init__(
         self,
@@ -145,16 +147,6 @@ class OnnxNetwork(DepthNetwork):
     def takes_intrinsics(self) -> bool:
         """Whether the graph does, or the unit of its depth depends on the focal length."""
         return self.K_input is not None or self.spec.outputs.focal is not None
-
-    @property
-    def states_confidence(self) -> bool:
-        """Whether the spec names one."""
-        return self.spec.outputs.confidence is not None
-
-    @property
-    def max_depth(self) -> float | None:
-        """[m] As declared."""
-        return self.spec.outputs.max_depth
 
     def _fitted_preprocess(self, preprocess: Preprocess) -> Preprocess:
         height, width = self.size

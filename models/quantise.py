@@ -43,24 +43,25 @@ def quantise(network: DepthNetwork, images: Iterable[Tensor], path: Path, *, thr
     if not samples:
         raise ValueError("images must hold at least one input of the network")
 
-    class Samples(tools.CalibrationDataReader):  # type: ignore[name-defined]
-        """The inputs, one by one."""
-
-        def __init__(self) -> None:
-            self._left = iter(samples)
-
-        def get_next(self) -> dict[str, Any] | None:
-            """The next one; None at the end."""
-            x = next(self._left, None)
-            return None if x is None else {_IMAGE: x.numpy()}
-
     with TemporaryDirectory() as folder, _quiet():
         plain = Path(folder) / "float.onnx"
         names = _export(network, samples[0], plain)
         how = {"activation_type": tools.QuantType.QUInt8, "weight_type": tools.QuantType.QInt8, "per_channel": True}
-        tools.quantize_static(plain, path, Samples(), quant_format=tools.QuantFormat.QDQ, **how)
+        tools.quantize_static(plain, path, _Samples(samples), quant_format=tools.QuantFormat.QDQ, **how)
     outputs = OutputSpec(METRIC, _DEPTH, aleatoric=_VARIANCE if _VARIANCE in names else None)
     return OnnxNetwork(path, OnnxSpec(outputs, network.preprocess), threads=threads)
+
+
+class _Samples:
+    """The network's inputs one by one, as onnxruntime reads them (its ``CalibrationDataReader``)."""
+
+    def __init__(self, inputs: Iterable[Tensor]) -> None:
+        self._left = iter(inputs)
+
+    def get_next(self) -> dict[str, Any] | None:
+        """The next input by its name; None at the end."""
+        x = next(self._left, None)
+        return None if x is None else {_IMAGE: x.numpy()}
 
 
 class _Maps(nn.Module):

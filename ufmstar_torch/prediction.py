@@ -52,8 +52,8 @@ class DepthPrediction:
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> DepthPrediction:
         """With a function applied to every map."""
-        maps = (self.depth, *(getattr(self, name) for name in _OPTIONAL))
-        return DepthPrediction(*(None if value is None else function(value) for value in maps))  # type: ignore[arg-type]
+        maps = {name: function(value) for name in _OPTIONAL if (value := getattr(self, name)) is not None}
+        return DepthPrediction(function(self.depth), **maps)
 
     @property
     def variance(self) -> Tensor | None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.opening import SequenceOptions
-from ufmstar_torch.eval.commands.options import T, UsageError, as_dict, fields_of, option, parse, positional
+from ufmstar_torch.eval.commands.options import UsageError, as_dict, fields_of, option, parse, positional
 from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.stateful import flat
@@ -184,6 +184,18 @@ class RunOptions:
         return plain | {"ufm": ufm}
 
 
+class _WithUfM(Protocol):
+    """A dataclass of options with those of UfM*."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def uncertainty(self) -> UfMOptions: ...
+
+
+T = TypeVar("T", bound=_WithUfM)
+
+
 def read(words: Sequence[str]) -> RunOptions:
     """The options of a command line.
 
@@ -198,8 +210,7 @@ def read_ufm(kind: type[T], words: Sequence[str], prog: str, own: Mapping[str, A
     """The options of a command with :class:`UfMOptions`, whose presets are defaults; ``own`` are the command's, by
     name. Errors as :func:`read`."""
     options = parse(kind, words, prog, own)
-    chosen: UfMOptions = options.uncertainty  # type: ignore[attr-defined]
-    defaults = chosen.preset_defaults()
+    defaults = options.uncertainty.preset_defaults()
     return parse(kind, words, prog, {**defaults, **own}) if defaults else options
 
 

@@ -81,7 +81,8 @@ def _gated(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[G
 def export_depth(frames: Iterator[Gated], out: Path) -> str:
     """NAME.npy [h, w] float32 [m], NaN where left out."""
     folder, count = export_folder(out, "depth"), 0
-    for count, frame in enumerate(frames, start=1):  # noqa: B007
+    for frame in frames:
+        count += 1
         write_atomic(folder / f"{frame.name}.npy", partial(_save, frame.depth))
     return f"{folder}: {count} maps"
 

@@ -59,7 +59,8 @@ def _write_bag(
     count = 0
     with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
-        for count, frame in enumerate(frames, start=1):  # noqa: B007
+        for frame in frames:
+            count += 1
             # without times, frames are a second apart
             seconds = float(frame.index) if frame.timestamp is None else frame.timestamp
             if not seconds < _LATEST:

@@ -40,7 +40,8 @@ def export_rerun(frames: Iterator[Gated], out: Path, sequence: FrameSequence | N
         records = {record["name"]: record for record in read_records((out / RECORDS).read_bytes(), out / RECORDS)}
         scale: ColourScale | None = None
         unit = None
-        for count, frame in enumerate(frames, start=1):  # noqa: B007
+        for frame in frames:
+            count += 1
             scale = scale or ColourScale(*robust_range([frame.sigma], from_zero=True), ERROR_MAP)
             unit = unit or fitting_unit(frame.depth)
             stream.set_time("frame", sequence=frame.index)

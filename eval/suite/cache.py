@@ -18,7 +18,13 @@ from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.prediction import DepthPrediction
 
-_MAPS = "depth", "aleatoric", "epistemic", "confidence"
+# Names of the maps in a file, and in a ``DepthPrediction``.
+_MAPS = {
+    "depth": "depth",
+    "aleatoric": "aleatoric_variance",
+    "epistemic": "epistemic_variance",
+    "confidence": "confidence",
+}
 _DIGEST = 32  # bytes of a SHA-256
 
 
@@ -60,14 +66,12 @@ class PredictionCache:
         if bytes(arrays.pop("content")).decode() != content:
             return None
         K = torch.from_numpy(arrays.pop("intrinsics"))
-        maps = {name: torch.from_numpy(value)[None].to(device) for name, value in arrays.items()}
-        return Predicted(DepthPrediction(*(maps.get(name) for name in _MAPS)), K[None])  # type: ignore[arg-type]
+        maps = {_MAPS[name]: torch.from_numpy(value)[None].to(device) for name, value in arrays.items()}
+        return Predicted(DepthPrediction(**maps), K[None])
 
     def store(self, path: Path, content: str, predicted: Predicted) -> None:
         """Keep a prediction. Raises CacheError: it cannot be written."""
-        maps = predicted.maps
-        each = (maps.depth, maps.aleatoric_variance, maps.epistemic_variance, maps.confidence)
-        named = dict(zip(_MAPS, each, strict=True))
+        named = {name: getattr(predicted.maps, field) for name, field in _MAPS.items()}
         arrays = {name: value[0].cpu().numpy() for name, value in named.items() if value is not None}
         arrays["intrinsics"] = predicted.intrinsics[0].numpy()
         arrays["content"] = np.frombuffer(content.encode(), np.uint8)
