@@ -33,14 +33,12 @@ View = tuple[Any, ...]  # what `in_view` returns
 
 
 class Seen(NamedTuple):
-    """The part of a stream's mixture that can matter in an image: n components by field [13, n and more] in the
-    camera's frame (``rigid_cpu``), their disagreement [n] and features [n, F], and how many components the mixture
-    has."""
+    """A stream's mixture: n components by field [13, n and more] in the camera's frame (``rigid_cpu``), their
+    disagreement [n] and features [n, F]."""
 
     components: NDArray[np.float64]
     disagreement: NDArray[np.float64]
     features: NDArray[np.float64]
-    occupied: int
 
     def moments(self) -> tuple[NDArray[np.float64], ...]:
         """Mean [n, 3], covariance [n, 3, 3] and weight [n]."""
@@ -49,14 +47,14 @@ class Seen(NamedTuple):
         return mean.copy(), np.ascontiguousarray(covariance).reshape(-1, 3, 3), weight[:, 0].copy()
 
 
-def in_slots(seen: Sequence[Seen], slots: Sequence[NDArray[np.int64]], capacity: int) -> GaussianMixture:
-    """The components in those slots [n] of a mixture [B, capacity] in the camera's frame, the others empty."""
+def in_slots(seen: Sequence[Seen], capacity: int) -> GaussianMixture:
+    """The components in the first slots of a mixture [B, capacity] in the camera's frame, the others empty."""
     features = seen[0].features.shape[1]
     mixture = GaussianMixture.empty(len(seen), capacity, features=features, dtype=torch.float64, device="cpu")
-    for b, (one, at) in enumerate(zip(seen, map(torch.from_numpy, slots), strict=True)):
+    for b, one in enumerate(seen):
         values = map(torch.from_numpy, (*one.moments(), one.disagreement, one.features))
         for field, value in zip(_tensors(mixture), values, strict=True):
-            field[b, at] = value
+            field[b, : len(value)] = value
     return mixture
 
 
@@ -68,7 +66,7 @@ def all_seen(mixture_cam: GaussianMixture, features: int | None = None) -> tuple
         n = len(at)
         components = np.zeros((FIELDS, padded(n)))
         components[:, :n] = np.column_stack([mean[at], covariance[at].reshape(n, 9), weight[at]]).T
-        seen.append(Seen(components, disagreement[at], own[at] if features is None else np.zeros((n, features)), n))
+        seen.append(Seen(components, disagreement[at], own[at] if features is None else np.zeros((n, features))))
         slots.append(at)
     return seen, slots
 
@@ -100,7 +98,7 @@ def regress_maps(
     """
     if pixels is not None and config.regression != "exact":
         most = max(len(one.disagreement) for one in seen)
-        mixture = in_slots(seen, [np.arange(len(one.disagreement)) for one in seen], most)
+        mixture = in_slots(seen, most)
         return regress_pixels(mixture, depth, intrinsics, depth > 0, config, pixels, _regress_near)
     z, K = array(depth), _doubles(intrinsics)[0]
     shape, features = z.shape if pixels is None else tuple(pixels.shape), seen[0].features.shape[1]

@@ -39,13 +39,12 @@ _LOG2_E = math.log2(math.e)
 
 
 @kernel
-def in_view(components, m, features, occupied, K, depth, prior_weight, prior_mean, epsilon):
+def in_view(components, m, features, K, depth, prior_weight, prior_mean, epsilon):
     """The components that can matter in an image, as :func:`exact` takes them.
 
     Args:
         components: in the camera's frame by field [13, n and more] (``rigid_cpu``).
         m, features: of the n components [n], [n, F].
-        occupied: how many components the mixture has, others than those included.
         depth: [H, W], not positive where there is none.
 
     Returns:
@@ -54,7 +53,7 @@ def in_view(components, m, features, occupied, K, depth, prior_weight, prior_mea
         and how many components level 1 left.
     """
     height, width = depth.shape
-    least, limit = math.log2(_PRIOR * prior_weight), negligible(prior_weight, epsilon, occupied)
+    least, limit = math.log2(_PRIOR * prior_weight), _limit(epsilon, m.size) + math.log2(_PRIOR * prior_weight)
     whitened = empty((WHITENED, components.shape[1]), np.float64)
     index, kept = empty(m.size, np.int64), empty(m.size, np.int64)
     n = _visible(components, m.size, whitened, K, height, width, limit, empty((2, 3), np.float64), index)
@@ -116,12 +115,6 @@ def _farthest(depth, work):
     for i in range(n, flat.size):
         most = flat[i] if flat[i] > most else most
     return np.float64(most)
-
-
-@leaf
-def negligible(prior_weight, epsilon, count):
-    """log2 of the density that one of ``count`` components must exceed somewhere in an image to be looked at."""
-    return _limit(epsilon, count) + math.log2(_PRIOR * prior_weight)
 
 
 @leaf
