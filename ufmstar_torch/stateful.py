@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -24,12 +24,10 @@ class StatefulModule(nn.Module):
     Attributes:
         STATE: the buffers' names.
         ALWAYS_FLOAT64: those of them that keep float64 under ``.float()``: a world coordinate of kilometres needs it.
-        CONFIG: class of the config.
         config: of the module.
     """
 
     STATE: tuple[str, ...]
-    CONFIG: ClassVar[type[Checked]]
     ALWAYS_FLOAT64: tuple[str, ...] = ("T_world_first",)
     config: Checked
 
@@ -82,30 +80,6 @@ class StatefulModule(nn.Module):
         if changed:
             each = ", ".join(f"{key} was {saved.get(key)!r}, is {ours.get(key)!r}" for key in changed)
             warnings.warn(f"the loaded state was made with another config: {each}", stacklevel=4)
-
-    @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any], **options: Any) -> Self:
-        """A module with the configuration, the dtype and the content of a saved state.
-
-        Args:
-            state: what ``state_dict`` returned (of an ``UncertainDepth``: its ``.ufm``'s).
-            options: further arguments of the constructor, as ``device``.
-
-        Raises:
-            ValueError: the state does not say with which configuration it was made, or with one that is not known here.
-            RuntimeError: the state is incomplete or impossible.
-        """
-        if "_extra_state" not in state:
-            raise ValueError(f"state must be that of a {cls.__name__}, with '_extra_state', got {sorted(state)[:5]}")
-        try:
-            config = cls.CONFIG.from_dict(_config_of(state["_extra_state"]))
-        except ValueError as error:
-            raise ValueError(f"state: its configuration is of another version: {error}") from error
-        first = state.get(cls.STATE[0])
-        dtype = first.dtype if isinstance(first, Tensor) and first.is_floating_point() else torch.float32
-        module = cls(config, dtype=dtype, **options)
-        module.load_state_dict(state)
-        return module
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         """Check a state that is about to be loaded, in the buffers' dtypes; a class states its own rules.

@@ -68,15 +68,13 @@ def step(
         pixels: [B, n] indices into the flattened image to regress only there; None = every pixel.
         smooth: apply the exponential moving average.
         extensions: what they do during this frame.
-        observer: is called after every stage and around every kernel.
+        observer: is called after every stage.
         kernels: which implementation of each part.
 
     Returns:
         The new state and the output. A stream whose frame is at fault keeps its state and gets NaN.
     """
-    stage = _unobserved
-    if observer is not None:
-        stage, kernels = observer.stage, kernels.observed(observer)
+    stage = unobserved if observer is None else observer.stage
     fine = frame.fault == 0
     first = torch.where((fine & ~state.started)[:, None, None], frame.T_world_cam, state.T_world_first)
 
@@ -162,7 +160,7 @@ def frame_statistics(frame: FrameInput, counts: Mapping[str, Tensor]) -> FrameSt
     )
 
 
-def _unobserved(name: str) -> None:
+def unobserved(name: str) -> None:
     """Without an observer nothing happens between stages."""
 
 

@@ -59,7 +59,6 @@ class UfMStar(StatefulModule):
     """
 
     STATE = UfMStarState.names()
-    CONFIG = UfMStarConfig
     config: UfMStarConfig
     observer: StepObserver | None = None
 
@@ -231,7 +230,8 @@ class UfMStar(StatefulModule):
     @property
     def state(self) -> UfMStarState:
         """The state as a step (``ufmstar_torch.step``) takes it."""
-        return self._stored()
+        buffers = cast("dict[str, Tensor]", self._buffers)  # none is None; without the detour by ``__getattr__``
+        return self._empty.with_tensors(buffers)
 
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget everything, or only some streams.
@@ -307,12 +307,8 @@ class UfMStar(StatefulModule):
         self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
         return out, maps
 
-    def _stored(self) -> UfMStarState:
-        buffers = cast("dict[str, Tensor]", self._buffers)  # none is None; without the detour by ``__getattr__``
-        return self._empty.with_tensors(buffers)
-
     def _state_for(self, frame: FrameInput) -> UfMStarState:
-        state = self._stored()
+        state = self.state
         streams, device, mean = len(frame.depth), frame.depth.device, state.mean
         if len(mean) == 0:
             return self._extensions.initial(streams, self.config, mean.dtype, device)

@@ -8,7 +8,6 @@ of threads changes a bit.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -37,7 +36,7 @@ from ufmstar_torch.output import StepOutput
 from ufmstar_torch.regress import distribute, moving_average
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.step import filled_in, frame_statistics
+from ufmstar_torch.step import filled_in, frame_statistics, unobserved
 from ufmstar_torch.step_parts import StepObserver
 
 Floats = NDArray[np.floating[Any]]
@@ -82,17 +81,15 @@ def step(
     observer: StepObserver | None = None,
 ) -> tuple[UfMStarState, StepOutput]:
     """As :func:`ufmstar_torch.step.step`, for CPU tensors."""
-    stage, kernel = (observer.stage, observer.kernel) if observer is not None else (_unobserved, nullcontext)
-    segments, labels = _segment(frame, array(frame.intrinsics), config, state.covariance.dtype, kernel)
+    stage = unobserved if observer is None else observer.stage
+    segments, labels = _segment(frame, array(frame.intrinsics), config, state.covariance.dtype)
     current_cam = GaussianMixture(*map(torch.from_numpy, segments))
     stage("segment")
 
-    with kernel("correspond"):
-        cameras, pairs = _match(state, frame, segments, config)
+    cameras, pairs = _match(state, frame, segments, config)
     stage("correspond")
 
-    with kernel("fuse"):
-        joined = _join(state, frame, segments, cameras[0], pairs, config, extensions.columns)
+    joined = _join(state, frame, segments, cameras[0], pairs, config, extensions.columns)
     stage("fuse")
 
     changed: dict[str, Tensor] = {}
@@ -101,8 +98,7 @@ def step(
         changed, views, shift = _columns(state, joined, frame, extensions, config)
     stage("append")
 
-    with kernel("regress_image"):
-        result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels, views, shift)
+    result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels, views, shift)
     result, measured = filled_in(result, frame, config, pixels)
     result = extensions.after_regression(result)
     stage("regress")
@@ -121,22 +117,13 @@ def step(
     return updated, out
 
 
-def _unobserved(name: str) -> None:
-    """Without an observer nothing happens between stages."""
-
-
 def _segment(
-    frame: FrameInput,
-    intrinsics: Floats,
-    config: UfMStarConfig,
-    stored: torch.dtype,
-    kernel: Callable[[str], AbstractContextManager],
+    frame: FrameInput, intrinsics: Floats, config: UfMStarConfig, stored: torch.dtype
 ) -> tuple[tuple[NDArray[Any], ...], Callable[[], Tensor]]:
     """Step 2: the fields of C_i in the camera frame, float64, its covariances lifted to the floor that the reference
     states, and its labels."""
     given = SegmentInput.of_frame(frame, config)
-    with kernel("spgf"):
-        fits, labels = fit(given)
+    fits, labels = fit(given)
     rounding = np.float32 if given.dtype == torch.float32 else np.float64
     b, n = len(fits), most_gaussians(fits)
     mean, covariance, weight, zero = np.zeros((b, n, 3)), np.zeros((b, n, 3, 3)), np.zeros((b, n)), np.zeros((b, n))
