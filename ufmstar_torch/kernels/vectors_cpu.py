@@ -72,13 +72,6 @@ class Lanes:
         """The quotient."""
         return self._new(self._builder.fdiv(self.value, by.value))
 
-    def root(self) -> Lanes:
-        """The square root."""
-        kind = self.value.type
-        name = f"llvm.sqrt.v{kind.count}f{64 if isinstance(kind.element, ir.DoubleType) else 32}"
-        sqrt = cgutils.get_or_insert_function(self._builder.module, ir.FunctionType(kind, [kind]), name)
-        return self._new(self._builder.call(sqrt, [self.value]))
-
     def everywhere(self, choose: Callable[[Lanes, Lanes], Lanes]) -> Lanes:
         """The least or greatest number (``Lanes.at_most``, ``Lanes.at_least``) in all places."""
         value, n = self, self.value.type.count

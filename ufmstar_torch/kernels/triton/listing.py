@@ -61,7 +61,7 @@ def prepare(
 
 @triton.jit
 def whitened(xx, xy, xz, yy, yz, zz):
-    """Inverse Cholesky factor (rows, 6 numbers) and its determinant's inverse, as ``regress_near_cpu`` has them."""
+    """Inverse Cholesky factor (rows, 6 numbers) and the factor's determinant (``regress_cull_cpu.whiten``)."""
     least = 1e-14 * tl.maximum(xx, tl.maximum(yy, zz))
     l00 = tl.sqrt(tl.maximum(xx, least))
     l10, l20 = xy / l00, xz / l00
