@@ -116,7 +116,7 @@ REFUSED = {
         lambda: wrap_network(transformers.GLPNModel(glpn())), TypeError, "a ...ForDepthEstimation .*got GLPNModel"
     ),
     "no processor": (
-        lambda: wrap_network(tiny()), ValueError, "does not say what its input needs"
+        lambda: wrap_network(tiny()), ValueError, "has no preprocessor_config.json, .* declare it in a spec"
     ),
     "two declarations": (
         lambda: wrap_network(tiny(), focal=300.0), ValueError, "only scale, takes_int"
