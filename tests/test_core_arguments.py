@@ -56,7 +56,14 @@ REFUSED = {
     "pose of 3 x 3": (lambda: ufm(DEPTH, torch.eye(3), K), ValueError, r"pose must be camera-to-world \[B, 4, 4\]"),
     "pose of other streams": (lambda: ufm(DEPTH, POSE.expand(3, 4, 4), K), ValueError, "pose must have depth's 1"),
     "pose as text": (lambda: ufm(DEPTH, ["a"], K), TypeError, "pose must hold numbers"),
-    "pose and intrinsics swapped": (lambda: ufm(DEPTH, K, POSE), ValueError, "pose must be"),
+    **{
+        f"pose and intrinsics swapped, {name}": (call, ValueError, "pose must be .*are these the intrinsics")
+        for name, call in {
+            "as matrices": lambda: ufm(DEPTH, K, POSE),
+            "as numbers": lambda: ufm(DEPTH, (FX, FX, CX, CY), POSE[:3]),
+            "of the whole model": lambda: UncertainDepth(nn.Conv2d(3, 1, 1))(torch.zeros(1, 3, H, W), K, POSE),
+        }.items()
+    },
     "intrinsics that are a pose": (lambda: ufm(DEPTH, POSE, frame(3)[1]), ValueError, "intrinsics .*is this the pose"),
     "intrinsics of 2 x 3": (lambda: ufm(DEPTH, POSE, K[:2]), ValueError, "intrinsics must be .*fx, fy, cx, cy"),
     "intrinsics of three numbers": (lambda: ufm(DEPTH, POSE, (FX, CX, CY)), ValueError, "intrinsics must be"),
