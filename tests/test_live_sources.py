@@ -241,7 +241,6 @@ def test_a_folder_that_grows_live(ufmstar, tmp_path):
         ("tour:3 --speed 0", "--speed must be positive"),
         ("tour:3 --scale-from network", "--scale-from goes with ufmstar run"),
         ("tour:3 --ufm.anchors.half_life 5", "needs --anchors"),
-        ("nowhere", "no such file or folder: nowhere"),
         ("{images}", "has no known layout"),
     ],
 )
