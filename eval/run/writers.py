@@ -5,7 +5,8 @@ OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2], measured (t
                       rests on two views or more) float32 and valid bool, each [H, W]; with anchors also anchored
                       [m^2] (B) and bias (r: depth (1 + r) is the depth corrected), with a posterior also
                       posterior_depth [m] and posterior_variance [m^2]; T_world_cam [4, 4] camera-to-world [m] and
-                      intrinsics [3, 3] of the maps [px]
+                      intrinsics [3, 3] of the maps [px]; with anchors also anchors [N, 4]: u, v in the maps [px], depth
+                      and its standard deviation [m]
 OUT/depth/NAME.png    depth, the posterior's if there is one; 16 bit, 0 = invalid; metres per count in the PNG's text
 OUT/sigma/NAME.png    its standard deviation, likewise; the text "unmeasured" counts pixels that no two views compared
 OUT/network_depth/NAME.png, OUT/network_sigma/NAME.png   with a posterior: those before it
@@ -73,8 +74,8 @@ class FrameWriter:
         self, name: str, *, valid: Tensor, camera: Mapping[str, NDArray[Any]] = _NO_CAMERA, **given: Tensor | None
     ) -> dict[str, int]:
         """Write one frame; none of its files appears before all are written. The maps are [H, W]; those that are None
-        are left out, ``valid`` is True where the pixel was used, and ``camera`` has the arrays of its pose and
-        intrinsics. Returns how many valid pixels of "depth" and "sigma" lie beyond the PNGs' range and are stored as
+        are left out, ``valid`` is True where the pixel was used, and ``camera`` has the arrays of its pose, intrinsics
+        and anchors. Returns how many valid pixels of "depth" and "sigma" lie beyond the PNGs' range and are stored as
         its largest value.
 
         Raises:
