@@ -93,21 +93,6 @@ def test_a_diverse_choice_leaves_out_neighbours():
     turned = along([0.0, 0.0, 0.0, 0.0], angle=1.0)
     assert choose(scores, poses=turned)[:2] == [0, 3], "the same place, another direction"
     assert choose([1.0, math.nan, 0.8, 0.5], poses=poses) == [0, 3, 2]
-
-
-def test_choices_that_make_no_sense_are_refused():
-    with pytest.raises(ValueError, match=r"scores must be \[N\]"):
-        choose(torch.ones(2, 2))
-    with pytest.raises(ValueError, match="count must lie in 0 to the number of images 2"):
-        choose([1.0, 2.0], 3)
-    with pytest.raises(ValueError, match=r"poses must be \[2, 4, 4\]"):
-        choose([1.0, 2.0], poses=torch.eye(4)[None])
-    with pytest.raises(ValueError, match="scores of at least 0"):
-        choose([1.0, -2.0], poses=along([0.0, 1.0]))
-    with pytest.raises(ValueError, match="count must lie in"):
-        choose([1.0, 2.0], 1.5)
-    with pytest.raises(ValueError, match="poses must be finite"):
-        choose([1.0, 2.0], poses=along([0.0, math.nan]))
     assert choose([1.0, math.nan], poses=along([0.0, math.nan])) == [0], "a pose without a score does not count"
 
 
@@ -122,17 +107,6 @@ def test_a_sampler_follows_the_scores():
     assert set(sampler) == {0}
     best = UncertaintySampler([1.0, 5.0, 3.0, 4.0], 2, top=True)
     assert sorted(best) == [1, 3]
-    for scores, count, message in (
-        ([-1.0, 2.0], 1, "at least 0"),
-        ([math.nan], 1, "some above"),
-        ([1.0], 1.5, "count"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            UncertaintySampler(scores, count)
-    with pytest.raises(ValueError, match="count must be a whole number of at least 1"):
-        UncertaintySampler([1.0], 0)
-    with pytest.raises(ValueError, match="at most the 1 scored"):
-        UncertaintySampler([1.0, 0.0], 2, top=True)
 
 
 # ---- the command ----
@@ -167,19 +141,7 @@ def test_a_pool_of_two_sequences(ufmstar, tmp_path, weights):
 
 def test_scores_are_those_of_mean_uncertainty(ufmstar, tmp_path):
     """With the sequence's own depth; ranked by M, diverse, and the best alone."""
-    words = (
-        "rank",
-        TOURS[0],
-        "--depth",
-        "self",
-        "--by",
-        "disagreement",
-        "--measured",
-        "0",
-        "--diverse",
-        "--count",
-        "1",
-    )
+    words = ("rank", TOURS[0], "--depth", "self", "--by", "disagreement", "--measured", "0", "--diverse", "--count", "1")
     assert ufmstar(*words, "--out", tmp_path / "out")[0] == 0
     with (tmp_path / "out" / "scores.csv").open() as file:
         rows = {row["frame"]: row for row in csv.DictReader(file)}

@@ -177,17 +177,6 @@ def test_chunks_change_nothing(monkeypatch):
     assert regress(m, points[:, :0], EXACT).disagreement.shape == (1, 0)
 
 
-def test_on_cuda_free_memory_decides_how_much_is_regressed_at_a_time(monkeypatch):
-    def pairs(free: int, kept: int = 0, device: str = "cuda") -> int:
-        monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
-        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 80 << 30))
-        monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: kept)
-        monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 0)
-        return regress_module._pairs_at_a_time(torch.device(device), 4)
-
-    assert pairs(64 << 30) == pairs(32 << 30, 32 << 30) == 2**28
-    assert pairs(64 << 30) // (256 * 1024) == 1024, "points at a time, with 256 streams of 1024 components"
-    assert pairs(1 << 20) == pairs(64 << 30, device="cpu") == 2**22
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -9,22 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluations import confident, draw_maps, in_memory, judge, record_of, rows_of, write_evaluation
+from evaluations import confident, draw_maps, in_memory, judge, record_of, rows_of
 
-from ufmstar_torch.eval.methods.method import BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Merged, Results
 from ufmstar_torch.eval.report.figures_cost import STAGES, draw_stages
 from ufmstar_torch.eval.report.figures_curves import (
-    Histogram,
     chosen_sequences,
     draw_calibration,
     draw_entropy,
     draw_error,
     draw_sequence_calibration,
     entropies,
-    entropy_range,
 )
 from ufmstar_torch.eval.report.figures_sweep import Point, draw_sweep, sweep_lines, sweeps
 from ufmstar_torch.eval.report.means import difference, mean_of
@@ -34,7 +31,6 @@ from ufmstar_torch.eval.report.style import (
     new_figure,
     save_figure,
 )
-from ufmstar_torch.eval.report.write import write_report
 
 ROWS = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "DepthOnly", "UfM*-DepthOnly")
 ALONE, UFM, UFM_STAR, DEPTH, STAR_OF_DEPTH = ROWS
@@ -158,11 +154,6 @@ class TestEntropy:
         assert entropies(result, "ensemble")["d"][UFM_STAR].density.tolist() == [0.0, 0.75]
         assert words(draw_entropy(result, "ensemble").axes[0]) == ["UfM*: mean 0.50\n(25 % with hardly any V)"]
 
-    def test_range_holds_the_pixels(self):
-        counts = np.zeros(66)
-        counts[1 + 20], counts[1 + 30] = 500, 500  # [-3, -2.75) and [-.5, -.25)
-        assert entropy_range([Histogram(counts, np.linspace(-8, 8, 65), 0.0)]) == (-3.5, 0.25)
-
 
 def noisy(value: float, seed: int = 0) -> Row:
     return Row(UFM_STAR.method, Setting(rotation_noise=value, seed=seed) if value else Setting())
@@ -218,24 +209,6 @@ class TestCost:
         assert [bar.get_width() for bar in axes.patches] == pytest.approx([5, 30, 10, 15, 5, 30, 5])
         assert "10.0 ms" in words(axes)
         assert draw_stages(results) is None
-
-
-def test_the_files_say_what_they_are(tmp_path):
-    out = write_evaluation(tmp_path / "o", ROWS[:1] + ROWS[2:3], [("rooms", "one two")], suite="own")
-    names = {path.relative_to(out).as_posix() for path in write_report(out, pictures="png").files}
-    kinds = {"calibration-rooms", "calibration-sequences-rooms-ensemble", "error-rooms", "entropy-ensemble"}
-    assert {f"figures/{kind}.png" for kind in kinds} <= names
-    assert all((out / name).stat().st_size > 1000 for name in names if name.endswith(".png"))
-    with pytest.raises(ValueError, match="figures must be svg or png, got 'jpg'"):
-        write_report(out, pictures="jpg")
-
-
-def test_every_kind_of_method_has_a_look_of_its_own():
-    kinds = ["Ensemble", "UfM-Ensemble", "UfM-Ensemble-100K", "UfM-FullEnsemble", "UfM*-Ensemble"]
-    kinds += ["UfM*-FullEnsemble", "UfM*-Ensemble-fixed-param"]
-    styles = [look_of(Method.parse(name)) for name in kinds]
-    assert len({s.colour for s in styles}) == len({s.marker for s in styles}) == len(kinds)
-    assert {look_of(Method(base)) for base in BASES} == {styles[0]}  # the same whatever the network
 
 
 def test_the_same_figure_gives_the_same_file_and_no_global_state(tmp_path):

@@ -189,12 +189,6 @@ def test_what_does_not_fit_is_named(tmp_path, how, options, message):
         open_sequence(path, **options)
 
 
-def test_other_layouts_take_no_topics(tmp_path):
-    path, _ = layouts.write_generic(tmp_path)
-    with pytest.raises(ValueError, match="layout 'generic' takes no topics"):
-        open_sequence(path, topics=["/image"])
-
-
 def test_a_trajectory_replaces_the_poses(tmp_path):
     path, truth = written.write_bag(tmp_path, poses="")
     times = [(written.START + i * written.STEP) * 1e-9 for i in range(6)]

@@ -21,18 +21,6 @@ def tum_trajectory(path, T_world_cam, times):
     path.write_text("\n".join(lines))
 
 
-def test_row_i_belongs_to_the_i_th_image_by_number(tmp_path):
-    path, truth = layouts.write_generic(tmp_path, frames=6)  # 7, 8, 9, 10, 11, 12: text order would differ
-    sequence = open_sequence(path)
-    assert sequence.names == ("7", "8", "9", "10", "11", "12")
-    for i, frame in enumerate(sequence):
-        np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i])
-        np.testing.assert_array_equal(frame.image, truth.images[i])
-        np.testing.assert_allclose(frame.depth, truth.depths[i], atol=5e-4 + 1e-6)
-        assert frame.depth_intrinsics is None
-    np.testing.assert_allclose(sequence.intrinsics, truth.K)
-
-
 def test_a_link_without_its_file_keeps_its_place_and_is_an_error_of_its_frame(tmp_path):
     path, truth = layouts.write_generic(tmp_path)
     (path / "images" / "7.png").unlink()
@@ -220,21 +208,6 @@ def test_a_video_that_does_not_say_its_length_is_counted(tmp_path, monkeypatch):
     video = Video(tmp_path / "walk.mkv")
     assert len(video) == 5
     assert video.read(4).shape == (48, 64, 3)
-
-
-@pytest.mark.parametrize("fps", [None, 20])
-def test_video_time_is_index_by_fps_plus_offset(tmp_path, fps):
-    K = layouts.resized(500, 500, 320, 240, (480, 640))
-    truth = layouts.truth(K, 6)
-    write_video(tmp_path / "walk.mkv", truth.images, fps=10)
-    rate = fps or 10
-    tum_trajectory(tmp_path / "slam.txt", truth.T_world_cam, 100 + np.arange(6) / rate)
-    sequence = open_sequence(
-        tmp_path / "walk.mkv", intrinsics=K, trajectory="slam.txt", fps=fps, time_offset=100, max_pose_gap=0.2
-    )
-    for i, frame in enumerate(sequence):
-        np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-9)
-        assert frame.timestamp == pytest.approx(100 + i / rate)
 
 
 def test_video_frames_have_the_times_in_the_container(tmp_path):

@@ -172,18 +172,6 @@ def test_missing_and_broken_files(root):
     assert "size must be a multiple of 16 bytes" in str(errors[2])
 
 
-def test_a_pose_that_is_not_finite_is_skipped(root):
-    text = (root / POSES).read_text().splitlines()
-    text[2] = " ".join(["6", *["-inf"] * 16])
-    (root / POSES).write_text("\n".join(text))
-    sequence = open_sequence(root, scans=1)
-    assert {frame.name: frame.reason for frame in sequence.skipped} == {
-        "0000000005": "no pose for this frame number",
-        "0000000006": "non-finite pose",
-    }
-    assert np.isfinite(sequence[2].depth).all()
-
-
 @pytest.mark.parametrize(
     ("file", "old", "new", "error"),
     [
