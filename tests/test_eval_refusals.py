@@ -1,10 +1,12 @@
-"""Settings, names and values that the evaluation refuses: the call, and the argument that the message names."""
+"""Calls and commands that the evaluation refuses, and the argument that the message names."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,8 +22,10 @@ from ufmstar_torch.eval.methods.setting import setting_from
 from ufmstar_torch.eval.methods.suite import Suite, suite_named
 from ufmstar_torch.eval.methods.ufm import UfMConfig
 from ufmstar_torch.eval.metrics.recalibration import fit
+from ufmstar_torch.eval.report.write import write_report
 from ufmstar_torch.eval.run.colours import DEPTH_MAP, ColourScale
 from ufmstar_torch.eval.run.panels import FramePanel, contact_sheet
+from ufmstar_torch.eval.run.video import write_video
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.suite.shards import Slurm, rank_of
 from ufmstar_torch.eval.suite.work_items import Shard
@@ -47,6 +51,12 @@ def tracked(**values: object) -> object:
 
 def poses(*words: str) -> object:
     return read_poses(["walk", "--out", "out", *words])
+
+
+def video(name: str, *shapes: tuple[int, ...], fps: float = 5) -> None:
+    with write_video(Path(name), fps) as add:
+        for shape in shapes:
+            add(np.zeros(shape, np.uint8))
 
 
 REFUSALS: list[tuple[Callable[[], object], str]] = [
@@ -141,6 +151,11 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: contact_sheet([], "x.png"), "at least one frame"),
     (lambda: FramePanel("a", PICTURE.astype(float), MAPS), "image must be uint8"),
     (lambda: FramePanel("a", PICTURE, MAPS | {"sigma": np.ones((3, 3))}), "sigma must have"),
+    (lambda: video("v.avi"), "path must end in"),
+    (lambda: video("v.mp4", fps=0), "fps"),
+    (lambda: video("v.mp4", (3, 4, 3)), "even size"),
+    (lambda: video("v.mp4", (32, 32, 3), (32, 34, 3)), "size of the first"),
+    (lambda: write_report(Path("out"), pictures="jpg"), "figures must be svg or png"),
     # tours
     *[(partial(tour, name), "tour:SEED") for name in ("tour:", "tour:-1", "tour:a")],
     (lambda: tour("tour:1?colour=red"), "unknown option 'colour'"),
@@ -173,6 +188,43 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
 
 
 @pytest.mark.parametrize(("call", "message"), REFUSALS, ids=range(len(REFUSALS)))
-def test_it_is_refused_and_named(call: Callable[[], object], message: str) -> None:
+def test_it_is_refused_and_named(
+    call: Callable[[], object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=message):
         call()
+
+
+TOURS = ("tour:5?frames=3&size=64x96", "tour:6?frames=3&size=64x96")
+COMMANDS = [
+    (("rank", TOURS[0], "--depth", "self", "--by", "epistemic"), "--by epistemic: there is none here, only total"),
+    (("rank", TOURS[0], "--depth", "self", "--count", "0"), "--count must be at least 1"),
+    (("rank", TOURS[0], "--depth", "self", "--measured", "2"), "--measured must be a share"),
+    (("rank", *TOURS, "--depth", "a"), "--depth DIR goes with one sequence"),
+    (("rank", TOURS[0], "--model", "trained"), "needs --weights FILE"),
+    (
+        (
+            "eval",
+            "--suite",
+            "depth-only",
+            "--network",
+            "depth_only=torchscript:n.ts",
+            "--root",
+            TOURS[0],
+            "--spec",
+            "s",
+        ),
+        "--spec must be a file *.json",
+    ),
+    (("run", TOURS[0], "--depth", "self", "--ufm.anchors.half_life", "10"), "--ufm.anchors.* needs --anchors"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), COMMANDS, ids=range(len(COMMANDS)))
+def test_a_command_refuses_and_names_the_option(
+    ufmstar: Any, tmp_path: Path, words: tuple[str, ...], message: str
+) -> None:
+    code, _, err = ufmstar(*words, "--out", tmp_path / "out")
+    assert code in (1, 2)
+    assert message in err

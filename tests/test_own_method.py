@@ -54,7 +54,6 @@ def test_eval_and_report_show_them(walk, tmp_path, capfd):
 
 
 def test_the_metric_equals_a_loop(walk):
-    """On numbers with errors of which some are beyond two sigma."""
     import torch
 
     rng = np.random.default_rng(0)

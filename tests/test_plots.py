@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -69,14 +69,6 @@ class TestContactSheet:
         for one in panels:
             expected = {tuple(c) for c in scales["depth"].rgb(one.maps["depth"]).reshape(-1, 3).tolist()}
             assert len(expected & shown) > 0.95 * len(expected)
-
-    def test_sigma_and_error_share_a_scale(self, tmp_path: Path) -> None:
-        one = panel()  # the error is twice sigma
-        scales = fit_scales([one])
-        assert scales["length"].logarithmic
-        assert scales["length"].high == pytest.approx(np.percentile(2 * one.maps["sigma"][4:], 99))
-        labels = [(c.label, c.scale) for c in map_columns([one])]
-        assert labels[1:] == [(name, scales["length"]) for name in ("σ", "|error|")]
 
     def test_a_small_sigma_of_the_posterior_is_not_black_beside_the_networks_errors(self) -> None:
         one = panel()
@@ -158,18 +150,3 @@ class TestPreview:
         video = cv2.VideoCapture(str(tmp_path / "v.mp4"))
         assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 3
         video.release()
-
-
-@pytest.mark.parametrize(
-    ("missing", "extra", "call"),
-    [
-        ("matplotlib", "viz", lambda: contact_sheet([panel()], "x.png")),
-        ("imageio_ffmpeg", "eval", lambda: write(Path("v.mp4"), [])),
-    ],
-)
-def test_missing_packages_name_their_extra(
-    missing: str, extra: str, call: Callable[[], object], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, missing, None)
-    with pytest.raises(ImportError, match=rf"ufmstar-torch\[{extra}\]"):
-        call()

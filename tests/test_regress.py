@@ -38,7 +38,6 @@ def rendered(seed: int = 0) -> torch.Tensor:
 @BOTH
 @given(seed=st.integers(0, 10**6))
 def test_agrees_with_the_oracle(backend, config, seed):
-    """At the pixels of a noisy image, some near components, and at a subset of them."""
     m, camera = mixture(2, 9, seed, features=2), torch.tensor(scenes.intrinsics(3, 5))
     generator = torch.Generator().manual_seed(seed)
     depth = 1 + 4 * torch.rand(2, 3, 5, generator=generator, dtype=torch.float64)
@@ -175,8 +174,6 @@ def test_chunks_change_nothing(monkeypatch):
     monkeypatch.setattr(regress_module, "_CHUNK", 9 * 100)
     torch.testing.assert_close(regress(m, points, EXACT).disagreement, whole, rtol=1e-13, atol=0)
     assert regress(m, points[:, :0], EXACT).disagreement.shape == (1, 0)
-
-
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from evaluations import KITCHEN, SHAPE, rows_of
+from evaluations import KITCHEN, SHAPE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLL
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.report.examples import Example, RowMaps, find_examples
@@ -26,15 +24,12 @@ from ufmstar_torch.eval.report.pictures import (
     ROOM,
     STRIP,
     ZOOM,
-    choose,
-    draw_breakdown,
     draw_comparison,
     draw_strip,
     fit_strip_scales,
     largest_difference,
     mean_nll,
     pictures_of,
-    strip_rows,
 )
 from ufmstar_torch.eval.report.rooms import (
     SIGMAS,
@@ -146,15 +141,6 @@ class TestStrips:
         # No truth on the right half: of the truth itself, two errors and two NLLs.
         assert pixels(path, np.full(3, INVALID_GREY)) == pytest.approx(2.5 * CELL, rel=0.12)
 
-    def test_breakdown_adds_up(self, tmp_path: Path) -> None:
-        parts = {"aleatoric": full(0.0625), "disagreement": full(0.1875)}
-        one = example({"star": RowMaps(full(2.0), full(0.25), **parts)})
-        path = tmp_path / draw_breakdown(tmp_path, one, ["star"]).file
-        scales = fit_strip_scales(one, ["star"])
-        for value in (0.25, np.sqrt(np.float32(0.1875)), 0.5, 1.0):  # sqrt A, sqrt M, sigma, error; E is missing
-            colour = scales.length.rgb(np.array(value))
-            assert pixels(path, colour) == pytest.approx(CELL, rel=0.12)
-
 
 class TestCompare:
     @settings(max_examples=20)
@@ -202,18 +188,6 @@ class TestProjection:
             a, b = axes.T
             np.testing.assert_allclose(np.hypot(a * np.cos(off), b * np.sin(off)), expected, rtol=1e-9)
 
-    @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)])
-    def test_views_find_up(self, up: tuple[float, float, float]) -> None:
-        above = np.array(up)
-        forward = np.cross(above, [0.3, 0.5, 0.1])
-        forward /= np.linalg.norm(forward)
-        T = np.eye(4)
-        T[:3, :3] = np.stack([np.cross(forward, above), -above, forward], axis=1)
-        oblique = oblique_view(T[None])
-        np.testing.assert_allclose(oblique.vertical, above, atol=1e-12)
-        assert oblique.towards @ above == pytest.approx(np.sin(np.radians(35)))
-        assert oblique.towards @ forward == pytest.approx(-np.cos(np.radians(35)))
-
 
 def snapshot(frame: str, mean: list[list[float]], m: list[float], sigma: float = 0.3) -> Snapshot:
     covariance = np.eye(3)[None].repeat(len(m), 0) * sigma**2
@@ -248,12 +222,6 @@ class TestRooms:
         assert self.pixels(tmp_path / "r.png", [one], 2.0) == 0
         assert self.pixels(tmp_path / "r.png", [higher], 2.0) > 300
 
-    def test_what_was_seen_once_is_grey(self, tmp_path: Path) -> None:
-        one = snapshot("f", [[0, 0.2, 2], [2, 0.2, 2]], [0.25, 0.0])
-        assert self.pixels(tmp_path / "r.png", [one], 0.0) > 300
-        assert self.pixels(tmp_path / "r.png", [replace(one, count=np.array([2, 1]))], 0.0) == 0
-        assert self.pixels(tmp_path / "r.png", [replace(one, count=np.array([2, 1]))], np.nan) > 300
-
     def test_snapshots_are_found_in_order(self, tmp_path: Path) -> None:
         (tmp_path / "room").mkdir()
         maps = {"mean_world": np.zeros((0, 3)), "covariance_world": np.zeros((0, 3, 3)), "disagreement": np.zeros(0)}
@@ -270,19 +238,6 @@ class TestRooms:
         np.savez(tmp_path / "room" / "UfMstar-MCD_1.npz", mean_world=np.zeros((0, 3)))
         with pytest.raises(ValueError, match=r"UfMstar-MCD_1\.npz must hold mean_world.*; covariance_world"):
             find_rooms(tmp_path)
-
-
-class TestChoice:
-    def test_frames_of_many_sequences_first(self) -> None:
-        names = [("a", "1"), ("a", "2"), ("a", "3"), ("b", "1"), ("c", "1"), ("c", "2")]
-        result = choose([example({}, sequence=s, frame=f) for s, f in names], 4)
-        assert [(e.sequence, e.frame) for e in result] == [("a", "3"), ("a", "2"), ("b", "1"), ("c", "2")]
-
-    def test_rows_of_a_strip(self) -> None:
-        rows = rows_of("UfM-MCD", "Ensemble", "UfM-Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "UfM*-FullEnsemble")
-        noisy = Row(rows[4].method, Setting(skip=2))
-        assert strip_rows([*rows, noisy], "ensemble") == [rows[1], rows[3], rows[4]]
-        assert strip_rows(rows[:3], "ensemble") == [rows[1], rows[2]]
 
 
 class TestWritePictures:

@@ -216,7 +216,6 @@ def test_a_topic_whose_messages_are_missing_is_named(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_bags(tmp_path, kind):
-    """Cut anywhere, spoiled, emptied: an error that names the file, or frames that can be read or are named."""
     path, truth = written.write_bag(tmp_path, kind, depth="16UC1")
     file = path if kind == "ros1" else next(path.glob(f"*.{kind}"))
     whole, rng, read = file.read_bytes(), random.Random(0), 0

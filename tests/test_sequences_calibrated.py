@@ -248,8 +248,6 @@ def test_transforms_from_structure_from_motion_have_no_scale(tmp_path):
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_damaged_files_are_named_or_their_frames_skipped(tmp_path, kind):
-    """Every text or binary file cut anywhere, spoiled, emptied: the frames read stay right, or the error names a
-    file."""
     path, truth, *_ = WRITERS[kind](tmp_path / "good")
     rng, messages = random.Random(0), []
     suffixes = (".bin", ".txt", ".json", ".csv", ".yaml", ".traj", ".pincam")

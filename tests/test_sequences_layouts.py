@@ -285,6 +285,8 @@ def test_unknown_and_ambiguous_layouts(tmp_path):
     with pytest.raises(ValueError, match="fits the layouts tum, scannet: pass layout"):
         open_sequence(scannet)
     assert open_sequence(scannet, "scannet").layout == "scannet"
+    with pytest.raises(ValueError, match="layout 'scannet' takes no fps"):
+        open_sequence(scannet, "scannet", fps=30)
 
 
 @pytest.mark.parametrize("layout", WRITERS)

@@ -164,7 +164,6 @@ def test_a_broken_header_is_refused(file, frames, message):
 
 
 def test_broken_frames_are_found_when_decoding(file):
-    """Bytes of a JPEG and of a depth map overwritten, an image of another size, a depth map too short."""
     data, offsets = bytearray(file.read_bytes()), frame_offsets(file)
     data[offsets[0] + FRAME : offsets[0] + FRAME + 60] = bytes(60)
     color, _ = struct.unpack_from("<2Q", data, offsets[1] + 80)

@@ -150,7 +150,6 @@ def test_images_without_poses_are_for_networks_alone(tmp_path):
 
 
 def test_poses_of_another_program(tmp_path):
-    """A trajectory in each sequence's folder, its own format: judged as if the poses were the sequence's own."""
     root = write_rooms(tmp_path / "own", ["ash", "birch"], frames=3)
     for name in ("ash", "birch"):
         shutil.copy(root / name / "poses.txt", root / name / "slam.txt")

@@ -65,7 +65,6 @@ def image(seed=0):
 
 @pytest.mark.parametrize(("head", "channels"), [(AleatoricHead, 1), (EvidentialHead, 3)])
 def test_a_head_on_any_feature_map(head, channels):
-    """As a module of one's own: features of another resolution, a loss, and gradients of all its weights."""
     one = head(5)
     depth = torch.full((2, 8, 12), 2.0, requires_grad=True)
     distribution = one(torch.rand(2, 5, 4, 6), depth)

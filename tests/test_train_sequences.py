@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from layouts import write_generic, write_scannet, write_tum
+from layouts import write_generic, write_tum
 from training_data import PLAIN, TINY, truncated
 
 from ufmstar_torch.eval.sequences import open_sequence
@@ -49,20 +49,6 @@ def test_frames_of_a_sequence_are_the_readers(tmp_path):
         np.testing.assert_array_equal(raw.image.transpose(1, 2, 0), frame.image)
         np.testing.assert_array_equal(raw.depth, frame.depth)
         np.testing.assert_array_equal(raw.intrinsics, frame.intrinsics)
-
-
-def test_depth_with_a_camera_of_its_own_is_seen_by_the_images(tmp_path):
-    """ScanNet: 121 x 162 colour, 48 x 64 depth. At the image's pixels it is the colour camera's depth, but for
-    the coarser depth map's edges."""
-    path, of_color, _ = write_scannet(tmp_path)
-    raw = SequenceFrames([open_sequence(path)]).load(2)
-    assert raw.depth.shape == raw.image.shape[1:] == (121, 162)
-    np.testing.assert_allclose(raw.intrinsics, of_color.K)
-    valid = raw.depth > 0
-    error = np.abs(raw.depth - of_color.depths[2])[valid] / of_color.depths[2][valid]
-    assert valid.mean() > 0.9
-    assert np.median(error) < 0.01
-    assert (error < 0.03).mean() > 0.9
 
 
 def test_a_broken_image_of_a_sequence_is_named_or_skipped(tmp_path):
