@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import pytest
@@ -94,19 +92,6 @@ class TestContactSheet:
         assert load(tmp_path / "s.png").shape[1] > 100
         assert dict(matplotlib.rcParams) == before
         assert ("matplotlib.pyplot" in sys.modules) == loaded
-
-    def test_full_disk_keeps_the_old_sheet(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        contact_sheet([panel()], tmp_path / "s.png")
-        before = (tmp_path / "s.png").read_bytes()
-
-        def full(*_: object) -> NoReturn:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-        monkeypatch.setattr(os, "replace", full)
-        with pytest.raises(OSError, match="No space left"):
-            contact_sheet([panel("b", seed=3)], tmp_path / "s.png")
-        assert (tmp_path / "s.png").read_bytes() == before
-        assert [p.name for p in tmp_path.iterdir()] == ["s.png"]
 
 
 class TestPreview:

@@ -111,6 +111,16 @@ class TestSplats:
             np.testing.assert_allclose(table[name], getattr(mix, name)[stream][used], rtol=1e-7)
         np.testing.assert_allclose(1 / (1 + np.exp(-table["opacity"])), OPACITY, rtol=1e-6)
 
+    def test_colour_follows_disagreement(self, tmp_path: Path) -> None:
+        mix = mixture(30, streams=1)
+        mix = mix.replace(count=torch.where(torch.arange(30) % 5 == 0, 1, mix.count + mix.valid))
+        write_mixture_ply(tmp_path / "m.ply", mix)
+        vertex = parse(tmp_path / "m.ply")[0]["vertex"]
+        rgb, compared = 0.5 + 0.28209479177387814 * stack(vertex, "f_dc_0", "f_dc_1", "f_dc_2"), vertex["count"] > 1
+        brightness = (rgb @ [0.3, 0.6, 0.1])[compared][np.argsort(vertex["disagreement"][compared])]
+        assert (np.diff(brightness) >= -1e-6).all()
+        np.testing.assert_allclose(rgb[~compared], 150 / 255, atol=1e-6)
+
     def test_flat_and_point_components_are_finite(self, tmp_path: Path) -> None:
         mix = mixture(4, streams=1)
         covariance = torch.zeros_like(mix.covariance)

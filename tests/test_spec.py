@@ -12,7 +12,6 @@ from ufmstar_torch.models import (
     BatchEnsemble,
     EvidentialDepth,
     FastDepth,
-    FastDepthWidths,
     GaussianDepth,
     MonodepthResNet,
     MonteCarloDropout,
@@ -72,20 +71,6 @@ def test_the_method_decides_the_head(name):
         assert (network(image).depth == network(image).depth).all()  # samples only within its wrapper
         sampled = MonteCarloDropout(network)
         assert (sampled(image).depth != sampled(image).depth).any()
-
-
-@pytest.mark.parametrize(
-    ("widths", "expected"),
-    [
-        ("full", FastDepthWidths.full()),
-        ("pruned", FastDepthWidths.pruned()),
-        (1, FastDepthWidths.full()),
-        (0.25, FastDepthWidths.scaled(0.25)),
-    ],
-)
-def test_widths(widths, expected):
-    with torch.device("meta"):
-        assert build_backbone(NetworkSpec(widths=widths)).widths == expected
 
 
 def test_a_pretrained_backbone_is_used():

@@ -67,6 +67,17 @@ def test_the_maps_are_the_frames(folder, networks, sequence):
     assert read(folder / "examples" / f"{frame.name}@Aleatoric.npz").keys() == {"depth", "variance", "aleatoric"}
 
 
+def test_the_image_is_what_the_network_saw(folder, networks, sequence):
+    frame = sequence[1]
+    shown = read(folder / "examples" / f"{frame.name}.npz")["image"]
+    assert shown.shape == (32, 64, 3)
+    assert shown.dtype == np.uint8
+    image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
+    x, _ = networks["aleatoric"].networks[0].preprocess(image, torch.from_numpy(frame.intrinsics)[None])
+    seen = 255 * x[0].permute(1, 2, 0).numpy()
+    assert np.abs(shown - seen).mean() < 4, "grey levels"
+
+
 def test_rooms_in_the_world(folder, networks, sequence):
     names = sorted(file.name for file in (folder / "room").iterdir())
     assert names == sorted(f"UfMstar-Aleatoric_{sequence.names[i]}.npz" for i in (1, 2, 5))

@@ -13,7 +13,7 @@ from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.tour import Tour, export_tour, make_tour, render, tour_path, tour_sequence
 from ufmstar_torch.eval.tour.intersect import entry
 from ufmstar_torch.eval.tour.sensor import develop
-from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD, Finish, ball, box, part, surfaces, tube
+from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD, Finish, ball, box, part, surfaces
 from ufmstar_torch.eval.tour.style import HALL_TEXTURES, HOME_TEXTURES, STYLES, TEXTURES
 from ufmstar_torch.eval.tour.texture import noise_table
 from ufmstar_torch.eval.tour.view import cast, intrinsics
@@ -76,18 +76,6 @@ def test_depth_of_a_sphere_is_the_quadratic_formula():
     expected = np.where(b * b >= a * c, (b - root) / a, np.inf)
     assert 20 < np.isfinite(expected).sum() < 700
     np.testing.assert_allclose(depth_of(ball(centre, (r, r, r), Finish())), expected, rtol=1e-9)
-
-
-def test_depth_of_a_cylinder_and_of_its_cap():
-    d = rays()
-    upright = depth_of(tube((0, 0, 3), 0.8, 5.0, Finish()))
-    a, b, c = d[..., 0] ** 2 + 1, 3.0, 9 - 0.64
-    expected = np.where(b * b >= a * c, (b - np.sqrt(np.maximum(b * b - a * c, 0))) / a, np.inf)
-    np.testing.assert_allclose(upright, expected, rtol=1e-9)
-    lying = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    cap = np.where(np.hypot(d[..., 0], d[..., 1]) * 2 <= 0.8, 2.0, np.inf)
-    on_end = depth_of(tube((0, 0, 3), 0.8, 1.0, Finish(), rotation=lying))
-    np.testing.assert_allclose(on_end, cap, rtol=1e-9)
 
 
 def test_a_quad_is_seen_from_its_front_only():

@@ -7,10 +7,11 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from layouts import write_generic, write_tum
+from layouts import write_generic, write_scannet, write_tum
 from training_data import PLAIN, TINY, truncated
 
 from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.train import SampleDataset, SampleError, SequenceFrames, TourSettings, tour_frames
 from ufmstar_torch.train.data_config import Part
 from ufmstar_torch.train.sequence_data import open_rgbd
@@ -49,6 +50,13 @@ def test_frames_of_a_sequence_are_the_readers(tmp_path):
         np.testing.assert_array_equal(raw.image.transpose(1, 2, 0), frame.image)
         np.testing.assert_array_equal(raw.depth, frame.depth)
         np.testing.assert_array_equal(raw.intrinsics, frame.intrinsics)
+
+
+def test_depth_with_a_camera_of_its_own_is_seen_by_the_images(tmp_path):
+    sequence = open_sequence(write_scannet(tmp_path)[0])  # 121 x 162 colour, 48 x 64 depth
+    raw = SequenceFrames([sequence]).load(2)
+    np.testing.assert_array_equal(raw.depth, truth_at(sequence[2], raw.intrinsics, (121, 162)))
+    np.testing.assert_array_equal(raw.intrinsics, sequence.intrinsics)
 
 
 def test_a_broken_image_of_a_sequence_is_named_or_skipped(tmp_path):
