@@ -144,16 +144,16 @@ def test_distortion_of_any_layout_and_tum_s_own(tmp_path):
     np.testing.assert_allclose(sequence.intrinsics, lens.K, atol=1e-12)
     assert (sequence[0].image != truth.images[0]).any()
     assert (sequence[0].depth != open_sequence(path)[0].depth).any(), "depth was registered to the distorted image"
-    with pytest.raises(ValueError, match="'own' is known for layout 'tum' only"):
-        open_sequence(path, distortion="own")
     for bad in ((0.1,), ("fisheye", 1, 2), "k1", (0.1, np.nan, 0, 0)):
         with pytest.raises(ValueError, match="distortion"):
             open_sequence(path, distortion=bad)
     with pytest.raises(ValueError, match=r"fold the image's border|shrink the image"):
         open_sequence(path, distortion=(-9.0, 0, 0, 0))[0]
     tum, _ = layouts.write_tum(tmp_path)
-    own = open_sequence(tum, distortion="own")
-    assert own.intrinsics[0, 0] != open_sequence(tum).intrinsics[0, 0]
+    K = open_sequence(tum, distortion="none").intrinsics
+    published = Lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), layouts.SIZE, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172))
+    np.testing.assert_allclose(open_sequence(tum).intrinsics, published.K, atol=1e-12)
+    np.testing.assert_allclose(open_sequence(tum, intrinsics=K).intrinsics, K, atol=1e-12)
     assert parse_distortion(["fisheye", "1", "2", "3", "4"]) == ((1, 2, 3, 4), True)
 
 

@@ -38,7 +38,7 @@ def assert_frames_equal(sequence, truth, quantum):
 
 def test_tum(tmp_path):
     path, truth = layouts.write_tum(tmp_path)
-    sequence = open_sequence(path)
+    sequence = open_sequence(path, distortion="none")
     assert (sequence.layout, sequence.name) == ("tum", "rgbd_dataset_freiburg2_desk")
     assert_frames_equal(sequence, truth, 1 / 5000)
     assert sequence.names[1] == "10.033333"
@@ -75,7 +75,7 @@ def test_tum_depth_beyond_the_time_difference_is_missing(tmp_path):
     path, truth = layouts.write_tum(tmp_path)
     text = (path / "depth.txt").read_text().replace("10.071667 depth", "10.087667 depth")  # 21 ms after its image
     (path / "depth.txt").write_text(text)
-    sequence = open_sequence(path)
+    sequence = open_sequence(path, distortion="none")
     # image 3 (10.1) is 12 ms from it, but its own depth is nearer
     assert sequence.without_depth == ("10.066667",)
     assert sequence[2].depth is None
@@ -107,7 +107,7 @@ def test_tum_intrinsics_follow_the_camera_or_the_user(tmp_path):
     )
     listing = (renamed / "rgb.txt").read_text()
     (renamed / "rgb.txt").write_text("# file: 'rgbd_dataset_freiburg2_desk.bag'\n" + listing)
-    np.testing.assert_allclose(open_sequence(renamed).intrinsics, truth.K, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(open_sequence(renamed, distortion="none").intrinsics, truth.K, rtol=1e-12, atol=1e-12)
     # of the dataset's own size
     path = renamed.rename(tmp_path / "rgbd_dataset_freiburg3_x")
     for file in (path / "rgb").iterdir():
