@@ -32,7 +32,6 @@ from ufmstar_torch.eval.report.demo import (
     sheet_rows,
     surface_kinds,
 )
-from ufmstar_torch.eval.report.figures_curves import write_curves
 from ufmstar_torch.eval.report.text import demo_explanation, demo_table
 from ufmstar_torch.eval.run.colours import colour_table
 from ufmstar_torch.eval.sequences.frame import Frame
@@ -76,26 +75,14 @@ def done(weights, tmp_path_factory):
 def test_the_command_prints_its_tables_and_where_everything_is(done):
     out, code, message, progress = done
     assert code == 0
-    lines, summary = message.splitlines(), read_summary(out)
-    for name in ("delta1", "NLL", "ECE_delta", "ECE_q", "AUSE [m]", "network ms", "+ ms", "state kB"):
-        assert name in lines[0]
-    assert [line[:26].strip() for line in lines[1:6]] == [
-        "3 members in turn, alone", "with UfM", "with UfM*", "posterior", "all 3 members per image",
-    ]  # fmt: skip
-    assert max(map(len, lines)) <= 130 + len(str(out))
+    summary = read_summary(out)
     assert message == f"{demo_table(summary)}\n\n{demo_explanation(summary)}\n"
-    for name in ("contact_sheet.png", "calibration.png", "mixture.ply", "summary.json"):
-        assert f"{out}/{name}: " in message
-    for line, method in zip(lines[1:6], ROWS, strict=True):
+    for line, method in zip(message.splitlines()[1:6], ROWS, strict=True):
         figures = summary["methods"][method]["figures"]
         assert line[26:].split()[:5] == [
             f"{figures[key]:.3g}" for key in ("delta1", "nll", "ece_delta", "ece_q", "ause_rmse")
         ]
-        for kind in ("familiar", "unfamiliar"):
-            assert f"{summary['surfaces'][kind][method]['rms_sigma']:.3g}" in message
-    for stage in ("rooms", "kernels", "frames", "pictures"):
-        assert f"{stage}: done, " in progress
-        assert f"{stage}: done, " not in message
+    assert "frames: done, " in progress
 
 
 def test_files_and_summary(done, weights):
@@ -113,10 +100,7 @@ def test_files_and_summary(done, weights):
     assert summary["tour"] == {"seed": SEED, "style": "mixed", "frames": FRAMES, "size": list(SIZE)}
     network = summary["network"]
     assert (network["file"], network["members"], len(network["sha256"])) == (weights.name, 3, 64)
-    assert network["training"] == {"note": "a test"}
     assert NetworkSpec.from_dict(network["spec"]) == SPEC
-    assert torch.__version__.startswith(summary["versions"]["torch"])
-    assert summary["seconds"] > 0
 
 
 def test_times_and_memory_of_every_row(done):
@@ -125,8 +109,7 @@ def test_times_and_memory_of_every_row(done):
     assert list(rows) == list(ROWS)
     assert all(rows[m]["network_ms"] == rows[NETWORK]["network_ms"] > 0 for m in (UFM, UFM_STAR, POSTERIOR))
     assert rows[ENSEMBLE]["network_ms"] > rows[NETWORK]["network_ms"], "three inferences take longer than one"
-    assert rows[POSTERIOR]["uncertainty_ms"] > rows[UFM_STAR]["uncertainty_ms"] > 0
-    assert rows[UFM]["uncertainty_ms"] > 0
+    assert rows[POSTERIOR]["uncertainty_ms"] > rows[UFM_STAR]["uncertainty_ms"] > 0 < rows[UFM]["uncertainty_ms"]
     assert rows[NETWORK]["uncertainty_ms"] is rows[ENSEMBLE]["uncertainty_ms"] is None
     assert rows[UFM]["state_bytes"] == 40 * summary["points"] > 0
     assert rows[UFM_STAR]["state_bytes"] == 64 * summary["components"] > 0
@@ -219,9 +202,6 @@ def test_rows_of_the_sheet(unfamiliar, expected):
 REFUSED = {
     "frames": (("--frames", 1), 2, "--frames must be at least 2"),
     "seed": (("--seed", -1), 2, "--seed must be at least 0"),
-    "device": (("--device", "cuda:99"), 2, "--device cuda:99 is not available"),
-    "threads": (("--threads", 0), 2, "--threads must be at least 1"),
-    "unknown": (("--frame-rate", 3), 2, "--frame-rate"),
     "no weights": (("--weights", "none.safetensors"), 2, "no such file: none.safetensors"),
     "no networks": (("--weights", "{tmp}/bad.safetensors"), 1, "bad.safetensors"),
     "no variance": (("--weights", "{tmp}/plain.safetensors", "--frames", 2), 1, "a variance of their own"),
@@ -279,11 +259,6 @@ def test_ctrl_c(monkeypatch, ufmstar):
 
     monkeypatch.setattr(demo, "run_demo", interrupted)
     assert ufmstar("demo") == (130, "", "ufmstar demo: interrupted\n")
-
-
-def test_the_calibration_picture_needs_something_to_draw(tmp_path):
-    with pytest.raises(ValueError, match="1 to 6 methods"):
-        write_curves(tmp_path / "x.png", {})
 
 
 # ---- the networks of the package ----

@@ -183,6 +183,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: poses("--length", "a", "b"), "--length must be A B METRES"),
     (lambda: poses("--length", "a", "b", "-1"), "--length must be A B METRES"),
     (lambda: poses("--length", "a", "b", "1", "--trajectory", "x"), "contradict each other"),
+    (lambda: poses("--intrinsics", "none.txt"), "--intrinsics: no such file: none.txt"),
     (lambda: poses("--distortion", "0.1", "0", "0", "0"), "--distortion goes with --intrinsics"),
 ]  # fmt: skip
 
@@ -198,7 +199,11 @@ def test_it_is_refused_and_named(
 
 TOURS = ("tour:5?frames=3&size=64x96", "tour:6?frames=3&size=64x96")
 COMMANDS = [
-    (("rank", TOURS[0], "--depth", "self", "--by", "epistemic"), "--by epistemic: there is none here, only total"),
+    (
+        ("rank", TOURS[0], "--depth", "self", "--by", "epistemic"),
+        "--by epistemic: the depth comes with no epistemic variance",
+    ),
+    (("rank", TOURS[0], "--depth", "self", "--by", "anchored"), "--by anchored needs --anchors or --posterior"),
     (("rank", TOURS[0], "--depth", "self", "--count", "0"), "--count must be at least 1"),
     (("rank", TOURS[0], "--depth", "self", "--measured", "2"), "--measured must be a share"),
     (("rank", *TOURS, "--depth", "a"), "--depth DIR goes with one sequence"),

@@ -141,3 +141,12 @@ def test_scores_are_those_of_mean_uncertainty(ufmstar, tmp_path):
     most = max(best, key=lambda name: np.nan_to_num(best[name]))
     assert [name for name, row in rows.items() if row["rank"] == "1"] == [most]
     assert sum(row["rank"] != "" for row in rows.values()) == 1
+
+
+def test_a_part_that_the_network_does_not_state_is_refused_before_compiling(ufmstar, tmp_path, weights, monkeypatch):
+    monkeypatch.setattr("ufmstar_torch.eval.run.run.warm_up_job", lambda *_: pytest.fail("compiled before"))
+    words = ("--model", "trained", "--weights", weights, "--by", "epistemic", "--out", tmp_path / "out")
+    code, _, err = ufmstar("rank", TOURS[0], *words)
+    assert code == 2
+    assert "--by epistemic: the network states no epistemic variance" in err
+    assert not (tmp_path / "out").exists()
