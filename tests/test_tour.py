@@ -12,7 +12,6 @@ from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.tour import Tour, export_tour, make_tour, render, tour_path, tour_sequence
 from ufmstar_torch.eval.tour.intersect import entry
-from ufmstar_torch.eval.tour.sensor import develop
 from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD, Finish, ball, box, part, surfaces
 from ufmstar_torch.eval.tour.style import HALL_TEXTURES, HOME_TEXTURES, STYLES, TEXTURES
 from ufmstar_torch.eval.tour.texture import noise_table
@@ -254,17 +253,6 @@ def test_mixed_tours_begin_at_home_and_end_in_a_hall(mixed):
     assert of_home <= set(HOME_TEXTURES)
     assert len(of_home) > 6
     assert len(of_hall) > 4
-
-
-def test_the_sensor_is_mild_and_repeats(home):
-    pose = tour_path(home, 10)[4]
-    clean = render(home, pose, K, 24, 32).image.double()
-    noisy = [render(home, pose, K, 24, 32, frame_seed=s).image.double() for s in (1, 1, 2)]
-    assert torch.equal(noisy[0], noisy[1])
-    assert not torch.equal(noisy[0], noisy[2])
-    assert 0 < (noisy[0] - clean).abs().mean() < 30
-    assert clean.std() > 10
-    assert torch.equal(develop(torch.zeros(3, 4, 4)), torch.zeros(4, 4, 3, dtype=torch.uint8))
 
 
 # --- sequences -----------------------------------------------------------------------------------------------

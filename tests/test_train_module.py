@@ -10,7 +10,7 @@ import torch
 from depth_anything_files import write_depth_anything, write_other
 from torch import nn
 from torch.nn.functional import interpolate
-from trainings import tiny_job, write_frames
+from trainings import tiny_job
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.engine.load import network_source
@@ -47,11 +47,6 @@ class Own(nn.Module):
     def forward(self, image):
         features = self.decoder(self.encoder(image))
         return features if self.returns == "features" else 2 + self.last(features).tanh()
-
-
-@pytest.fixture(scope="module")
-def frames(tmp_path_factory):
-    return write_frames(tmp_path_factory.mktemp("frames") / "walk")
 
 
 def data_of(frames):

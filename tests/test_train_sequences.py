@@ -12,7 +12,7 @@ from training_data import PLAIN, TINY, truncated
 
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.train import SampleDataset, SampleError, SequenceFrames, TourSettings, tour_frames
+from ufmstar_torch.train import SampleDataset, SampleError, SequenceFrames, tour_frames
 from ufmstar_torch.train.data_config import Part
 from ufmstar_torch.train.sequence_data import open_rgbd
 from ufmstar_torch.train.tour_data import TourFrames, tour_files
@@ -120,19 +120,6 @@ def test_tours_are_rendered_once_and_completed(tours, tmp_path):
         assert path.stat().st_mtime_ns == times[path.name]
     np.testing.assert_array_equal(again.load(4).image, frames.load(4).image)
     assert sorted(times) == sorted(path.name for path in inside.iterdir())  # nothing temporary is left
-
-
-def test_every_setting_has_a_cache_of_its_own():
-    others = [
-        TourSettings(frames=4, stride=4, size=(24, 32)),
-        TourSettings(frames=3, stride=5, size=(24, 32)),
-        TourSettings(frames=3, stride=4, size=(32, 24)),
-        TourSettings(frames=3, stride=4, size=(24, 32), style="hall"),
-        TourSettings(frames=3, stride=4, size=(24, 32), fov=60.0),
-    ]
-    digests = {one.digest() for one in (TINY, *others)}
-    assert len(digests) == 6
-    assert TourSettings(frames=3, stride=4, size=(24, 32)).digest() == TINY.digest()
 
 
 def test_a_truncated_cache_file_is_named(tours, tmp_path):
