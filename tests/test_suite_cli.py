@@ -12,7 +12,6 @@ from tiny_suite import TRUTH, Stub, rows_of
 from ufmstar_torch.eval.bench import measure as measurement
 from ufmstar_torch.eval.commands import dry_run as dry
 from ufmstar_torch.eval.commands.evaluate import job_from, read
-from ufmstar_torch.eval.commands.terminal import warned_once
 from ufmstar_torch.eval.methods.suite import names
 from ufmstar_torch.eval.suite import shards
 
@@ -49,7 +48,6 @@ MISTAKES = {
     "no root": (["{}", "--root", "/nowhere"], "no such file or folder: /nowhere"),
     "frames": (["{}", "--frames", "5"], "--frames must be START:STOP"),
     "shard": (["{}", "--shard", "0/2"], "--shard must be 1/n to n/n"),
-    "shard and slurm": (["{}", "--shard", "1/2", "--slurm", "jobs=2"], "--shard and --slurm contradict each other"),
     "shard and overwrite": (["{}", "--shard", "1/2", "--overwrite"], "--overwrite goes without shards"),
     "both": (["{}", "--resume", "--overwrite"], "--resume and --overwrite contradict"),
     "processes": (["{}", "--processes", "0"], "--processes must be at least 1"),
@@ -58,7 +56,6 @@ MISTAKES = {
     "list of nothing": (["{}", "--sequence-list", "/nowhere.txt"], "/nowhere.txt"),
     "unknown option": (["{}", "--etaa", "1"], "--etaa"),
     "device": (["{}", "--device", "abacus"], "--device abacus is not available"),
-    "slurm": (["{}", "--slurm", "gpu"], "--slurm must be KEY=VALUE"),
 }
 
 
@@ -190,7 +187,7 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
 def test_a_warning_of_many_streams_is_logged_once(caplog):
     logger = logging.getLogger("ufmstar_torch")
     for _ in range(2):
-        with warned_once():
+        with shards.warned_once():
             for stream, text in ((0, "a frame has no segment"), (1, "a frame has no segment"), (1, "other")):
                 logger.warning("stream %d: %s", stream, text)
     assert caplog.messages == 2 * ["stream 0: a frame has no segment", "stream 1: other"]

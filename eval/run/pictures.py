@@ -89,23 +89,18 @@ class Finished:
         return float(np.clip(1 / np.median(np.diff(known)), *FPS_RANGE))
 
 
-def panel_of(name: str, note: str, frame: Frame, row: RowResult, posterior: RowResult | None = None) -> FramePanel:
-    """Depth, sigma and, with ground truth, true error of a row, and of a row of its posterior, beside the image."""
-    if frame.image is None:
-        raise ValueError(f"frame {name} has no image to show")
-    valid, maps = row.valid.numpy(), dict[str, NDArray[Any]]()
-    for prefix, one in (("", row), ("posterior_", posterior)):
-        if one is None or one.variance is None:
-            continue
-        depth = one.depth.float().numpy()
-        maps[prefix.rstrip("_") or "depth"] = depth
-        maps[f"{prefix}sigma"] = one.variance.float().sqrt().numpy()
-        if row.truth is not None:
-            maps[f"{prefix}error"] = absolute_error(depth, row.truth)
+def panel_of(name: str, note: str, frame: Frame, row: RowResult) -> FramePanel:
+    """A row's maps of a frame beside its image: depth, sigma and, with ground truth, the absolute error."""
+    if frame.image is None or row.variance is None:
+        raise ValueError(f"frame {name} has no image or no variance to show")
+    maps = {"depth": row.depth.float().numpy(), "sigma": row.variance.float().sqrt().numpy()}
+    if row.truth is not None:
+        maps["error"] = absolute_error(maps["depth"], row.truth)
     if row.measured is not None:
         maps["measured"] = row.measured.float().numpy()
     image = field_of_view(frame.image, frame.intrinsics, row.intrinsics, row.size)
-    return FramePanel(name, image, {key: known_where(valid, values) for key, values in maps.items()}, note)
+    shown = {key: known_where(row.valid.numpy(), values) for key, values in maps.items()}
+    return FramePanel(name, image, shown, note)
 
 
 def common_columns(finished: Finished) -> list[MapColumn]:
