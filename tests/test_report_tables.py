@@ -234,7 +234,7 @@ class TestSums:
             assert merged.curves[name] == pytest.approx(curve, rel=1e-12, nan_ok=True), name
         references = {name for name in merged.curves if name.startswith("nll_by_error")}
         names = ("Ensemble", "UfM-Ensemble-100K")
-        assert references == {f"nll_by_error{kind}:{name}" for kind in ("", "_of_all") for name in names}
+        assert references == {f"nll_by_error:{name}" for name in names}
 
     def test_the_same_bits_whoever_wrote_what(self, results, evaluation, tmp_path):
         other = write_evaluation(tmp_path / "o", ENSEMBLE, [], title=TITLE, unfinished=[*SCENES, KITCHEN, LATER])

@@ -7,10 +7,9 @@ import logging
 import signal
 
 import pytest
-from tiny_suite import TRUTH, Stub, rows_of
+from tiny_suite import TRUTH, Stub
 
 from ufmstar_torch.eval.bench import measure as measurement
-from ufmstar_torch.eval.commands import dry_run as dry
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.methods.suite import names
 from ufmstar_torch.eval.suite import shards
@@ -121,27 +120,7 @@ def test_a_dry_run_counts_and_writes_nothing(ufmstar, rooms, tmp_path):
     assert code == 0
     assert "5 rows:" in text
     assert "2 of 3:\n  rooms/ash: 3 frames\n  rooms/cedar: 3 frames\n6 frames, 10 records" in text
-    assert "cache of predictions: up to 0.0 MB" in text  # ground truth is not kept
     assert not (tmp_path / "out").exists()
-
-
-class Members:
-    """Three members that take turns."""
-
-    passes = 3
-
-    def turn(self, position):
-        return position % 3
-
-
-def test_predictions_are_counted_once_however_many_rows_share_them():
-    rows = rows_of("Ensemble", "UfM*-FullEnsemble", "UfM-Ensemble", "UfM*-Ensemble")
-    assert dry.predictions(rows[:1], Members(), 10) == 10
-    assert dry.predictions(rows, Members(), 10) == 20
-    # Every second frame: images 0, 2, 4, 6, 8 are member 0, 1, 2, 0, 1's; of the default row 0, 2, 1, 0, 2's.
-    skipping = rows_of("UfM*-Ensemble", skip=1)
-    assert dry.predictions(skipping, Members(), 10) == 5
-    assert dry.predictions([*rows[3:], *skipping], Members(), 10) == 10 + 3
 
 
 def test_several_roots_and_networks_and_a_file_of_options(rooms, tmp_path):

@@ -273,7 +273,7 @@ def test_skip_and_limit_choose_frames_and_turns(texts, networks, sequence):
 
 def binned(*references):
     """The names of the sums of NLL by error."""
-    return {f"nll_by_error{kind}:{name}" for kind in ("", "_of_all") for name in references}
+    return {f"nll_by_error:{name}" for name in references}
 
 
 def test_the_nll_by_error_is_over_the_pixels_where_the_reference_is_confident(networks, sequence):

@@ -108,7 +108,7 @@ class EvalOptions:
         threads: number of CPU threads of each process; default: all cores, divided among --processes
         processes: number of processes on this computer
         shard: i/n, only the i-th of n parts of the sequences, 1/n to n/n; torchrun's processes are shards as well
-        dry_run: show rows, sequences and the size of the cache, and stop
+        dry_run: show rows and sequences, and stop
         debug: show tracebacks
     """
 

@@ -2,8 +2,7 @@
 
 For the figure of NLL by error, the paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is
 confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, the half of the
-reference's pixels with the smallest variance, of every frame, and of all sequences with one threshold. All rows on the
-same frames are judged on the same pixels.
+reference's pixels with the smallest variance in every frame. All rows on the same frames are judged on the same pixels.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence with
 # Names of a run's figures: UfM*, beside it the network alone, and the posterior if there is one.
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Names of a row's sums.
-METRICS, BY_ERROR, BY_ERROR_OF_ALL, CONFIDENCE = "metrics", "nll_by_error", "nll_by_error_of_all", "confidence"
+METRICS, BY_ERROR, CONFIDENCE = "metrics", "nll_by_error", "confidence"
 EACH = 512  # pixels of a frame, evenly, for ``ufmstar recalibrate --kind confidence``
 # Metrics of one's own by name (``sequences.plugins``).
 Own = Mapping[str, Any]
@@ -101,9 +100,8 @@ class RowFigures:
     curves: dict[str, Any]
     state: dict[str, float]
     ms: dict[str, float]
-    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``), "nll_by_error:REFERENCE"
-    # and "nll_by_error_of_all:REFERENCE" (``NLLByError``), to be added up over sequences; and "confidence", samples of
-    # pixels (``_samples``).
+    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and "nll_by_error:REFERENCE"
+    # (``NLLByError``), to be added up over sequences; and "confidence", samples of pixels (``_samples``).
     sums: dict[str, dict[str, Tensor]]
 
 
@@ -120,20 +118,13 @@ class RowJudge:
         self._ms: list[Mapping[str, float]] = []
         self._memory: list[Mapping[str, float]] = []
 
-    def add(
-        self,
-        result: RowResult,
-        memory: Mapping[str, float],
-        masks: Mapping[str, Tensor],
-        rows: Mapping[str, RowResult],
-    ) -> None:
+    def add(self, result: RowResult, memory: Mapping[str, float], masks: Mapping[str, Tensor]) -> None:
         """Add a frame. Pixels that the row leaves out are NaN, not masked, so that the metrics count them.
 
         Args:
             result: of this row.
             memory: of its estimator after the frame.
             masks: confident pixels by reference.
-            rows: results of all rows by key.
         """
         if result.statistics is not None:
             segments, matched = (int(count[0]) for count in (result.statistics.segments, result.statistics.matched))
@@ -158,11 +149,6 @@ class RowJudge:
         for other, name in self.named.items():
             by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
             by_error.update(depth, variance, target, masks[other])
-            of_all = NLLByError(one_threshold=True, sync_on_compute=False)
-            of_all = self._by_error.setdefault(f"{BY_ERROR_OF_ALL}:{name}", of_all)
-            reference = rows[other]
-            assert reference.variance is not None
-            of_all.add_levels(depth, variance, target, torch.where(reference.valid, reference.variance, torch.nan))
 
     def figures(self) -> RowFigures:
         """The figures after the last frame. Raises SequenceError: no frame was judged."""
@@ -175,8 +161,7 @@ class RowJudge:
         curves: dict[str, Any] = metrics.curves()
         sums = {METRICS: metrics.state_dict()}
         for name, by_error in self._by_error.items():
-            if name.startswith(f"{BY_ERROR}:"):
-                curves[name] = by_error.compute()["nll_by_error"].tolist()
+            curves[name] = by_error.compute()["nll_by_error"].tolist()
             sums[name] = by_error.state_dict()
         if self._samples:
             sums[CONFIDENCE] = {"samples": torch.cat(self._samples)}
@@ -222,7 +207,7 @@ class RowJudges(FrameSink):
         expected = {other for key in judged for other in self._judges[key].named}
         masks = {other: confident_pixels(result.rows[other]) for other in expected}
         for key, row in result.rows.items():
-            self._judges[key].add(row, self._estimators[key].memory(), masks, result.rows)
+            self._judges[key].add(row, self._estimators[key].memory(), masks)
 
 
 def _samples(confidence: Tensor, depth: Tensor, variance: Tensor, target: Tensor) -> Tensor:

@@ -159,14 +159,13 @@ def add_joint(depth: Any, variance: Any, target: Any, use: Any, joint: Any) -> N
 def add_nll_by_error(
     depth: Any, variance: Any, target: Any, use: Any, count: Any, nll: Any
 ) -> None:  # fmt: skip
-    """By level and bin [levels, bins + 2] of (d - g)^2, over v > 0: pixels, and NLL. ``use`` is the pixel's
-    level, counted from 1; 0 (False) = unused."""
+    """By bin [bins + 2] of (d - g)^2, over v > 0: pixels, and NLL."""
     for i in range(len(depth)):
         d, v, g = depth[i], variance[i], target[i]
         if use[i] and _is_truth(g) and _is_prediction(d, v) and v > 0:
-            level, b = use[i] - 1, log_bin((d - g) * (d - g), count.shape[1] - 2)
-            count[level, b] += 1
-            nll[level, b] += gaussian_nll(d, v, g)
+            b = log_bin((d - g) * (d - g), len(count) - 2)
+            count[b] += 1
+            nll[b] += gaussian_nll(d, v, g)
 
 
 @part

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.engine.judge import BY_ERROR, BY_ERROR_OF_ALL
+from ufmstar_torch.eval.engine.judge import BY_ERROR
 from ufmstar_torch.eval.methods.method import ALONE, BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report import style
@@ -176,8 +176,7 @@ _SIGMAS = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)  # [m]
 
 def draw_error(results: Results, dataset: str) -> Any | None:
     """The mean NLL of each tenth of the pixels, from a row's smallest errors to its largest: a line of panels per
-    network, two panels per reference (its confident pixels of each frame, and of all sequences with one threshold);
-    None where no row was judged so."""
+    network, a panel per reference (its confident pixels of each frame); None where no row was judged so."""
     panels = {base: of_base for base in results.bases if (of_base := _error_curves(results, dataset, base))}
     if not panels:
         return None
@@ -186,7 +185,7 @@ def draw_error(results: Results, dataset: str) -> Any | None:
     for line, (base, by_reference) in zip(
         style.hidden_panels(figure, len(panels), columns), panels.items(), strict=True
     ):
-        for axes, ((reference, kind), curves) in zip(line, by_reference.items(), strict=False):
+        for axes, (reference, curves) in zip(line, by_reference.items(), strict=False):
             axes.set_visible(True)
             for row, values in sorted(curves.items(), key=lambda item: item[0].method.fusion == UFM_STAR):
                 x = (np.arange(len(values)) + 0.5) * 100 / len(values)
@@ -194,24 +193,22 @@ def draw_error(results: Results, dataset: str) -> Any | None:
             axes.set(xlim=(0, 100), xticks=[0, 25, 50, 75, 100])
             method = Method.parse(reference)
             judge = "it" if method.fusion == ALONE else style.look_of(method).name
-            title = f"{BASES[base][0]}: where {judge} is confident"
-            title += ", one threshold" if kind == BY_ERROR_OF_ALL else " in each frame"
+            title = f"{BASES[base][0]}: where {judge} is confident in each frame"
             style.finish(axes, title=title, x="percentile of the row's error", y="mean NLL [nats]")
             style.name_lines(axes)
     return figure
 
 
-def _error_curves(results: Results, dataset: str, base: str) -> dict[tuple[str, str], dict[Row, Sequence[float]]]:
-    """Curves by row, by reference and kind of threshold: the base alone first, then UfM."""
-    curves: dict[tuple[str, str], dict[Row, Sequence[float]]] = {}
+def _error_curves(results: Results, dataset: str, base: str) -> dict[str, dict[Row, Sequence[float]]]:
+    """Curves by row, by reference: the base alone first, then UfM."""
+    curves: dict[str, dict[Row, Sequence[float]]] = {}
     for row in results.default_rows(base):
         merged = results.merged.get((dataset, row))
         for name, values in (merged.curves if merged else {}).items():
             kind, _, reference = name.partition(":")
-            known = kind in (BY_ERROR, BY_ERROR_OF_ALL) and np.isfinite(values).any()
-            if known and Method.parse(reference).base == base:
-                curves.setdefault((reference, kind), {})[row] = values
-    return dict(sorted(curves.items(), key=lambda item: (item[0][0].startswith("UfM"), item[0])))
+            if kind == BY_ERROR and np.isfinite(values).any() and Method.parse(reference).base == base:
+                curves.setdefault(reference, {})[row] = values
+    return dict(sorted(curves.items(), key=lambda item: (item[0].startswith("UfM"), item[0])))
 
 
 # ---- the paper's figure of predictive entropy ----

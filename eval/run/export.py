@@ -127,7 +127,7 @@ def export_cloud(frames: Iterator[Gated], out: Path, voxel: float, sequence: Fra
         kinds |= dict.fromkeys(("red", "green", "blue"), "|u1")
         columns.append(np.rint(colour))
     file = export_folder(out) / "cloud.ply"
-    write_ply(file, {"vertex": vertex_table(kinds, *columns)}, ["x y z sigma [m], world of the poses"])
+    write_ply(file, vertex_table(kinds, *columns), "x y z sigma [m], world of the poses")
     return f"{file}: {len(keys)} points"
 
 

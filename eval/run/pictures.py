@@ -1,4 +1,4 @@
-"""Pictures of a run: contact sheet, preview video, and the mixture for viewers.
+"""Pictures of a run: contact sheet and preview video.
 
 A run's pictures are drawn from its finished frames on disk, so that their scales fit the whole run, and a run that was
 stopped and continued gets the same ones.
@@ -6,9 +6,8 @@ stopped and continued gets the same ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +18,14 @@ from numpy.typing import NDArray
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.run.colours import INVALID_GREY, known_where
-from ufmstar_torch.eval.run.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.run.panels import FramePanel, MapColumn, contact_sheet, map_columns
 from ufmstar_torch.eval.run.video import preview_frame, write_video
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
-from ufmstar_torch.ufmstar import UfMStar
 
 SHEET = "contact_sheet.png"
-PLY, ELLIPSOIDS, NPZ = "mixture.ply", "ellipsoids.ply", "mixture.npz"
 SHEET_ROWS, POSTERIOR_ROWS, SCALE_FRAMES = 6, 3, 12
 # Without timestamps; and the range in which a recording's own rate is kept.
 DEFAULT_FPS, FPS_RANGE = 10.0, (2.0, 30.0)
@@ -125,17 +121,6 @@ def draw_video(finished: Finished, columns: Sequence[MapColumn]) -> Iterator[int
         for number in range(len(finished.records)):
             add(preview_frame(finished.panel(number), columns))
             yield number + 1
-
-
-def mixture_writers(ufm: UfMStar) -> dict[str, Callable[[Path], object]]:
-    """By file name, what writes the mixture in world coordinates: as splats, as ellipsoids, and exactly."""
-    mixture, first = ufm.mixture, ufm.T_world_first
-    writers: dict[str, Callable[..., object]] = {
-        PLY: write_mixture_ply,
-        ELLIPSOIDS: write_ellipsoids_ply,
-        NPZ: write_mixture_npz,
-    }
-    return {name: partial(write, mixture=mixture, T_world_first=first) for name, write in writers.items()}
 
 
 def square_pixels(K: NDArray, size: Size) -> tuple[NDArray, Size]:
