@@ -1,4 +1,4 @@
-"""How right and how certain anchors of images are, and what the posterior makes of them on wrong poses and images.
+"""Measures the errors and stated variances of anchors from images, and of the posterior on wrong poses and images.
 
     python docs/measure_evidence.py 'tour:62?style=hall&frames=60&size=240x320' rgbd_dataset_freiburg1_xyz
 

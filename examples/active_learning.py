@@ -71,8 +71,8 @@ def views(frames: Iterable[Frame], preprocess: Preprocess, tour: Any = None) -> 
 def open_place(options: argparse.Namespace, repetition: int, preprocess: Preprocess, size: tuple[int, int]) -> Any:
     """The pool, of which some views may be labelled, and the held-back views that judge.
 
-    Of a tour, the two are walks through the same rooms with another start, direction, sway and glances; of a recording,
-    its first 60 % and its last 35 %, so that no neighbour of a labelled frame is judged.
+    In a tour, both are walks through the same rooms with another start, direction, sway and glances. In a recording,
+    they are its first 60 % and its last 35 %, so that no neighbour of a labelled frame is judged.
     """
     if options.sequence is not None:
         sequence = open_sequence(options.sequence)
@@ -123,7 +123,7 @@ def score_pool(members: Sequence[DepthNetwork], pool: Sequence[View], pixels: in
 def select(scores: Sequence[float], budget: int, spacing: int, taken: Collection[int] = ()) -> list[int]:
     """Greedy picks: the highest score first, no two closer than ``spacing`` frames, nor to one that is ``taken``.
 
-    Of equal scores the earlier frame wins; frames without a score (NaN) are never picked.
+    The earlier of two frames with equal scores wins; frames without a score (NaN) are never picked.
 
     Raises:
         ValueError: the pool is too short for the budget.

@@ -283,7 +283,7 @@ def _inliers(x: Tensor, y: Tensor, use: Tensor, weight: Tensor, shift: float | N
         if step < _REWEIGHTED:
             weights = weight * use * (_HUBER * deviation / residual.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1)
             continue
-        # Where no line is determined all points stay, and the final fit names the image.
+        # All points stay where no line is determined; the final fit names the image.
         previous, inlier = inlier, use & ((residual <= _CUT * deviation) | ~determined[:, None])
         weights = weight * inlier
         if torch.equal(inlier, previous):

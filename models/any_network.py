@@ -43,7 +43,7 @@ class WrappedNetwork(DepthNetwork):
 
     @property
     def takes_intrinsics(self) -> bool:
-        """Whether the network does, or the unit of its depth depends on the focal length."""
+        """True if the network takes intrinsics, or the unit of its depth depends on the focal length."""
         return self.outputs.focal is not None or self._passes_intrinsics
 
     @property
@@ -53,7 +53,7 @@ class WrappedNetwork(DepthNetwork):
 
     @property
     def states_confidence(self) -> bool:
-        """Whether one is declared, or stated by a network that returns a ``DepthPrediction``."""
+        """True if a confidence is declared, or stated by a network that returns a ``DepthPrediction``."""
         return self.outputs.confidence is not None or states_confidence([self.network])
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
@@ -129,7 +129,7 @@ def wrap_network(
 
 
 def _described(value: object) -> str:
-    """What was given in place of a network or a preprocessing, and what to do."""
+    """Describe an argument that is no network or preprocessing, and the remedy, for an error message."""
     if isinstance(value, type):
         return f"the class {value.__name__}: give an instance, {value.__name__}(...)"
     if isinstance(value, str | Path):
@@ -198,7 +198,7 @@ def _checked_copy(path: str) -> io.BytesIO:
 
 
 def _is_json(content: bytes) -> bool:
-    """Whether the content is nothing or JSON, neither of which can be unpickled."""
+    """True if the content is empty or JSON, neither of which can be unpickled."""
     try:
         json.loads(content or b"0")
     except (ValueError, RecursionError):

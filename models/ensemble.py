@@ -83,7 +83,7 @@ class LazyMember(DepthNetwork):
 
     @property
     def loaded(self) -> bool:
-        """Whether the weights are in memory."""
+        """True if the weights are in memory."""
         return bool(self._held)
 
     def network(self) -> DepthNetwork:
@@ -110,7 +110,7 @@ class LazyMember(DepthNetwork):
 
     @property
     def takes_intrinsics(self) -> bool:
-        """Whether the network does, which is loaded for it."""
+        """True if the network takes intrinsics; loads it."""
         return takes_intrinsics(self.network())
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
@@ -151,5 +151,5 @@ class LazyMember(DepthNetwork):
         super().__setstate__({**state, "_loading": threading.Lock(), "_calling": threading.Lock()})
 
     def extra_repr(self) -> str:
-        """Whether it is loaded."""
+        """Name and state of the network."""
         return f"{self.name!r}, loaded={self.loaded}, offload={self.offload}"

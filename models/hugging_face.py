@@ -186,7 +186,7 @@ class HuggingFaceDepth(DepthNetwork):
 
     @property
     def is_metric(self) -> bool:
-        """Whether it can be used without an alignment."""
+        """True if the network needs no alignment."""
         return self.kind == METRIC
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
@@ -261,7 +261,7 @@ def from_hugging_face(
 
 
 def of_transformers(network: object) -> bool:
-    """Whether it is a model or a pipeline of ``transformers``, which is not imported for that."""
+    """True for a model or a pipeline of ``transformers``, which is not imported for the test."""
     bases = {cls.__name__ for cls in type(network).__mro__ if cls.__module__.startswith("transformers.")}
     return bool(bases & {"PreTrainedModel", "Pipeline"})
 

@@ -31,7 +31,7 @@ BF16 = "bf16"
 
 @dataclass(frozen=True)
 class Inference(Checked):
-    """How networks are run.
+    """Settings with which networks are run.
 
     Attributes:
         runtime: "auto" (ONNX Runtime for ONNX weights, torch for the rest), "torch" or "onnx".

@@ -120,7 +120,7 @@ class Units(nn.Module):
         self.network, self.inverse = network, inverse
 
     def forward(self, image: Tensor) -> Tensor:
-        """Of ``image`` [B, 3, H, W]."""
+        """The depth, or its inverse, of ``image`` [B, 3, H, W]."""
         depth: Tensor = self.network(image).depth
         return 1 / depth if self.inverse else depth
 

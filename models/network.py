@@ -33,7 +33,7 @@ class DepthNetwork(nn.Module, ABC):
 
     @property
     def takes_intrinsics(self) -> bool:
-        """Whether it is called as ``network(x, K)``, with K [B, 3, 3] of ``x`` [px]."""
+        """True if it is called as ``network(x, K)``, with K [B, 3, 3] of ``x`` [px]."""
         return any(takes_intrinsics(network) for network in self.wrapped)
 
     @property
@@ -43,7 +43,7 @@ class DepthNetwork(nn.Module, ABC):
 
     @property
     def states_confidence(self) -> bool:
-        """Whether its predictions have a ``confidence``."""
+        """True if its predictions have a ``confidence``."""
         return states_confidence(self.wrapped)
 
     if TYPE_CHECKING:
@@ -95,12 +95,12 @@ class ProgramNetwork(DepthNetwork):
 
     @property
     def takes_intrinsics(self) -> bool:
-        """Whether the unit of its depth depends on the focal length."""
+        """True if the unit of its depth depends on the focal length."""
         return self.spec.outputs.focal is not None
 
     @property
     def states_confidence(self) -> bool:
-        """Whether the spec names one."""
+        """True if the spec names a confidence."""
         return self.spec.outputs.confidence is not None
 
     @property
@@ -136,5 +136,5 @@ def require_image(image: Tensor, multiple: int = 1, smallest: int = 1) -> tuple[
 
 
 def fits(height: int, width: int, multiple: int, smallest: int) -> bool:
-    """Whether both sides [px] are multiples of ``multiple`` and at least ``smallest``."""
+    """True if both sides [px] are multiples of ``multiple`` and at least ``smallest``."""
     return not height % multiple and not width % multiple and min(height, width) >= smallest

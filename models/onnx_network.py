@@ -145,7 +145,7 @@ class OnnxNetwork(ProgramNetwork):
 
     @property
     def takes_intrinsics(self) -> bool:
-        """Whether the graph does, or the unit of its depth depends on the focal length."""
+        """True if the graph takes intrinsics, or the unit of its depth depends on the focal length."""
         return self.K_input is not None or self.spec.outputs.focal is not None
 
     def _fitted_preprocess(self, preprocess: Preprocess) -> Preprocess:

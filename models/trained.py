@@ -211,7 +211,7 @@ def _unwrapped(network: DepthNetwork) -> nn.Module:
 
 
 def _fits_half(key: str, value: Tensor) -> bool:
-    """Whether half precision holds a tensor: small weights may become 0, a variance that is divided by may not."""
+    """True if half precision holds a tensor: small weights may become 0, a variance that is divided by may not."""
     if value.dtype not in (torch.float32, torch.float64) or not value.numel():
         return False
     tiny = key.endswith("running_var") and value.min() < _HALF.tiny

@@ -97,7 +97,7 @@ def draw(config: AugmentationConfig, seed: tuple[int, ...], height: int, width: 
 
 
 def camera_change(intrinsics: Tensor, change: Change, height: int, width: int, zoom: str) -> tuple[Tensor, Tensor]:
-    """How pixels move, p' = A p + b, and the intrinsics K' that belong to them.
+    """The map of the pixels, p' = A p + b, and the intrinsics K' that belong to it.
 
     With K = (L, c), L its upper left 2x2 part, c the principal point, a point at x = (X/Z, Y/Z) is seen at
     p = L x + c. The new camera is rolled by R and mirrored by F, so A = s F L R L^-1. The image's centre m stays

@@ -62,7 +62,8 @@ def distillation_sums(
 ) -> tuple[Tensor, Tensor]:
     """The sum of the loss over pixels and their number (int64), as ``losses.loss_sums``.
 
-    Of a pixel: |error| [m] of the depth where there is ground truth, and (s - log V)^2 / 2 where UfM* has measured V.
+    Each pixel counts |error| [m] of the depth where there is ground truth, and (s - log V)^2 / 2 where UfM* has
+    measured V.
     The likelihood of an error of variance V would be the alternative; V spans many orders of magnitude, and a few large
     values would decide its mean.
 

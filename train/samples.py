@@ -44,8 +44,8 @@ class Sample(TypedDict):
 
 
 class SampleKey(NamedTuple):
-    """Which frame in which epoch: what a sampler yields, so that augmentation differs between epochs and is
-    the same for any number of workers. ``counts``: otherwise no pixel of the sample is valid."""
+    """A frame and its epoch, which a sampler yields, so that augmentation differs between epochs and is the same for
+    any number of workers. ``counts``: otherwise no pixel of the sample is valid."""
 
     epoch: int
     frame: int

@@ -1,4 +1,4 @@
-"""Which images to label or to train on, by a score of every image, as ``UfMStar.mean_uncertainty`` states it."""
+"""Chooses images to label or to train on by a score of every image, as ``UfMStar.mean_uncertainty`` computes it."""
 
 from __future__ import annotations
 

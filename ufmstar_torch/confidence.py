@@ -50,7 +50,7 @@ FEWEST, FULL, USEFUL = 5, 4, 1e-3
 
 @dataclass(frozen=True)
 class Learnt:
-    """What is known of the confidence of B streams.
+    """Statistics of the confidence of B streams.
 
     Attributes:
         c, y, w: [B, N] of the last anchors, the youngest last; w = 0: there is none.

@@ -254,8 +254,8 @@ class UfMStarConfig(Checked):
 
     # Fusion (section "Multiview Fusion")
     overlap_weighted: bool = False
-    # What m averages: the paper's squared 2-Wasserstein distance, or the squared depth difference where both
-    # Gaussians are seen (``disagree``).
+    # m averages the paper's squared 2-Wasserstein distance, or the squared depth difference where both Gaussians are
+    # seen (``disagree``).
     disagreement: str = choice("w2", "overlap")
 
     # Regression (section "Uncertainty Regression")

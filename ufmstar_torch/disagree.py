@@ -1,4 +1,4 @@
-"""How far apart two matched Gaussians lie where both are seen: the alternative to W2^2 ("overlap").
+"""Distance of two matched Gaussians in depth where both are seen: the alternative to W2^2 ("overlap").
 
 The paper's W2^2 compares whole Gaussians. Two views cut one surface into different pieces, and W2^2 then counts how
 the pieces differ in place and extent, with perfect depth too. Here only the depths are compared, and only where both

@@ -1,4 +1,4 @@
-"""How an extension hangs on UfM*: tensors of its own in the state, and calls around a frame.
+"""The interface of extensions of UfM*: tensors of their own in the state, and calls around a frame.
 
 An :class:`Extension` belongs to a module. For each frame it makes a :class:`FrameExtension`, whose methods are called
 in this order: ``before_regression`` adds columns that are regressed beside H with the same weights,
@@ -151,12 +151,12 @@ class FrameExtensions:
 
     @property
     def columns(self) -> int:
-        """How many columns they add."""
+        """Number of columns that all of them add."""
         return sum(one.columns for one in self.each)
 
     @property
     def changes_mixture(self) -> bool:
-        """Whether any of them may change the mixture after the frame."""
+        """True if any of them may change the mixture after the frame."""
         return any(one.changes_mixture for one in self.each)
 
     def before_regression(

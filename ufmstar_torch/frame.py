@@ -31,7 +31,7 @@ FRAME_FAULTS = (
     "intrinsics have their principal point outside the depth map; expected the intrinsics of the depth map, not those "
     "of an image of another size (ufmstar_torch.camera.resize_intrinsics)",
 )
-# What is accepted. Within these ranges nothing that the algorithm squares or divides by leaves float32.
+# Accepted ranges. Within these ranges nothing that the algorithm squares or divides by leaves float32.
 DEPTH_RANGE = (1e-6, 1e6)  # [m]
 LARGEST = 1e12  # A and E [m^2], and entries of features
 FOCAL_RANGE = (1e-2, 1e7)  # [px]

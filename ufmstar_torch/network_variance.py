@@ -20,11 +20,11 @@ class NetworkVariance:
 
     @classmethod
     def of(cls, frame: FrameInput, config: UfMStarConfig) -> NetworkVariance:
-        """Of a frame [B, H, W]."""
+        """A and E of a frame [B, H, W]."""
         return cls(frame.aleatoric if config.add_aleatoric else None, frame.epistemic if config.add_epistemic else None)
 
     def maps(self) -> list[Tensor]:
-        """Those that count."""
+        """A and E as far as they count."""
         return [value for value in (self.aleatoric, self.epistemic) if value is not None]
 
     def at(self, chosen: Chosen, features: Tensor, config: UfMStarConfig) -> NetworkVariance:

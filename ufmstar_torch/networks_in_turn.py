@@ -57,7 +57,7 @@ class NetworksInTurn(nn.Module):
 
     @property
     def states_confidence(self) -> bool:
-        """Whether each of the networks states a confidence."""
+        """True if each of the networks states a confidence."""
         return states_confidence(self.networks)
 
     @property

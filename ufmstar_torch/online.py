@@ -19,7 +19,7 @@ _TINY = 1e-6  # [m^2]; below it a variance is nothing beside any depth error
 
 
 def image_statistics(result: MeanUncertainty, motion: Tensor) -> Tensor:
-    """What :class:`TrainDecision` looks at, of one image.
+    """The statistics of an image from which :class:`TrainDecision` decides.
 
     Args:
         result: of the image, B = 1.
@@ -82,7 +82,7 @@ class TrainDecision:
         self._sums = torch.zeros(0, 0, dtype=torch.float64)  # of z z^T with z = (1, statistics, gain), fading
 
     def __call__(self, statistics: Tensor) -> bool:
-        """Whether to train on an image with these statistics [F]."""
+        """True if an image with these statistics [F] is worth training on."""
         if self.updates < self.first:
             return True
         gain, error = self.expected(statistics)

@@ -22,8 +22,8 @@ class DepthPrediction:
         depth: [B, H, W] metric depth D along the optical axis [m].
         aleatoric_variance: [B, H, W] learned data variance A [m^2], or None.
         epistemic_variance: [B, H, W] learned model variance E [m^2], or None.
-        confidence: [B, H, W] a map of any unit that says which pixels are better or worse, or None; what it means in
-            metres is learnt from anchors (``ufmstar_torch.confidence``).
+        confidence: [B, H, W] a map of any unit that ranks the pixels by quality, or None; its meaning in metres is
+            learnt from anchors (``ufmstar_torch.confidence``).
 
     Raises:
         TypeError: something else than tensors and arrays.
@@ -65,7 +65,7 @@ class DepthPrediction:
 
 
 def takes_intrinsics(network: Callable[..., Any]) -> bool:
-    """Whether a network declares that it is called as ``network(x, K)``: an attribute ``takes_intrinsics = True``."""
+    """True if a network declares that it is called as ``network(x, K)``: an attribute ``takes_intrinsics = True``."""
     return bool(getattr(network, "takes_intrinsics", False))
 
 
@@ -78,7 +78,7 @@ def stated_range(networks: Iterable[Callable[..., Any]]) -> float | None:
 
 
 def states_confidence(networks: Iterable[Callable[..., Any]]) -> bool:
-    """Whether each of the networks states a confidence, by its attribute ``states_confidence``."""
+    """True if each of the networks states a confidence, by its attribute ``states_confidence``."""
     stated = [bool(getattr(network, "states_confidence", False)) for network in networks]
     return bool(stated) and all(stated)
 

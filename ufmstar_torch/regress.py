@@ -67,7 +67,7 @@ def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> 
 
 
 def _pairs_at_a_time(device: torch.device, size: int) -> int:
-    """How many pairs of a point and a component may be held at a time, in numbers of ``size`` bytes."""
+    """Number of pairs of a point and a component that may be held at a time, in numbers of ``size`` bytes."""
     if device.type != "cuda" or not torch.cuda.is_initialized():  # fake tensors need no device
         return _CHUNK
     free = torch.cuda.mem_get_info(device)[0]
@@ -120,7 +120,7 @@ def _where(valid: Tensor, disagreement: Tensor, features: Tensor) -> Regression:
 
 
 def shares(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> Tensor:
-    """How much of a point each component explains, w_k(x) = pi_k N_k(x) / (sum_k pi_k N_k(x) + pi_0).
+    """Share of each component in the density at a point, w_k(x) = pi_k N_k(x) / (sum_k pi_k N_k(x) + pi_0).
 
     Args:
         mixture, points, config: as :func:`regress`; for few points, all pairs are held at once.

@@ -94,7 +94,7 @@ def step(
     if config.disagreement == "overlap":
         pairs = with_overlap_disagreement(pairs, previous_cam, current_cam)
     matched = pairs.match.any(dim=2)
-    # What is nearer than the near plane could never be matched again: it is not remembered.
+    # A Gaussian nearer than the near plane could never be matched again: it is not appended.
     far_enough = current_cam.mean[..., 2] > config.near_plane
     new = current_cam.valid & far_enough & ~matched
     current_first = current_cam.rigid(*relative_pose(frame.T_world_cam, first))

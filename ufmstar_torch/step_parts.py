@@ -23,7 +23,7 @@ class StepObserver(Protocol):
     def stage(self, name: str) -> None:
         """A stage has ended: check, segment, correspond, fuse, append, regress or average, in this order.
 
-        What lies between two kernels belongs to the stage that needs it. segment: SPGF and the floor of its
+        Work between two kernels belongs to the stage that needs it. segment: SPGF and the floor of its
         covariances. correspond: the mixture into the camera frame, and the matching. fuse: the disagreement of
         overlaps, the segments into the first camera's frame, growth, and the fusion. append: the new components, the
         mixture into the camera frame, and the columns of extensions. regress: the regression. average: the moving

@@ -1,4 +1,4 @@
-"""Where M was not measured, and what it reads there (``config.unmeasured``): two ends around step 5's regression.
+"""Finds the pixels where M was not measured, and sets M there (``config.unmeasured``), before and after step 5.
 
 A surface seen from one view has m = 0 because nothing was compared, and where no component is near M is the prior's
 mean. Both read as certain in the paper. The share of a pixel's M that rests on surfaces seen from two views or more,

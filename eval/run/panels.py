@@ -185,7 +185,7 @@ MAPS = {
     "posterior_sigma": ("σ, posterior", "length"),
     "posterior_error": ("|error|, posterior", "length"),
 }
-DECADES = 2  # of the logarithmic scale of lengths: beside the network's errors the posterior's would all be black
+DECADES = 2  # range of the logarithmic scale of errors: a linear one would show the posterior's errors as black
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ def follow(
     back_tolerance: float,
     expected: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Where corners of one gray image are in the next, and which of them lead back to where they were.
+    """Follow corners of one gray image into the next, and check that following them back returns to the start.
 
     Args:
         before, after: [H, W] gray.

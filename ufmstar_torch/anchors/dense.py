@@ -45,7 +45,7 @@ _CORNERS = "corners_"  # before the names of the tracker's state
 
 @dataclass(frozen=True)
 class DenseConfig(Checked):
-    """How dense anchors are measured and believed.
+    """Settings of the search for dense anchors, and of their acceptance.
 
     Attributes:
         width: largest width of the image that is searched [px]; larger images are reduced to it.
@@ -226,7 +226,7 @@ class DenseEvidence(SavedState):
         return Landmarks(position, depth, spread, searched + known, none, *judged)
 
     def _apart(self, corners: Landmarks, taken: NDArray[np.float64], width: int) -> NDArray[np.int64]:
-        """Which corners are anchors: certain ones, away from positions [N, 2] that are taken."""
+        """Indices of the corners that become anchors: certain ones, away from the ``taken`` positions [N, 2]."""
         over = self._tracker.pose_error / max(self._tracker.baseline, 1e-9) / self._tracker.focal
         sigma = np.maximum(np.sqrt(corners.variance) / corners.depth, over * np.maximum(corners.depth, self._depth))
         fine = np.flatnonzero(sigma <= self.config.corner_sigma)

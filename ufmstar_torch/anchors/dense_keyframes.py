@@ -16,7 +16,7 @@ from ufmstar_torch.anchors.saved_state import SavedState, saved_image
 _MOVED, _TURNED = 0.015, np.deg2rad(4.0)
 # A baseline may be off from the one that is asked for by a factor of at most _OFF.
 _OFF = 2.5
-# What a view must show of the present one: this share of a grid of points at the median depth.
+# A view must show at least this share of a grid of points that the present view has at the median depth.
 _OVERLAP = 0.5
 
 
@@ -37,7 +37,7 @@ class Keyframes(SavedState):
 
     @property
     def number(self) -> int:
-        """How many are kept."""
+        """Number of stored frames."""
         return min(self._added, self._count)
 
     def add(self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], depth: float) -> None:

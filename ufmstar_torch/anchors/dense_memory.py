@@ -106,7 +106,7 @@ class Memory(SavedState):
         self._failed[hidden] += 1
         self._forget(hidden)
         slot = np.flatnonzero(shown > 0)
-        # Of those in one cell, the one that is confirmed most often is kept; of equal ones, the least uncertain.
+        # Each cell keeps the point that is confirmed most often; among equal ones, the least uncertain.
         column, row = (pixel[slot] / cell).astype(np.int64).T
         order = np.lexsort((spread[slot] / depth[slot], -self.confirmed[slot], column, row))
         first = np.diff(row[order] * image.shape[1] + column[order], prepend=-1) > 0

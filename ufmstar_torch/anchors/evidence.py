@@ -100,7 +100,7 @@ def inliers(anchors: AnchorInput) -> Tensor:
     log_ratio = (anchors.depth / anchors.predicted).log()
     u, v = anchors.pixel.unbind(-1)
     apart = (u[:, :, None] - u[:, None]).square_().add_((v[:, :, None] - v[:, None]).square_())
-    # Of neighbours equally near the first given counts: which of them topk takes depends on how far a row is padded.
+    # The first of equally near neighbours counts: topk's choice between them depends on the padding of a row.
     apart += TIE * torch.arange(n, dtype=apart.dtype, device=few.device)
     apart.masked_fill_(~anchors.valid[:, None], torch.inf).diagonal(dim1=1, dim2=2).fill_(torch.inf)
     distance, neighbour = apart.topk(min(NEIGHBOURS, n - 1), dim=2, largest=False)

@@ -34,7 +34,7 @@ _DRIFT = 0.6
 _MEMORY, _LONG = 0.8, 4
 # Why an image has no landmark.
 _NO_TRACK, _NO_DEPTH = "no corner followed from the frame before", "no parallax, or no track that fits the poses"
-# Of the median depth: nearer, a point's position in an image is not computed but bounded.
+# Share of the median depth: the position of a nearer point in an image is not computed but bounded.
 _NEAREST = 1e-3
 # Depths of a scene, over the median: where the poses allow a corner's point to be. Half of the corners lie nearer than
 # the median, which says little while it is not known well; of an image without motion, as of one that is frozen, all
@@ -51,7 +51,7 @@ _MEDIAN = 0.6745
 
 @dataclass(frozen=True)
 class TrackerConfig(Checked):
-    """How corners are found, followed and believed. Lengths in pixels are the camera's.
+    """Settings of the search for corners, of their tracking and acceptance. Lengths in pixels are the camera's.
 
     Attributes:
         max_points: corners followed at a time.
@@ -254,7 +254,7 @@ class LandmarkTracker(SavedState):
 
     @property
     def focal(self) -> float:
-        """Of the last image [px]."""
+        """Focal length of the last image [px]."""
         return float(self._K[0, 0])
 
     @property
@@ -264,12 +264,12 @@ class LandmarkTracker(SavedState):
 
     @property
     def pose_variance(self) -> float:
-        """What errors of the poses add to the variance of a tracked position [px^2]."""
+        """Variance that errors of the poses add to a tracked position [px^2]."""
         return max(max(self._off, 0.0) ** 2 - self.config.pixel_noise**2, 0.0)
 
     @property
     def contradicted(self) -> bool:
-        """Whether the poses contradict the images."""
+        """True where the poses contradict the images."""
         return self._off > self.config.max_pose_error * self._gray.shape[1]
 
     def _compare_with_poses(self) -> None:
@@ -302,8 +302,8 @@ class LandmarkTracker(SavedState):
         return position, alive
 
     def _expected(self, chosen: NDArray[np.bool_], T: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Where the chosen corners of the last image should be in that of a camera T [4, 4]: each moves as its point
-        does. One without a point has the others' median depth; None where too few have one."""
+        """Predict the positions of the chosen corners in the image of a camera T [4, 4]: each moves as its
+        point does. One without a point has the others' median depth; None where too few have one."""
         last, K = self._poses[self._view], self._K
         position, point = self._pixel[chosen, self._view], self._point[chosen]
         depth = (point - last[:3, 3]) @ last[:3, 2]
@@ -335,8 +335,8 @@ class LandmarkTracker(SavedState):
         self._pixel[slots, self._view] = result
 
     def _triangulated(self) -> tuple[NDArray[np.bool_], Triangulated | None]:
-        """Which corners of the newest image have views enough in the window [N], and their points; those that fit are
-        remembered."""
+        """Triangulate the corners of the newest image that have enough views in the window (mask [N]), and store the
+        points that fit."""
         chosen = self._seen[:, self._view] & (self._seen.sum(1) >= self.config.min_views)
         self._point = np.full((self.config.max_points, 3), np.nan)
         if not chosen.any():
@@ -390,15 +390,15 @@ class LandmarkTracker(SavedState):
 
 
 def contradiction(error: float, limit: float) -> str:
-    """Why no depth is used, where corners lie ``error`` px from their epipolar lines."""
+    """The warning that no depth is used, where corners lie ``error`` px from their epipolar lines."""
     return f"poses contradict the images: corners lie {error:.1f} px from their epipolar lines, at most {limit:.1f}"
 
 
 def off_lines(
     position: NDArray, before: NDArray, T: NDArray, T_before: NDArray, K: NDArray, near: float, far: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """How far matches lie from where two poses allow them: from the part of the epipolar line on which points of a
-    scene lie. Without parallax, that is a point; a match that moved the wrong way, or not at all, lies beyond its end.
+    """Distances of matches from the part of the epipolar line on which two poses allow points of a
+    scene. Without parallax, that is a point; a match that moved the wrong way, or not at all, lies beyond its end.
 
     Args:
         position: [N, 2] (u, v) in the present view [px].

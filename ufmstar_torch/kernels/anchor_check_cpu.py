@@ -30,7 +30,7 @@ def check_anchors(
     variance: NDArray[np.float64],
     cell: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where the surface of each anchor is, and how far it may be off.
+    """Positions of the surfaces of anchors, and bounds of their errors.
 
     Args:
         image: [H, W] uint8.

@@ -226,7 +226,7 @@ def _folded(values):
 def _distribute(index, predicted, chosen, rows, K, width, slots, view, sums):
     """Add the rows [N, 3] of the chosen anchors to the components [K, 3] that explain their points, by their shares.
 
-    What is left out of each cell of anchors is what the regression leaves out of a tile.
+    A cell of anchors leaves out the components that the regression leaves out of a tile.
     """
     visible, fields, packed, _, settings = view
     points, pixel = np.empty((chosen.size, 3)), np.empty((chosen.size, 2))

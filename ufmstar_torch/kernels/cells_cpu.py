@@ -12,7 +12,7 @@ from ufmstar_torch.kernels.field_cpu import Floats, fast
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.read import LARGEST
 
-# What is claimed may be NaN.
+# An anchor's stated depth or variance may be NaN.
 with_nan = kept(fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 

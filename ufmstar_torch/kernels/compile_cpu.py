@@ -1,4 +1,4 @@
-"""How code for the CPU is compiled (numba): kernels, which Python calls, and their parts, which only kernels call.
+"""Compiles code for the CPU (numba): kernels, which Python calls, and their parts, which only kernels call.
 
 A kernel is kept on disk. A part is compiled into the kernels that call it and has no interface of its own; called from
 Python it is a plain function.

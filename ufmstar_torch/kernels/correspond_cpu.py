@@ -79,7 +79,7 @@ def _overlapping(image_c, i, image, eta, limit, close, members, overlap):
 
 @leaf
 def _hidden(image, members, n, a, eta_occl, limit):
-    """Whether a nearer member covers member ``a``."""
+    """True if a nearer member covers member ``a``."""
     far = members[a]
     for b in range(n):
         near = members[b]
@@ -121,7 +121,7 @@ def _project(fields, n, K, height, width, near, widening, index, image):
 
 @leaf
 def _far(image, i, j, limit):
-    """Whether two projected Gaussians are too far apart: d^T S^-1 d >= d_x^2 / S_xx, S their mean covariance."""
+    """True if two projected Gaussians are too far apart: d^T S^-1 d >= d_x^2 / S_xx, S their mean covariance."""
     dx, dy = image[0, i] - image[0, j], image[1, i] - image[1, j]
     return dx * dx > limit * 0.5 * (image[2, i] + image[2, j]) or dy * dy > limit * 0.5 * (image[4, i] + image[4, j])
 

@@ -59,7 +59,7 @@ class Views:
 
 @dataclass(frozen=True)
 class Search:
-    """How a depth is searched and believed.
+    """Settings of the search for a depth, and of its acceptance.
 
     Attributes:
         start: inverse depth at which the first patch is warped [1/m].
@@ -188,7 +188,7 @@ def _measure(image, pixel, keys, H, b, noise, numbers, rho, variance, agreed, co
                 continue
             if out[5] < least_score:
                 continue
-            # Of the normalised window: G along and across the line; the variance of a pixel from what is left over.
+            # G of the normalised window along and across the line; a pixel's variance from the remaining differences.
             g_ee, g_ep, g_pp = out[1], out[2], out[3]
             pixel_noise = match * 2 * max(1 - out[5], 0.0) / (COUNT - 4)  # rounding puts a ZNCC above 1
             slope = g_ep / g_ee

@@ -116,9 +116,9 @@ def geodesic(mean_a, cov_a, mean_b, cov_b, lam, work):
 
 @leaf
 def _exceeds(S, floor):
-    """Whether every eigenvalue of S is certainly above ``floor``: S - floor I has a Cholesky factor.
+    """True if every eigenvalue of S is certainly above ``floor``: S - floor I has a Cholesky factor.
 
-    What its pivots, and the eigenvalues that it spares, round off is far below 1e-13 tr S.
+    The rounding of its pivots, and of the eigenvalues that it saves, is far below 1e-13 tr S.
     """
     least = 1e-13 * (S[0, 0] + S[1, 1] + S[2, 2])
     a = S[0, 0] - floor - least

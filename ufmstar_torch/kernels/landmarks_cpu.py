@@ -50,7 +50,7 @@ def sight(
     T_world_cam: NDArray[np.float64],
     K: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Where an image shows landmarks.
+    """Finds landmarks in an image.
 
     Args:
         image: [H, W] uint8.
@@ -95,7 +95,7 @@ def _sight(image, point, pose, sigma, patch, used, P, centre, K_inverse, pixel, 
         before = 0.0
         for i in range(3):
             before += (point[n, i] - pose[n, i, 3]) * pose[n, i, 2]
-        # What a pixel of the view that measured it is here, and what its standard deviation is.
+        # Size in this image of a pixel of the view that measured it, and of its standard deviation.
         for i in range(3):
             error[i] = 0.0
             for j in range(3):

@@ -14,7 +14,7 @@ from ufmstar_torch.kernels.fuse_cpu import cholesky3
 from ufmstar_torch.kernels.regress_cull_cpu import HALF_LOG_TWO_PI_CUBED
 from ufmstar_torch.mixture import GaussianMixture
 
-# What a component adds at a point is left out below this share of the point's own density: K of them change a share
+# A component's density at a point is left out below this share of the point's own density: K of them change a share
 # by less than K times this.
 _LEAST_SHARE = 1e-15
 

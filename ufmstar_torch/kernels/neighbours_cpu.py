@@ -1,4 +1,4 @@
-"""Which of a frame's anchors their neighbours support, on the CPU (numba).
+"""Tests each anchor of a frame against its neighbours, on the CPU (numba).
 
 Neighbours are searched in a grid over the image: time and memory grow with the number of anchors.
 """
@@ -59,7 +59,7 @@ def grid(pixel, chosen, mean_count):
 
 @part
 def supported(pixel, predicted, depth, variance, valid, out):
-    """Which of N anchors are valid and supported by their neighbours (``evidence.inliers``), into ``out`` [N]."""
+    """Write to ``out`` [N] whether an anchor is valid and supported by its neighbours (``evidence.inliers``)."""
     cells = grid(pixel, valid, _FEW)
     order = cells[5]
     n = order.size
@@ -176,7 +176,7 @@ def _around(cells, u, v, tie, i, column, row, ring, distance, place, work):
 
 @leaf
 def _within(distance, n, limit, work):
-    """How many of n distances are less than ``limit``."""
+    """Number of the n distances that are less than ``limit``."""
     work[2] = limit
     count_less(distance, n, work[2:])
     return int(work[3])

@@ -32,7 +32,7 @@ def linearised(
     views: Views,
     K: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How the errors move the matches.
+    """Derivatives of the matches' positions by the errors.
 
     Args:
         pixel: [N, 2] (u, v).

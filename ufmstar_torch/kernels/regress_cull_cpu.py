@@ -1,4 +1,4 @@
-"""Which components matter in a box of points, on the CPU (numba): culling in three levels, and its error.
+"""Selects the components that matter in a box of points, on the CPU (numba): culling in three levels, and its error.
 
 A component k adds w_k(x) = pi_k N(x; mu_k, Sigma_k) to the denominator D(x) = pi_0 + sum_k w_k(x) of a point x.
 

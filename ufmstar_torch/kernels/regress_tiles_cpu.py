@@ -66,7 +66,7 @@ def _scratch(view, features, shift):
     """Memory for the work on one block, of the n components in view, in the dtype of the maps.
 
     Returns:
-        Of the tiles: their pixels' rays less that through the middle [2, 64], the depths of one of them [64], points
+        Scratch of a tile: its pixels' rays less that through the middle [2, 64], the depths of one of them [64], points
         [16, 192], boxes and origins [16, 9] in float64, whether they have a pixel, what :func:`place` adds in holes
         [16, 64], and its work [10]. Of lists of components: their fields, work of :func:`cull`, and two lists. Of sums
         at a tile: what they start with [6], offsets and densities of components, the sums [5, 64], averages of the
@@ -93,7 +93,7 @@ def _scratch(view, features, shift):
 
 @leaf
 def _mixed(features):
-    """How many of the last features are averaged together with m."""
+    """Number of the last features that are averaged together with m."""
     return features if features < 1 else 1 if features < 3 else 3
 
 

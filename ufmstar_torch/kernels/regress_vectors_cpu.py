@@ -199,8 +199,8 @@ def square_distances(code, u, v, more, first, n, point, out, at):
 
 @vectors
 def count_less(code, values, n, limit):
-    """How many of n values are less than ``limit`` [0], to ``limit`` [1]. Up to a vector's length more is read, which
-    must not be less."""
+    """Count the values among n that are less than ``limit`` [0], into ``limit`` [1]. Reads up to one vector more,
+    which must not be less."""
     most = limit.one(0)
     count = code.variable(most * 0.0)
     with code.loop(n, code.lanes) as j:

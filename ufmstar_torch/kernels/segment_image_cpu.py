@@ -147,7 +147,7 @@ def _lift(segment, ry, h):
 
 @leaf
 def _best_overlap(low, high, interval, before):
-    """Which of the intervals active before this row overlaps the one from ``low`` to ``high`` most, or -1.
+    """Index of the interval active before this row that overlaps [``low``, ``high``] most, or -1.
 
     The overlap is shared / union; products of whole numbers compare two of them as their quotients would.
     """

@@ -12,7 +12,7 @@ import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, zeros
 
-# Where counters start. numba gives a plain 0 a type of its own, and compiles all that is called with it twice.
+# Counters start here: numba gives a plain 0 another type, and would compile the functions called with it twice.
 ZERO: Any = np.int64(0)
 
 # Columns of a finished segment. Within a row y = z (v - cy)/fy, so x and z say everything.
@@ -108,7 +108,7 @@ def _thresholds(depth, rx, slope, limits, x, tau_z):
 
 @leaf
 def _near(x, z, last_x, last_z, tau_z, slope, limits):
-    """Whether a point is near the one before: within tau_z and tau_x."""
+    """True if a point is near the one before: within tau_z and tau_x."""
     tau_x = min(max(slope * z * z, limits.noise_floor), limits.line_thresh)
     return (abs(z - last_z) < tau_z) & (abs(x - last_x) < tau_x)
 
@@ -176,7 +176,7 @@ def _scanline(
             dxx, dxz, dzz = dxx + s2[u] * (rx[u] * rx[u]), dxz + s2[u] * rx[u], dzz + s2[u]
         nearest = min(nearest, k)
         u += 1
-        # What follows without a gap in the same depth bin, by the same rules: until n_check, then by the line.
+        # Pixels that follow without a gap in the same depth bin, by the same rules: until n_check, then by the line.
         short = u if spread else min(depth.size, max(u, begin + limits.n_check - n + 1))
         while 0 <= u < short:  # the index is not negative: no wrap-around to compile
             ex, ez = x_of[u] - x0, depth[u] - z0

@@ -1,4 +1,4 @@
-"""Which implementation of a step runs on a device."""
+"""Selects the implementation of a step for a device."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def select_kernels(name: str, device_type: str) -> Kernels:
 
 
 def _compiled(name: str, device_type: str) -> bool:
-    """Whether the step is compiled for the CPU."""
+    """True if the step is compiled for the CPU."""
     if name == "numba":
         if device_type != "cpu":
             raise ValueError(f"backend='numba' needs CPU tensors, got device type {device_type!r}")
@@ -117,7 +117,7 @@ def _compiled(name: str, device_type: str) -> bool:
 
 
 def _on_gpu(name: str, device_type: str) -> bool:
-    """Whether the kernels are Triton's."""
+    """True if the kernels are Triton's."""
     if name == "triton":
         from ufmstar_torch.kernels.triton.launch import interpreted
 
@@ -149,7 +149,7 @@ def _triton() -> Kernels:
 
 @functools.cache
 def _has_triton(device_type: str) -> bool:
-    """Whether triton can be imported and supports the device; one warning where not."""
+    """True if triton can be imported and supports the device; warns once if not."""
     try:
         import triton as triton
     except ImportError as error:
@@ -164,7 +164,7 @@ def _has_triton(device_type: str) -> bool:
 
 @functools.cache
 def has_numba() -> bool:
-    """Whether numba can be imported; one warning where it cannot."""
+    """True if numba can be imported; warns once if not."""
     try:
         import numba as numba
     except ImportError as error:

@@ -222,5 +222,5 @@ def device_step(
 
 
 def _full(capacity: int, config: UfMStarConfig) -> bool:
-    """Whether a mixture of so many slots may not grow."""
+    """True if a mixture of so many slots may not grow."""
     return config.max_components is not None and capacity >= config.max_components

@@ -76,7 +76,7 @@ def match(camera, started, first_before, first, mixture, segments, size, thresho
     for i in range(new.size):
         found += weight_c[i] > 0
         matched += not new[i]
-        # What is nearer than the near plane could never be matched again: it is not remembered.
+        # A Gaussian nearer than the near plane could never be matched again: it is not appended.
         new[i] = new[i] and weight_c[i] > 0 and mean_c[i, 2] > thresholds[2]
         created += new[i]
     return c, k, overlap, new, found, matched, created, occupied, near[:n], here

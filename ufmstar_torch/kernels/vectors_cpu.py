@@ -167,7 +167,7 @@ class Memory:
             self._builder.store(part, self._builder.bitcast(at, row.as_pointer())).align = self._size
 
     def _rows(self, width: int, place: Any, stride: Any) -> Iterator[Any]:
-        """Where the one row of a vector or its two start."""
+        """Addresses of the first numbers of a vector's one or two rows."""
         for i in range(self._vector.count // width):
             yield self._at(self._builder.add(place, self._builder.mul(stride, _INDEX(i))), 0)
 

@@ -1,4 +1,4 @@
-"""Which components of a mixture a frame can reach, on the CPU (numba), before anything else is computed of them.
+"""Selects the components of a mixture that a frame can see, on the CPU (numba), before all other computation.
 
 A component matters to a frame where its mean projects into the image, so that it can match, or where its density
 exceeds what the regression leaves out at its first level (``regress_cull_cpu``), so that it can be summed. All of it

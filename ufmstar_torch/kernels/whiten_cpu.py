@@ -1,4 +1,4 @@
-"""Which components an image can show: whitening and silhouettes, several at a time, as vector instructions.
+"""Whitening and silhouettes of components, several at a time, as vector instructions: selects those in the image.
 
 Components are in the camera's frame by field [13, stride] (``rigid_cpu``). Each number has the bits that scalar code
 gives it: ``regress_near_cpu`` whitens by the same sums.

@@ -168,7 +168,7 @@ def update(
         config: the constants.
 
     Returns:
-        What was learnt up to this frame, and the posterior. A stream without a usable anchor learns nothing; its
+        The statistics up to this frame, and the posterior. A stream without a usable anchor learns nothing; its
         coefficients drift.
     """
     given = anchors is not None

@@ -82,7 +82,7 @@ def append(
         last: whether the mixture cannot grow: what finds no slot is dropped.
 
     Returns:
-        What found no slot and waits [B, C] bool; the slots that would hold all [B] int32.
+        Mask [B, C] of the Gaussians that found no slot and wait; the number of slots that would hold all [B] int32.
     """
     b, c = current.weight.shape
     left = torch.empty(b, c, dtype=torch.bool, device=counts.device)

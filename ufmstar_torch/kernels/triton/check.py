@@ -68,7 +68,7 @@ def _gram(a, b, c, d, e, f, g, h, i):
 
 @triton.jit
 def _some(bad):
-    """Whether any of a block of flags is set."""
+    """True if any of a block of flags is set."""
     return tl.sum(bad.to(tl.int32), 0) > 0
 
 

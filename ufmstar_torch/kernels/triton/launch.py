@@ -1,4 +1,4 @@
-"""How every kernel is launched."""
+"""Launches every kernel."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 def interpreted() -> bool:
-    """Whether Triton was imported to run kernels in its interpreter, on CPU tensors."""
+    """True if Triton was imported to run kernels in its interpreter, on CPU tensors."""
     return os.environ.get("TRITON_INTERPRET", "0") == "1"
 
 

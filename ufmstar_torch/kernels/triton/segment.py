@@ -240,7 +240,7 @@ def _join(
                 since, last, born = tl.where(own, v, since), tl.where(own, v, last), tl.where(own, created, born)
                 tl.store(member + row * most + j, created)
                 created += 1
-        # What the row did not extend has ended; after the last row all of them, in the order of their creation.
+        # Gaussians that the row did not extend have ended; after the last row all have, in the order of their creation.
         gone = (born >= 0) & (tl.where(height - 1 - v == 0, -1, last) != v)
         if tl.sum(gone.to(tl.int32), 0) > 0:
             large, tall = n >= min_pixels, merged >= min_rows
