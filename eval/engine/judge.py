@@ -121,7 +121,7 @@ class RowJudge:
 
         Args:
             result: of this row.
-            memory: of its estimator after the frame.
+            memory: of the row after the frame.
             masks: confident pixels by reference.
         """
         if result.statistics is not None:
@@ -191,7 +191,7 @@ class RowJudges(FrameSink):
         self._judges = judges
 
     def begin(self, stream: FrameStream) -> None:
-        self._estimators = {row.key: row.estimator for row in stream.rows}
+        self._rows = {row.key: row for row in stream.rows}
 
     def take(self, result: FrameResult) -> None:
         """Add a frame."""
@@ -201,7 +201,7 @@ class RowJudges(FrameSink):
         expected = {other for key in judged for other in self._judges[key].named}
         masks = {other: confident_pixels(result.rows[other]) for other in expected}
         for key, row in result.rows.items():
-            self._judges[key].add(row, self._estimators[key].memory(), masks)
+            self._judges[key].add(row, self._rows[key].memory(), masks)
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:

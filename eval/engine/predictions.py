@@ -120,7 +120,7 @@ class FramePredictions:
         if key in self._cached:
             return self._cached[key]
         store = self._store if source.cacheable else None
-        path = Path(source.digest[:_SHOWN], self._sequence[:_SHOWN], f"{self.frame.name}@{member}.maps")
+        path = Path(source.digest[:_SHOWN], self._sequence[:_SHOWN], f"{self.frame.name}@{member}.npz")
         found = None if store is None else store.load(path, self._content, self._device)
         if found is None:
             members = range(source.passes) if combined else [int(member)]

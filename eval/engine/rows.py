@@ -129,6 +129,13 @@ class RowRunner:
             ms={stage: time for stage, time in times.items() if time is not None},
         )
 
+    def memory(self) -> dict[str, float]:
+        """Size of the state as ``Estimator.memory`` has it, with the bytes behind the anchors: tracks or evidence."""
+        memory = self.estimator.memory()
+        if self._tracks is not None:
+            memory["bytes"] += sum(value.nbytes for value in self._tracks.state().values())
+        return memory
+
     def state(self) -> dict[str, Tensor]:
         """All tensors on which the next frame depends, networks left aside: they remember nothing."""
         anchors = {} if self._tracks is None else self._tracks.state()

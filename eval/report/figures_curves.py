@@ -169,10 +169,6 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
 
 # ---- NLL by size of the error ----
 
-# Entropy [nats] of a Gaussian with a standard deviation of 1 m.
-ONE_METRE = 0.5 * math.log(2 * math.pi * math.e)
-_SIGMAS = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)  # [m]
-
 
 def draw_error(results: Results, dataset: str) -> Any | None:
     """The mean NLL of each tenth of the pixels, from a row's smallest errors to its largest: a line of panels per
@@ -260,7 +256,6 @@ def draw_entropy(results: Results, base: str) -> Any | None:
         _draw_histograms(panel, rows)
         style.finish(panel, title=environment, y="share of pixels per nat")
     axes[-1].set_xlabel("entropy ½ ln(2πeV) [nats]", size=style.LABEL, color=INK)
-    _sigma_axis(axes[0], low, high)
     return figure
 
 
@@ -290,12 +285,3 @@ def _draw_histograms(axes: Any, rows: Mapping[Row, Histogram]) -> None:
             1.02, 0.95 - 0.13 * number, words, color=look.colour, size=style.TICK, va="top", transform=axes.transAxes
         )
     axes.set_ylim(bottom=0)
-
-
-def _sigma_axis(axes: Any, low: float, high: float) -> None:
-    """The same axis in metres of a standard deviation, above."""
-    twin = axes.secondary_xaxis("top", functions=(lambda h: h - ONE_METRE, lambda s: s + ONE_METRE))
-    shown = [sigma for sigma in _SIGMAS if low <= math.log(sigma) + ONE_METRE <= high]
-    twin.set_xticks([math.log(sigma) for sigma in shown], [f"{sigma:g} m" for sigma in shown])
-    twin.tick_params(labelsize=style.TICK - 1, color=FAINT, labelcolor=INK)
-    twin.spines["top"].set_visible(False)

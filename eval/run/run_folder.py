@@ -32,7 +32,7 @@ from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
 
 # Outputs that are made from the finished frames.
 _MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "mixture.npz", "curves.json")
-_FRAMES = ("frames/*.npz", "depth/*.png", "sigma/*.png", "network_depth/*.png", "network_sigma/*.png")
+_FRAMES = ("frames/*.npz", "depth/*.png", "sigma/*.png")
 CHECKPOINT_EVERY = 2.0  # [s]
 # Raised by torch and zipfile for a damaged checkpoint.
 _DAMAGED = (OSError, EOFError, RuntimeError, LookupError, TypeError, ValueError, UnpicklingError, zipfile.BadZipFile)
