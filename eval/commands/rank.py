@@ -20,18 +20,18 @@ _SHOWN = 10  # lines of the printed table
 
 @dataclass(frozen=True, kw_only=True)
 class RankOptions:
-    """Which images are worth a label: every image's uncertainty, and the order in which to label them.
+    """Rank the images of sequences by their uncertainty: the most uncertain ones are to be labelled first.
 
-    Writes scores.csv, the images to label first, and a contact sheet of the least and the most certain images.
-    Sequences are streamed one after another, with a fresh state each.
+    Writes scores.csv, a line per image, and a contact sheet of the least and the most certain images. Each sequence
+    starts with an empty state.
 
     Attributes:
-        sequences: as of `ufmstar run`
+        sequences: folders of sequences, video files, or tour:SEED, as for `ufmstar run`
         out: folder for everything that is written
         by: rank by the mean of V, M, A, E or B (docs/active_learning.md)
-        diverse: of images that look at the same place from nearly the same side, take one
+        diverse: rank only one of several images that show the same place from nearly the same side
         count: number of images to rank; default: all
-        measured: images with a smaller share of pixels seen in two views get no rank by total or disagreement
+        measured: smallest share of pixels seen in two views; images below it get no rank by total or disagreement
         frames: START:STOP:STEP, which frames of each sequence
         overwrite: replace the ranking in --out
         device: cpu, cuda or cuda:N

@@ -1,4 +1,4 @@
-"""How a row gets its variance: from the network alone, from UfM or from UfM*."""
+"""Estimators of a row's variance: the network alone, UfM, and UfM*."""
 
 from __future__ import annotations
 

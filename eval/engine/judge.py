@@ -61,7 +61,7 @@ class RunMetrics(FrameSink):
             metrics_of(self._metrics, name, own=own).load_state_dict(dict(state))
 
     def sums(self) -> dict[str, dict[str, Tensor]]:
-        """By name. They are exchanged by updates, never changed in place."""
+        """The sums by name. Updates exchange them and never change them in place."""
         return {name: metrics.sums() for name, metrics in self._metrics.items()}
 
     def figures(self) -> dict[str, dict[str, float]]:
@@ -205,8 +205,10 @@ class RowJudges(FrameSink):
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:
-    """Whose confidence a row is judged by: its base alone, and behind UfM with the fewest points that are among
-    ``rows`` and see the same frames; of several settings the row's own, or else the default."""
+    """The rows by whose confidence a row is judged: its base alone, and behind UfM with the fewest points.
+
+    They are among ``rows`` and see the same frames. Of several settings, the row's own is preferred, then the default.
+    """
 
     def seen(other: Row) -> tuple[str, int, str]:  # from which frames, and which part of them
         return other.method.base, other.setting.skip, other.setting.preprocess

@@ -1,4 +1,4 @@
-"""Does a larger variance mean a larger error? AUSE, AURG, Spearman, and the NLL by size of the error.
+"""Metrics of the order of variances and errors: AUSE, AURG, Spearman, and the NLL by size of the error.
 
 Ranks need all pixels at once; a stream has none of the earlier ones. So the pixels go into bins of equal
 width in the logarithm of the variance and of the error, finer than anyone reads a variance, and pixels

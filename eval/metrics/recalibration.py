@@ -60,7 +60,7 @@ def fit(joints: Sequence[Array], groups: int = GROUPS) -> Recalibration:
 
 
 def figures(joint: Array, recalibration: Recalibration | None) -> dict[str, float]:
-    """How well N(d, V) fits a sequence, under a map or as it is (None), from its counts.
+    """Judge the fit of N(d, V) to a sequence, under a map or as it is (None), from its counts.
 
     Returns:
         "coverage_error": mean over nine central intervals of |share of errors inside - the interval's level|;

@@ -131,7 +131,7 @@ def _confidence(values: Curves) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def _has_curves(curves: Mapping[str, Any]) -> bool:
-    """Whether a variance was judged, on any pixel at all (a curve without one is NaN, None in a record)."""
+    """Return whether a variance was judged on at least one pixel (a curve without one is NaN, None in a record)."""
     levels = curves.get("ece_q_observed") or ()
     return len(levels) > 0 and all(value is not None and value == value for value in levels)
 
@@ -260,7 +260,7 @@ def draw_entropy(results: Results, base: str) -> Any | None:
 
 
 def entropy_range(histograms: Sequence[Histogram]) -> tuple[float, float]:
-    """Between the first and the last bin with more than a thousandth of some row's pixels, and half a nat around."""
+    """The range from the first to the last bin with more than 0.1 % of some row's pixels, and half a nat around."""
     edges = histograms[0].edges
     shares = np.array([histogram.counts / histogram.counts.sum() for histogram in histograms])
     filled = np.flatnonzero(shares[:, 1:-1].max(0) > 0.001)

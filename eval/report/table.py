@@ -85,7 +85,7 @@ class Table:
 
     @property
     def is_empty(self) -> bool:
-        """Whether the table has no line, or only dashes."""
+        """True if the table has no line, or only dashes."""
         return not any(cell.value for line in self.lines for cell in line.cells)
 
 

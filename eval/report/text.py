@@ -104,7 +104,7 @@ def run_table(summary: Mapping[str, Any]) -> str:
 
 
 def supported(summary: Mapping[str, Any]) -> bool:
-    """Whether held-out anchors are off by as much as the posterior states, to a factor of two."""
+    """Return whether the errors at held-out anchors agree with the posterior's sigma to a factor of two."""
     calibration = summary.get("posterior", {}).get("calibration")
     return calibration is not None and 1 / _CALIBRATED < calibration < _CALIBRATED
 
@@ -147,7 +147,7 @@ def onboard_table(summary: Mapping[str, Any]) -> str:
         m = {name: number(value) for name, value in found.items()}
         lines.append(
             f"where the aleatoric variance is low: RMSE {m['rmse_high']} m at high disagreement "
-            f"({100 * found['share']:.0f} % of the pixels; aleatoric sigma {m['own_sigma_high']} m, sqrt(M) "
+            f"({100 * found['share']:.0f} % of the pixels; aleatoric sigma {m['aleatoric_sigma_high']} m, sqrt(M) "
             f"{m['disagreement_high']} m), {m['rmse_low']} m elsewhere"
         )
     return "\n".join([*lines, f"{summary['out']}: summary.json{', onboard.png' if found else ''}"])

@@ -95,8 +95,11 @@ def _figures(row: RowResult) -> dict[str, Any]:
 
 
 def _times(result: FrameResult, row: RowResult, writing: float, saving: float) -> dict[str, float]:
-    """By stage [ms]. "prepare" is the rest of the prediction beside the network. "save" is the frame before's: this
-    frame's is not known yet. "cycle" is the time since the frame before; stages overlap."""
+    """The times by stage [ms].
+
+    "prepare" is the rest of the prediction beside the network. "save" is that of the previous frame, since this frame's
+    is not known yet. "cycle" is the time since the previous frame; stages overlap.
+    """
     ms = result.ms
     return {
         "read": ms["read"],
@@ -111,7 +114,7 @@ def _times(result: FrameResult, row: RowResult, writing: float, saving: float) -
 
 
 def _anchor_figures(row: RowResult) -> dict[str, Any]:
-    """With anchors: the frame's counts, and the means of B [m^2] and of r.
+    """The frame's counts of anchors, and the means of B [m^2] and of r; {} without anchors.
 
     ``tracked`` corners were followed from the frame before, ``found`` of them triangulated; ``usable`` lie on a pixel
     with a depth, and ``used`` agree with others. ``without`` is the reason where none is used.
@@ -137,7 +140,7 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
 
 
 def _posterior_figures(row: RowResult) -> dict[str, Any]:
-    """With a posterior: its mean sigma [m], and the figures of held-out anchors (``FrameStatistics``)."""
+    """The posterior's mean sigma [m] and figures of held-out anchors (``FrameStatistics``); {} without one."""
     variance, statistics = row.posterior_variance, row.statistics
     if variance is None or statistics is None or statistics.calibration is None or statistics.unseen is None:
         return {}

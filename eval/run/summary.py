@@ -111,7 +111,7 @@ def _warnings(job: RunJob, depth: DepthFit | None, done: Sequence[Mapping[str, A
 
 
 def _posterior(done: Sequence[Mapping[str, Any]], figures: Mapping[str, float] | None) -> dict[str, Any]:
-    """With a posterior: its metrics, and the last frame's figures of held-out anchors; else {}."""
+    """The posterior's metrics, and the last frame's figures of held-out anchors; {} without a posterior."""
     records = [record["posterior"] for record in done if "posterior" in record]
     if not records:
         return {}
@@ -138,7 +138,7 @@ def _sequence(sequence: FrameSequence) -> dict[str, Any]:
 
 
 def _scale(job: RunJob) -> dict[str, Any]:
-    """Where the unit of the poses comes from, if not from the recording: a network's error of scale is then in the
+    """The origin of the poses' unit, if it is not the recording: a network's error of scale is then in the
     poses and in the anchors too, which show the shape of its error alone."""
     if job.scale is None:
         return {} if job.sequence.pose_scale == 1 else {"scale_from": "--pose-scale"}

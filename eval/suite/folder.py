@@ -76,7 +76,7 @@ class EvalFolder:
         return self.missing(item, rows)
 
     def is_finished(self, item: WorkItem, rows: Iterable[Row]) -> bool:
-        """Whether every row has a record, or the sequence has failed."""
+        """Return whether every row has a record, or the sequence has failed."""
         return (self.sequence_folder(item) / FAILED).exists() or not self.missing(item, rows)
 
     def missing(self, item: WorkItem, rows: Iterable[Row]) -> list[Row]:

@@ -39,7 +39,7 @@ Frames = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class EvalOutcome:
-    """How an evaluation, or one shard of it, ended."""
+    """The outcome of an evaluation, or of one shard of it."""
 
     finished: bool  # False: it was stopped, or a process was killed
     stopped: bool  # by the caller
