@@ -22,7 +22,6 @@ from ufmstar_torch import (
     cli,
 )
 from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.confidence import isotonic
 from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
 from ufmstar_torch.eval.engine.networks import NetworkSource
@@ -153,31 +152,6 @@ def test_streams_of_a_batch_are_independent_and_anchors_may_be_padded():
         out = both(*stacked[:2], K.expand(2, 3, 3), anchors=Anchors(*whole, valid=valid), confidence=stacked[2])
         expected = alone(d2, T2, K, anchors=a2, confidence=s2)
     torch.testing.assert_close(out.variance[1:], expected.variance)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_a_confidence_in_half_precision_is_that_in_single(dtype):
-    given, outs = list(frames(12, dtype=torch.float32)), []
-    for convert in (lambda c: c, lambda c: c.float()):
-        ufm = UfMStar(CONFIG)
-        outs += [ufm(d, T, K, anchors=a, confidence=convert(s.to(dtype))) for d, s, a, T, _ in given][-1:]
-    assert same(outs[0].variance, outs[1].variance)
-    assert bool(outs[0].statistics.confidence > 0)
-
-
-def test_a_skipped_frame_leaves_what_was_learnt_as_it_was():
-    ufm = UfMStar(CONFIG.replace(on_bad_frame="skip"))
-    for i, (depth, sigma, given, T, _) in enumerate(frames(8, dtype=torch.float32)):
-        before = ufm.confidence.clone()
-        ufm(depth, T * torch.nan if i == 7 else T, K, anchors=given, confidence=sigma.float())
-    assert same(ufm.confidence, before)
-
-
-def test_isotonic_regression_against_pooling():
-    rng = np.random.default_rng(0)
-    value, weight = rng.uniform(0, 3, (5, 16)), rng.uniform(0.1, 9, (5, 16))
-    expected = [oracle.pooled(*pair) for pair in zip(value, weight, strict=True)]
-    np.testing.assert_allclose(isotonic(torch.from_numpy(value), torch.from_numpy(weight)), expected, rtol=1e-12)
 
 
 class Stated(nn.Module):

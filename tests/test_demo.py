@@ -14,7 +14,6 @@ from runs import Recorder
 from ufmstar_torch import cli
 from ufmstar_torch.eval.commands import demo, evaluate
 from ufmstar_torch.eval.report.data import load_results
-from ufmstar_torch.eval.report.figures_curves import write_curves
 from ufmstar_torch.models import save_trained
 
 FRAMES, SEED = 5, 5
@@ -105,11 +104,6 @@ def test_ctrl_c(monkeypatch, ufmstar):
 
     monkeypatch.setattr(evaluate, "main", interrupted)
     assert ufmstar("demo") == (130, "", "ufmstar demo: interrupted\n")
-
-
-def test_the_calibration_picture_needs_something_to_draw(tmp_path):
-    with pytest.raises(ValueError, match="1 to 6 methods"):
-        write_curves(tmp_path / "x.png", {})
 
 
 # ---- the networks of the package ----

@@ -75,7 +75,7 @@ def test_poses_are_read_as_their_lines_are_completed(tmp_path):
             events = list(poses.new())
             assert [event.stamp for event in events] == expected
             if expected == [1.5]:
-                np.testing.assert_allclose(events[0].T_world_cam[:3, 3], [-2, -4, -6])
+                np.testing.assert_allclose(events[0].T_world_cam[:3, 3], [-2, -4, -6], atol=1e-12)
         assert np.isnan(events[-1].T_world_cam).all()
         file.write("4 1 2 3\n")
         file.flush()
@@ -164,15 +164,23 @@ def test_a_recording_live(ufmstar, tmp_path):
     assert "UfM*'s share of the time" in err
     assert 0 < summary["ours_share"] < 1
     assert summary["latency_ms"]["p50"] <= summary["latency_ms"]["p99"]
+    assert (summary["program"], summary["state"]) == ("ufmstar live", "finished")
     with np.load(tmp_path / "out" / f"{lines[-1]['stamp']:.6f}.npz") as maps:
         assert maps["depth"].shape == maps["variance"].shape == (64, 96)
-        np.testing.assert_allclose(maps["T_world_cam"], open_sequence(TOUR)[-1].T_world_cam)
+        np.testing.assert_allclose(maps["T_world_cam"], open_sequence(TOUR)[-1].T_world_cam, atol=1e-12)
         assert float(np.median(maps["depth"])) == pytest.approx(lines[-1]["depth_m"], abs=1e-3)
     images = int(torch.load(tmp_path / "state.pt")["image_index"])
     assert images == summary["results"]
     code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt", "--speed", "0.2")
     assert code == 0, err
     assert int(torch.load(tmp_path / "state.pt")["image_index"]) > images  # it went on
+    before = sorted((tmp_path / "out").iterdir())
+    code, _, err = ufmstar(TOUR, "--out", tmp_path / "out")
+    assert code == 2
+    assert f"--out {tmp_path / 'out'} holds an earlier live run: --overwrite replaces it" in err
+    assert sorted((tmp_path / "out").iterdir()) == before
+    assert ufmstar("tour:4?frames=2&size=64x96", "--out", tmp_path / "out", "--overwrite")[0] == 0
+    assert not any((tmp_path / "out" / f"{line['stamp']:.6f}.npz").exists() for line in lines[2:])
     (tmp_path / "state.pt").write_bytes(b"no state")
     code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt")
     assert code == 2
@@ -228,11 +236,11 @@ def test_a_folder_that_grows_live(ufmstar, tmp_path):
     [
         ("0", "0 needs --trajectory FILE"),
         ("images --follow --intrinsics 1 1 1 1", "images needs --trajectory FILE"),
+        ("- --overwrite", "--overwrite goes with --out"),
         ("- --drive 3", "--drive goes with recordings, not with -"),
         ("tour:3 --speed 0", "--speed must be positive"),
         ("tour:3 --scale-from network", "--scale-from goes with ufmstar run"),
         ("tour:3 --ufm.anchors.half_life 5", "needs --anchors"),
-        ("nowhere", "no such file or folder: nowhere"),
         ("{images}", "has no known layout"),
     ],
 )

@@ -163,6 +163,7 @@ def test_similarity_is_exact_and_leaves_outliers_out():
         (["--length", "a", "b"], "--length must be A B METRES"),
         (["--length", "a", "b", "-1"], "--length must be A B METRES"),
         (["--length", "a", "b", "1", "--trajectory", "x"], "contradict each other"),
+        (["--intrinsics", "none.txt"], "--intrinsics: no such file: none.txt"),
         (["--distortion", "0.1", "0", "0", "0"], "--distortion goes with --intrinsics"),
     ],
 )

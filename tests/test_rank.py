@@ -199,7 +199,8 @@ def test_scores_are_those_of_mean_uncertainty(ufmstar, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--depth", "self", "--by", "epistemic"), "--by epistemic: there is none here, only total, disagreement"),
+        (("--depth", "self", "--by", "epistemic"), "--by epistemic: the depth comes with no epistemic variance"),
+        (("--depth", "self", "--by", "anchored"), "--by anchored needs --anchors or --posterior"),
         (("--depth", "self", "--count", "0"), "--count must be at least 1"),
         (("--depth", "self", "--measured", "2"), "--measured must be a share"),
         ((TOURS[1], "--depth", "a"), "--depth DIR goes with one sequence"),
@@ -208,5 +209,14 @@ def test_scores_are_those_of_mean_uncertainty(ufmstar, tmp_path):
 )
 def test_mistakes_are_named(ufmstar, tmp_path, words, message):
     code, _, err = ufmstar("rank", TOURS[0], *words, "--out", tmp_path / "out")
-    assert code in (1, 2)
+    assert code == 2
     assert message in err
+
+
+def test_a_part_that_the_network_does_not_state_is_refused_before_compiling(ufmstar, tmp_path, weights, monkeypatch):
+    monkeypatch.setattr("ufmstar_torch.eval.run.run.warm_up_job", lambda *_: pytest.fail("compiled before"))
+    words = ("--model", "trained", "--weights", weights, "--by", "epistemic", "--out", tmp_path / "out")
+    code, _, err = ufmstar("rank", TOURS[0], *words)
+    assert code == 2
+    assert "--by epistemic: the network states no epistemic variance" in err
+    assert not (tmp_path / "out").exists()

@@ -26,11 +26,11 @@ def test_row_i_belongs_to_the_i_th_image_by_number(tmp_path):
     sequence = open_sequence(path)
     assert sequence.names == ("7", "8", "9", "10", "11", "12")
     for i, frame in enumerate(sequence):
-        np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i])
+        np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-12)
         np.testing.assert_array_equal(frame.image, truth.images[i])
         np.testing.assert_allclose(frame.depth, truth.depths[i], atol=5e-4 + 1e-6)
         assert frame.depth_intrinsics is None
-    np.testing.assert_allclose(sequence.intrinsics, truth.K)
+    np.testing.assert_allclose(sequence.intrinsics, truth.K, atol=1e-12)
 
 
 def test_a_link_without_its_file_keeps_its_place_and_is_an_error_of_its_frame(tmp_path):
@@ -59,7 +59,7 @@ def test_intrinsics_in_every_form(tmp_path, form):
     elif form == "numbers":
         (path / "K.txt").unlink()
         given = four
-    np.testing.assert_allclose(open_sequence(path, intrinsics=given).intrinsics, K)
+    np.testing.assert_allclose(open_sequence(path, intrinsics=given).intrinsics, K, atol=1e-12)
 
 
 def test_missing_or_doubled_pieces_are_named(tmp_path):
@@ -170,7 +170,7 @@ def test_depth_of_another_size_scales_its_intrinsics(tmp_path):
     for i in range(6):
         write_depth_png(path / "depth" / f"{i + 7}.png", half.depths[i], 1000)
     sequence = open_sequence(path)
-    np.testing.assert_allclose(sequence.depth_intrinsics, K_half)
+    np.testing.assert_allclose(sequence.depth_intrinsics, K_half, atol=1e-12)
     np.testing.assert_allclose(sequence[3].depth, half.depths[3], atol=5e-4 + 1e-6)
     for i in range(6):
         write_depth_png(path / "depth" / f"{i + 7}.png", np.ones((24, 24)), 1000)
@@ -193,7 +193,7 @@ def test_video_with_kitti_rows(tmp_path):
         for i in (0, 5, 2, 7, 7, 6):  # backwards too
             frame = sequence[i]
             np.testing.assert_array_equal(frame.image, truth.images[i])
-            np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i])
+            np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-12)
             np.testing.assert_allclose(frame.depth, truth.depths[i], atol=5e-4 + 1e-6)
     sequence = pickle.loads(pickle.dumps(open_sequence(tmp_path / "walk.mkv", intrinsics=K)))
     assert sequence.name == "walk"

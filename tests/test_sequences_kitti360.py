@@ -230,7 +230,7 @@ def test_unroll_closed_forms():
     points = np.stack([left, right, front], axis=1)
     T_before = layouts_more.rigid(np.eye(3), (-1.0, 0, 0))  # a turn ago the laser stood 1 m behind
     moved = unroll(points, T_before)
-    np.testing.assert_allclose(moved.T, [[-0.25, 10, 1], [0.25, -10, 1], [10, 0, 1]])
+    np.testing.assert_allclose(moved.T, [[-0.25, 10, 1], [0.25, -10, 1], [10, 0, 1]], atol=1e-12)
     turned = unroll(points, layouts_more.rigid(layouts_more.turn(0, 0, np.degrees(0.1)), (0, 0, 0)))
     angles = np.arctan2(turned[1], turned[0])
     np.testing.assert_allclose(angles, [np.pi / 2 + 0.025, -np.pi / 2 - 0.025, 0], atol=1e-12)

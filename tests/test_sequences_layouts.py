@@ -23,7 +23,7 @@ def reasons(sequence):
 def assert_frames_equal(sequence, truth, quantum):
     """Names aside, all frames carry the truth; ``quantum`` is the depth files' unit [m]."""
     assert len(sequence) == len(truth.depths)
-    np.testing.assert_allclose(sequence.intrinsics, truth.K, rtol=1e-12)
+    np.testing.assert_allclose(sequence.intrinsics, truth.K, rtol=1e-12, atol=1e-12)
     for i, frame in enumerate(sequence):
         assert frame.index == i
         np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-9)
@@ -107,7 +107,7 @@ def test_tum_intrinsics_follow_the_camera_or_the_user(tmp_path):
     )
     listing = (renamed / "rgb.txt").read_text()
     (renamed / "rgb.txt").write_text("# file: 'rgbd_dataset_freiburg2_desk.bag'\n" + listing)
-    np.testing.assert_allclose(open_sequence(renamed).intrinsics, truth.K, rtol=1e-12)
+    np.testing.assert_allclose(open_sequence(renamed).intrinsics, truth.K, rtol=1e-12, atol=1e-12)
     # of the dataset's own size
     path = renamed.rename(tmp_path / "rgbd_dataset_freiburg3_x")
     for file in (path / "rgb").iterdir():
@@ -121,7 +121,7 @@ def test_tum_other_trajectory_and_bad_lines(tmp_path):
     slam = "\n".join(" ".join([w[0], str(float(w[1]) + 5), *w[2:]]) for w in moved)
     (tmp_path / "slam.txt").write_text(slam)
     sequence = open_sequence(path, trajectory=tmp_path / "slam.txt")
-    np.testing.assert_allclose(sequence[0].T_world_cam[0, 3], truth.T_world_cam[0][0, 3] + 5)
+    np.testing.assert_allclose(sequence[0].T_world_cam[0, 3], truth.T_world_cam[0][0, 3] + 5, atol=1e-12)
     (path / "rgb.txt").write_text("# x\n10.0 rgb/a.png\nten rgb/b.png\n")
     with pytest.raises(ValueError, match=r"rgb\.txt:3: expected 'timestamp filename'"):
         open_sequence(path)
@@ -134,7 +134,7 @@ def test_seven_scenes_registers_depth_to_colour(tmp_path):
     path, of_color, _ = layouts.write_seven_scenes(tmp_path)
     sequence = open_sequence(path)
     assert (sequence.layout, sequence.depth_intrinsics) == ("7scenes", None)
-    np.testing.assert_allclose(sequence.intrinsics, of_color.K)
+    np.testing.assert_allclose(sequence.intrinsics, of_color.K, atol=1e-12)
     for i, frame in enumerate(sequence):
         np.testing.assert_allclose(frame.T_world_cam, of_color.T_world_cam[i], atol=1e-9)
         np.testing.assert_array_equal(frame.image, of_color.images[i])
@@ -149,19 +149,19 @@ def test_seven_scenes_registers_depth_to_colour(tmp_path):
 def test_seven_scenes_unregistered(tmp_path):
     path, of_color, of_depth = layouts.write_seven_scenes(tmp_path)
     sequence = open_sequence(path, register=False)
-    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K)
-    np.testing.assert_allclose(sequence.intrinsics, of_color.K)
+    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K, atol=1e-12)
+    np.testing.assert_allclose(sequence.intrinsics, of_color.K, atol=1e-12)
     for i, frame in enumerate(sequence):
-        np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i])
+        np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i], atol=1e-12)
         np.testing.assert_allclose(frame.depth, of_depth.depths[i], atol=5e-4 + 1e-6)
-        np.testing.assert_allclose(frame.depth_intrinsics, of_depth.K)
+        np.testing.assert_allclose(frame.depth_intrinsics, of_depth.K, atol=1e-12)
 
 
 def test_seven_scenes_own_calibration(tmp_path):
     path, _, of_depth = layouts.write_seven_scenes(tmp_path)
     sequence = open_sequence(path, T_color_depth=np.eye(4), intrinsics=of_depth.K, depth_intrinsics=of_depth.K)
     np.testing.assert_allclose(sequence[0].depth, of_depth.depths[0], atol=5e-4 + 1e-6)
-    np.testing.assert_allclose(sequence[0].T_world_cam, of_depth.T_world_cam[0])
+    np.testing.assert_allclose(sequence[0].T_world_cam, of_depth.T_world_cam[0], atol=1e-12)
 
 
 def test_seven_scenes_invalid_and_missing(tmp_path):
@@ -207,13 +207,13 @@ def test_scannet(tmp_path):
     sequence = open_sequence(path)
     assert sequence.layout == "scannet"
     assert sequence.names == tuple(str(i) for i in range(11))  # 10 after 9
-    np.testing.assert_allclose(sequence.intrinsics, of_color.K)
-    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K)
+    np.testing.assert_allclose(sequence.intrinsics, of_color.K, atol=1e-12)
+    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K, atol=1e-12)
     for i in (0, 5, 10):
         frame = sequence[i]
         assert (frame.image.shape, frame.depth.shape) == ((121, 162, 3), (48, 64))
         np.testing.assert_allclose(frame.depth, of_depth.depths[i], atol=5e-4 + 1e-6)
-        np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i])
+        np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i], atol=1e-12)
         # JPEG keeps a smoothed image of the cells, with its noise
         difference = np.abs(frame.image.astype(int) - of_color.images[i]).mean()
         other = np.abs(frame.image.astype(int) - of_color.images[(i + 5) % 11]).mean()
@@ -237,8 +237,8 @@ def test_scannet_resized_export_keeps_the_original_intrinsics_file(tmp_path):
         fx, fy, cx, cy = K
         np.savetxt(path / "intrinsic" / f"intrinsic_{name}.txt", [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     sequence = open_sequence(path)
-    np.testing.assert_allclose(sequence.intrinsics, of_color.K)
-    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K)
+    np.testing.assert_allclose(sequence.intrinsics, of_color.K, atol=1e-12)
+    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K, atol=1e-12)
 
 
 # ---- TartanAir

@@ -7,7 +7,7 @@ import pickle
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields
 from itertools import takewhile
 from pathlib import Path
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.live import LiveDepth, LiveResult
     from ufmstar_torch.pipeline import UncertainDepth
 
-_STANDARD_INPUT = "-"
-# What a source that is no recording takes, of the options for opening.
+_STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
+# Options for opening that also go with a source that is no recording.
 _OF_LIVE = ("intrinsics", "trajectory", "poses", "pose_scale", "max_pose_gap")
 
 
@@ -49,6 +49,7 @@ class LiveOptions:
         state: file in which the state is kept, and from which it goes on
         save_every: of the state [s]
         out: folder for realtime.json and a .npz with depth, variance, disagreement, pose and intrinsics per image
+        overwrite: replace the results in --out
         json: print a line of JSON per image instead of the status
         device: cpu, cuda or cuda:N
         threads: number of CPU threads of network and step; default: all cores but one
@@ -66,6 +67,7 @@ class LiveOptions:
     state: Path | None = None
     save_every: float = 10.0
     out: Path | None = None
+    overwrite: bool = False
     json: bool = False
     device: str = "cpu"
     threads: int | None = None
@@ -82,6 +84,8 @@ class LiveOptions:
                 raise ValueError(f"--{name} must be positive, got {getattr(self, name)}")
         if self.network.model is None or not self.network.weights:
             raise ValueError("live needs a network: --model NAME --weights FILE")
+        if self.overwrite and self.out is None:
+            raise ValueError("--overwrite goes with --out")
         if self.uncertainty.scale_from is not None:
             raise ValueError("--scale-from goes with ufmstar run, which sees the whole recording")
         if self.recorded:
@@ -109,22 +113,28 @@ def main(options: LiveOptions) -> int:
     from ufmstar_torch.eval.engine.realtime import RealTime
     from ufmstar_torch.eval.report.text import realtime_table
     from ufmstar_torch.eval.run.files import write_json_atomic
+    from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
     from ufmstar_torch.eval.run.machine import share_threads
 
     if options.threads is None:
         share_threads()
-    try:
-        events = _events(options)
-        model = _model(options)
+    kind = FolderKind("ufmstar live", "live run", _SUMMARY, remover("*.npz"), lock=".lock")
+    started = {"state": "started"}  # and not finished, which would allow the next run to replace it
+    with ExitStack() as held:
+        try:
+            if options.out is not None:
+                kind.earlier(options.out, resume=False, overwrite=options.overwrite)
+            events = _events(options)
+            model = _model(options)
+            if options.out is not None:
+                held.enter_context(OutputFolder.open(options.out, kind, started, overwrite=options.overwrite))
+        except (ImportError, OSError, ValueError) as error:
+            raise UsageError(error) from error
+        times = RealTime(model)
+        live = _run(options, model, events, times)
+        summary = times.summary(live.statistics)
         if options.out is not None:
-            options.out.mkdir(parents=True, exist_ok=True)
-    except (ImportError, OSError, ValueError) as error:
-        raise UsageError(error) from error
-    times = RealTime(model)
-    live = _run(options, model, events, times)
-    summary = times.summary(live.statistics)
-    if options.out is not None:
-        write_json_atomic(options.out / "realtime.json", summary)
+            write_json_atomic(options.out / _SUMMARY, {"program": kind.program, "state": "finished", **summary})
     print(realtime_table(summary), file=sys.stderr if options.json else sys.stdout)
     return 0 if summary["results"] else 1
 
@@ -158,7 +168,7 @@ def _run(options: LiveOptions, model: UncertainDepth, events: Iterator[LiveEvent
 
 
 def _events(options: LiveOptions) -> Iterator[LiveEvent]:
-    """What the source yields; errors as ``open_sequence``."""
+    """The source's images and poses; errors as ``open_sequence``."""
     from ufmstar_torch.eval.sequences import live
     from ufmstar_torch.eval.sequences.open import open_sequence
 
@@ -221,7 +231,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
 
 
 def _anchors(value: bool | str) -> Path | Literal["corners", "dense"] | None:
-    """What ``--anchors`` means to ``UncertainDepth``."""
+    """The anchors of ``UncertainDepth`` that ``--anchors`` names."""
     if value is True or value == "corners":
         return "corners"
     return "dense" if value == "dense" else Path(value) if isinstance(value, str) else None

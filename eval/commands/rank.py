@@ -100,7 +100,7 @@ def _scores(options: RankOptions) -> ImageScores:
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
     from ufmstar_torch.eval.engine.progress import ProgressSink
     from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
-    from ufmstar_torch.eval.run.rank import ImageScores
+    from ufmstar_torch.eval.run.rank import ImageScores, require_part
     from ufmstar_torch.eval.run.run import warm_up_job
     from ufmstar_torch.eval.run.run_folder import Checkpoint
 
@@ -109,6 +109,8 @@ def _scores(options: RankOptions) -> ImageScores:
         for path in options.sequences:
             try:
                 job = job_from(options.of(path), source)
+                if source is None:
+                    require_part(job, options.by)
             except (ImportError, OSError, ValueError) as error:
                 raise UsageError(error) from error
             if source is None:
