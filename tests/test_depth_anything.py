@@ -234,7 +234,7 @@ def test_another_model_in_one_line_with_its_meaning_declared(other):
     affine = from_hugging_face(other, kind="affine", size=(64, 96))
     with pytest.raises(ValueError, match=r"\(depth up to scale and shift\), not metres"):
         affine(images.float() / 255)
-    with pytest.raises(ValueError, match="preprocessor_config.json states no size with height and width: declare it"):
+    with pytest.raises(ValueError, match=r"preprocessor_config\.json states no size with height and width: declare it"):
         from_hugging_face(other, kind="metric")
     with pytest.raises(ValueError, match="scale goes with kind 'metric' only"):
         from_hugging_face(other, kind="affine", scale=2.0, size=(64, 96))
