@@ -10,8 +10,8 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -66,26 +66,22 @@ def test_one_process_and_two_give_the_same_bits(rooms, tmp_path, capfd):
     assert kept(one.out) == kept(two.out)
 
 
-def part(number, job, shard, local, processes, threads):
-    """Stands for the work of a process: the job's output folder says what becomes of each."""
-    (job.out / f"{number}-{os.getpid()}").touch()
-    end = (job.out / "ends").read_text().split()[number]
-    if end == "kill":
+def part(folder, ends, number):
+    """Stands for the work of a process; ``ends`` says what becomes of each."""
+    (folder / f"{number}-{os.getpid()}").touch()
+    if ends[number] == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
-    if end == "fail":
+    if ends[number] == "fail":
         raise OSError("disk full")
-    while end == "wait":
+    while ends[number] == "wait":
         time.sleep(0.02)
 
 
 def in_parts(folder, *ends, stop=lambda: False):
     """Whether all of some processes finished, and what was reported."""
-    folder.mkdir(exist_ok=True)
-    (folder / "ends").write_text(" ".join(ends))
+    folder.mkdir()
     lines: list[str] = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shards, "_evaluate_part", part)
-        return shards._in_processes(SimpleNamespace(out=folder), Shard(), 0, len(ends), 1, stop, lines.append), lines
+    return shards.in_processes(partial(part, folder, ends), len(ends), stop, lines.append), lines
 
 
 def at_work(folder):

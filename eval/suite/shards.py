@@ -10,10 +10,12 @@ from __future__ import annotations
 import logging
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -88,7 +90,8 @@ def evaluate_suite(
         with EvalFolder.open(job.out, job.about(job.load(torch.device("cpu"))), shard=shard, **how):
             pass  # mistakes are reported once, before any process starts
         threads = threads or max(1, available_cores() // processes)
-        finished = _in_processes(job, shard, local, processes, threads, stop, report)
+        part = partial(_evaluate_part, job, shard, local, processes, threads)
+        finished = in_processes(part, processes, stop, report)
     else:
         finished = _evaluate(job, shard, local, threads, how, stop, report, progress, evaluate)
     folder = EvalFolder(job.out)
@@ -110,12 +113,10 @@ def rank_of(environment: Mapping[str, str]) -> tuple[Shard, int]:
     return Shard(rank + 1, world), local
 
 
-def _in_processes(
-    job: EvalJob, shard: Shard, local: int, processes: int, threads: int, stop: Stop, report: Report
-) -> bool:
-    """Divide a shard among processes, and wait for them; whether all finished. They end with this one, also when it is
-    killed. Raises RuntimeError: one failed; the others are ended."""
-    context = spawn(_evaluate_part, (job, shard, local, processes, threads), processes, join=False)
+def in_processes(task: Callable[[int], object], processes: int, stop: Stop, report: Report) -> bool:
+    """Run a task in processes, with the number of each, and wait for them; whether all finished. They end with this
+    one, also when it is killed. Raises RuntimeError: one failed; the others are ended."""
+    context = spawn(_child, (task,), processes, join=False)
     finished = False
     try:
         while not finished and not stop():
@@ -133,8 +134,15 @@ def _in_processes(
     return finished
 
 
-def _evaluate_part(number: int, job: EvalJob, shard: Shard, local: int, processes: int, threads: int) -> None:
-    """Evaluate one of equal parts of a shard, in a process of its own."""
+def _child(number: int, task: Callable[[int], object]) -> None:
+    """Run the task in its process."""
+    # torch sends SIGINT to a process whose parent has died; a shell's background jobs ignore it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    task(number)
+
+
+def _evaluate_part(job: EvalJob, shard: Shard, local: int, processes: int, threads: int, number: int) -> None:
+    """Evaluate one of equal parts of a shard."""
     part = Shard(shard.index + shard.count * number, shard.count * processes)
     how = {"resume": True, "overwrite": False}
 
