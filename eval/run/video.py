@@ -25,7 +25,7 @@ def preview_frame(panel: FramePanel, columns: Sequence[MapColumn]) -> NDArray[np
     height, width = panel.shape
     cell_height = min(240, max(1, round(427 * height / width)))
     cell_width = max(1, round(cell_height * width / height))
-    cells = []
+    cells: list[NDArray[np.uint8]] = []
     for words, picture in [(panel.name, panel.image), *((_words(column), column.rgb(panel)) for column in columns)]:
         cell = np.full((HEAD + cell_height, cell_width, 3), 255, np.uint8)
         if picture is not None:
