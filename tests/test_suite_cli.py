@@ -119,7 +119,7 @@ def test_a_dry_run_counts_and_writes_nothing(ufmstar, rooms, tmp_path):
     code, text, _ = ufmstar(*words)
     assert code == 0
     assert "5 rows:" in text
-    assert "2 of 3:\n  rooms/ash: 3 frames\n  rooms/cedar: 3 frames\n6 frames, 10 records" in text
+    assert "2 of 3 sequences:\n  rooms/ash: 3 frames\n  rooms/cedar: 3 frames\n6 frames, 10 records" in text
     assert not (tmp_path / "out").exists()
 
 

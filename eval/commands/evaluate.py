@@ -282,14 +282,29 @@ def _measure(job: EvalJob, threads: int | None) -> None:
 
 
 def _dry_run(options: EvalOptions) -> int:
-    """Print what would be evaluated."""
+    """Print the rows with their networks, and the sequences with their number of frames."""
     import torch
 
-    from ufmstar_torch.eval.commands.dry_run import dry_run
     from ufmstar_torch.eval.suite.work_items import Shard
 
     job = job_from(options)
     for base in job.unused:
         print(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
-    print(dry_run(job, job.load(torch.device("cpu")), Shard.parse(options.shard or "1/1")))
+    networks, items = job.load(torch.device("cpu")), Shard.parse(options.shard or "1/1").of(job.items)
+    print(f"{job.suite.name}: {job.suite.title}\n{len(job.suite.rows)} rows:")
+    for row in job.suite.rows:
+        print(f"  {row.label}  [{networks[row.method.base].label}]")
+    if job.missing_bases:
+        print(f"left out, without a --network: the rows of {', '.join(job.missing_bases)}")
+    print(f"{len(items)} of {len(job.items)} sequences:")
+    total = 0
+    for item in items:
+        try:
+            frames = len(range(len(item.open()))[job.frames])
+        except (OSError, ValueError) as error:
+            print(f"  {item.label}: cannot be opened: {' '.join(str(error).split())}")
+            continue
+        print(f"  {item.label}: {frames} frames")
+        total += frames
+    print(f"{total} frames, {len(items) * len(job.suite.rows)} records")
     return 0
