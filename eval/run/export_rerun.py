@@ -17,7 +17,7 @@ from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.export import Gated, export_folder, image_of, points_in_camera
 from ufmstar_torch.eval.run.gaussians import RADIUS, Components
-from ufmstar_torch.eval.run.writers import fitting_unit
+from ufmstar_torch.eval.run.length_png import fitting_unit
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
 from ufmstar_torch.mixture import GaussianMixture

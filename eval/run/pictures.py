@@ -20,7 +20,7 @@ from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.run.colours import INVALID_GREY, known_where
 from ufmstar_torch.eval.run.panels import FramePanel, MapColumn, contact_sheet, map_columns
 from ufmstar_torch.eval.run.video import preview_frame, write_video
-from ufmstar_torch.eval.run.writers import read_frame
+from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
@@ -45,7 +45,7 @@ class Finished:
     def panel(self, number: int) -> FramePanel:
         """Finished frame ``number``, with square pixels, and the image cut to what the prediction shows."""
         record = self.records[number]
-        stored = read_frame(self.out / "frames" / f"{record['name']}.npz")
+        stored = read_frame(frame_file(self.out, record["name"]))
         K, size = pinhole(*record["intrinsics"]), (record["size"][0], record["size"][1])
         K_square, size_square = square_pixels(K, size)
         try:

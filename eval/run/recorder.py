@@ -14,6 +14,7 @@ from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.run_folder import Checkpoint, RunFolder
 from ufmstar_torch.eval.run.summary import GOING_ON, NEAR_ZERO, write_summary
+from ufmstar_torch.eval.run.writers import frame_file, write_frame
 
 _MAPS = ("depth", "variance", "disagreement", "measured", "anchored", "bias", "posterior_depth", "posterior_variance")
 _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured", "single_view")
@@ -35,12 +36,11 @@ class FrameRecorder(FrameSink):
         self._summarised = self._started
 
     def take(self, result: FrameResult) -> None:
-        """Write and record a frame; raises OSError as ``FrameWriter.write`` and ``RunFolder.add``."""
+        """Write and record a frame; raises OSError as ``write_frame`` and ``RunFolder.add``."""
         record, frames = self._record(result), result.number + 1 - self._first
         session = {"first": self._first, "frames": frames, "seconds": perf_counter() - self._started}
         checkpoint = Checkpoint(
             position=result.number + 1,
-            unit=self._folder.writer.unit,
             state=dict(result.state[UFM]),
             metrics=self._metrics.sums(),
             sessions=[*self._earlier, session],
@@ -67,9 +67,9 @@ class FrameRecorder(FrameSink):
         row, before = result.rows[UFM], perf_counter()
         maps = {name: getattr(row, name) for name in _MAPS}
         camera = {"T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
-        saturated = {"saturated": self._folder.writer.write(result.name, valid=row.valid, camera=camera, **maps)}
+        write_frame(frame_file(self._folder.path, result.name), row.valid, camera, **maps)
         times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
-        return {**about, "state": "done", **_figures(row), **saturated, **times, **_anchor_figures(row)}
+        return {**about, "state": "done", **_figures(row), **times, **_anchor_figures(row)}
 
 
 def _figures(row: RowResult) -> dict[str, Any]:
