@@ -160,7 +160,7 @@ def _merged(then: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
         **now,
         "networks": networks,
         "missing_bases": [base for base in now["missing_bases"] if base not in networks],
-        **{name: _union(then[name], now[name]) for name in ("rows", "sequences", "datasets", "sweep")},
+        **{name: _union(then[name], now[name]) for name in ("rows", "sequences", "datasets")},
     }
 
 

@@ -73,7 +73,6 @@ class EvalJob:
         return {
             "suite": suite.name,
             "title": suite.title,
-            "sweep": list(suite.sweep),
             "networks": {base: network.identity for base, network in networks.items()},
             "rows": [row.to_dict() for row in suite.rows],
             "datasets": sorted({item.dataset for item in self.items}),
