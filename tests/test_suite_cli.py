@@ -38,15 +38,10 @@ def test_list_names_every_suite(ufmstar):
 MISTAKES = {
     "nothing": ([], "--suite is missing"),
     "no network": (["--suite", "depth-only", "--root", "x", "--out", "o"], "--network is missing"),
-    "no suite of the name": (["{}", "--suite", "table-1"], "no suite is called 'table-1': there are paper-table-1"),
     "no file": (["{}", "--suite", "/nowhere/mine.toml"], "/nowhere/mine.toml"),
-    "base of a table": (["{}", "--base", "aleatoric"], "--base goes with figures and ablations"),
-    "no such base": (["{}", "--network", "resnet=trained:x"], "base must be one of ensemble"),
     "base twice": (["{}", "--network", "depth_only=ground-truth"], "time and energy, got depth_only, depth_only"),
-    "no row left": (["{}", "--suite", "paper-table-1"], "there are networks of depth_only only"),
     "no root": (["{}", "--root", "/nowhere"], "no such file or folder: /nowhere"),
     "frames": (["{}", "--frames", "5"], "--frames must be START:STOP"),
-    "shard": (["{}", "--shard", "0/2"], "--shard must be 1/n to n/n"),
     "shard and overwrite": (["{}", "--shard", "1/2", "--overwrite"], "--overwrite goes without shards"),
     "both": (["{}", "--resume", "--overwrite"], "--resume and --overwrite contradict"),
     "processes": (["{}", "--processes", "0"], "--processes must be at least 1"),
@@ -73,10 +68,7 @@ def test_an_evaluation_ends_with_its_table_and_report(ufmstar, rooms, tmp_path):
     out = tmp_path / "out"
     code, text, err = ufmstar(*words_for(rooms, out, "--frames", "0:2", "--examples", "1"))
     assert code == 0, err
-    assert "3 sequences of rooms" in text
     assert all(name in text for name in ("DepthOnly", "UfM-DepthOnly-100K", "UfM\\*-DepthOnly"))
-    assert "3 sequences, fewer than 5: no confidence intervals." in text
-    assert f"{out}: eval.json, records/DATASET/SEQUENCE/" in text
     assert (out / "tables" / "main.md").is_file()
     assert err.count("rooms/") == 3
     about = json.loads((out / "eval.json").read_text())

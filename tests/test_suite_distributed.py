@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_suite import NAMES, TRUTH, Stub, go, job_on, kept
+from tiny_suite import NAMES, Stub, go, job_on, kept
 from trainings import SPEC
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
@@ -33,7 +32,7 @@ TORCHRUN = {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"}
 
 @pytest.fixture
 def whole(rooms, tmp_path):
-    """What one process that is not disturbed leaves, judging by the real judge."""
+    """The records that one undisturbed process leaves, from the real judge."""
     go(job_on(rooms, tmp_path / "whole"), evaluate_sequence)
     return kept(tmp_path / "whole")
 
@@ -136,16 +135,6 @@ def test_devices_go_round(monkeypatch):
     assert machine.device_of("cuda:1", 0) == "cuda:1"
 
 
-def test_a_job_is_the_same_in_another_process(rooms, tmp_path):
-    words = ["--suite", "ablation-anchors", "--network", TRUTH, "--root", f"rooms={rooms}", "--out", str(tmp_path)]
-    words += ["--frames", "1::2", "--cache", str(tmp_path / "cache"), "--truth-scale", "0.5", "--samples", "3"]
-    job = job_from(read(words))
-    again = pickle.loads(pickle.dumps(job))
-    assert again == job
-    assert [item.opening for item in again.items] == [item.opening for item in job.items]
-    assert [row.setting.to_dict() for row in again.suite.rows] == [row.setting.to_dict() for row in job.suite.rows]
-
-
 # ---- shards ----
 
 
@@ -188,6 +177,3 @@ def test_ranks_of_torchrun():
     assert rank_of(TORCHRUN) == (Shard(4, 4), 1)
     alone = {**TORCHRUN, "RANK": "0", "WORLD_SIZE": "1", "LOCAL_RANK": "0"}
     assert rank_of({}) == rank_of({"WORLD_SIZE": "4"}) == rank_of(alone) == (Shard(), 0)
-    for wrong, message in (({"RANK": "first"}, "must be numbers"), ({"RANK": "4"}, "RANK 4 must be in")):
-        with pytest.raises(ValueError, match=message):
-            rank_of({**TORCHRUN, **wrong})

@@ -10,7 +10,7 @@ import torch
 from depth_anything_files import write_depth_anything, write_other
 from torch import nn
 from torch.nn.functional import interpolate
-from trainings import tiny_job, write_frames
+from trainings import tiny_job
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.engine.load import network_source
@@ -49,11 +49,6 @@ class Own(nn.Module):
         return features if self.returns == "features" else 2 + self.last(features).tanh()
 
 
-@pytest.fixture(scope="module")
-def frames(tmp_path_factory):
-    return write_frames(tmp_path_factory.mktemp("frames") / "walk")
-
-
 def data_of(frames):
     return tiny_job(frames, frames, augment=False).data
 
@@ -69,7 +64,6 @@ def image(seed=0):
 
 @pytest.mark.parametrize(("head", "channels"), [(AleatoricHead, 1), (EvidentialHead, 3)])
 def test_a_head_on_any_feature_map(head, channels):
-    """As a module of one's own: features of another resolution, a loss, and gradients of all its weights."""
     one = head(5)
     depth = torch.full((2, 8, 12), 2.0, requires_grad=True)
     distribution = one(torch.rand(2, 5, 4, 6), depth)

@@ -20,7 +20,8 @@ class SequenceOptions:
     Attributes:
         layout: name of the layout (docs/data.md); auto: detect it from the files
         intrinsics: camera of the images: a file, or fx fy cx cy [px]
-        distortion: lens distortion to undo: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or own (TUM RGB-D's)
+        distortion: lens distortion to undo: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or none (default:
+            TUM RGB-D's own)
         depth_intrinsics: camera of the sequence's own depth maps: a file, or fx fy cx cy [px]
         truth_scale: metres per unit of the sequence's own depth
         max_truth: ground truth beyond this depth is ignored [m]
