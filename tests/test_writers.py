@@ -41,7 +41,9 @@ def write_png(path, values, unit):
 
 
 def write(folder, name, maps):
-    write_frame(frame_file(folder, name), **maps)
+    file = frame_file(folder, name)
+    file.parent.mkdir(exist_ok=True)
+    write_frame(file, **maps)
 
 
 def full_disk(*_, **__):

@@ -69,6 +69,7 @@ class RunFolder:
     def __init__(self, folder: OutputFolder) -> None:
         self.path, self._folder = folder.path, folder
         self.checkpoint, self.records = _load(folder.path) if folder.resumed else (Checkpoint(), [])
+        (self.path / FRAMES).mkdir(exist_ok=True)
         lines = b"".join(_line(record) for record in self.records)
         write_atomic(self.path / RECORDS, lambda file: file.write(lines))
         self._stored, self._stored_at = self.checkpoint, monotonic()
