@@ -179,3 +179,18 @@ def test_everything_a_summary_holds(tmp_path):
         write_json_atomic(tmp_path / "summary.json", {"b": [1, object()]})
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 3
     assert to_json({1: (1, 2)}) == {"1": [1, 2]}
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "No space left on device"), OSError("9 requested and 4 written")]
+)
+def test_a_full_disk_is_reported_with_the_file(tmp_path, error):
+    """NumPy's error has no number, and neither has a name."""
+
+    def write(file):
+        file.write(b"begun")
+        raise error
+
+    with pytest.raises(OSError, match=rf"({error.strerror or error}): .*maps\.npy"):
+        write_atomic(tmp_path / "maps.npy", write)
+    assert not list(tmp_path.iterdir())

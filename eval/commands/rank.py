@@ -139,11 +139,11 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     lines += [{"rank": None, **scores.images[i].line} for i in rest]
     table = pd.DataFrame(lines, dtype=object).to_csv(index=False, lineterminator="\n")
     write_atomic(out / SCORES, lambda file: file.write(table.encode()))
-    write_json_atomic(out / SETTINGS, {"program": "ufmstar rank", "settings": as_dict(options), "images": len(lines)})
     files = [SCORES]
     if panels := scores.panels():
         contact_sheet(panels, out / SHEET, title=f"the least and the most certain of {len(lines)} images")
         files.append(SHEET)
+    write_json_atomic(out / SETTINGS, {"program": "ufmstar rank", "settings": as_dict(options), "images": len(lines)})
     shown = [["rank", "sequence", "frame", f"{options.by} [m²]", "measured"]]
     mean, names = f"{options.by}_mean_m2", [Path(path).name for path in options.sequences]
     for line in lines[: min(len(chosen), _SHOWN)]:

@@ -42,6 +42,7 @@ class Gated:
     intrinsics: NDArray[np.float64]  # [3, 3] [px]
     depth: NDArray[np.float32]
     sigma: NDArray[np.float32]
+    anchors: NDArray[np.float32] | None = None  # [N, 4] u, v [px], depth and its standard deviation [m]
 
 
 def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
@@ -53,17 +54,19 @@ def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iter
         max_relative_sigma: largest sigma as a share of the depth.
 
     Raises:
-        ValueError: no run's folder, or one of an earlier version, without poses.
+        ValueError: no run's folder, one without a finished frame, or one of an earlier version, without poses.
     """
     if not (out / RECORDS).is_file():
         raise ValueError(f"{out} is no output of `ufmstar run`: it has no {RECORDS}")
-    return _gated(out, max_sigma, max_relative_sigma)
+    records = read_records((out / RECORDS).read_bytes(), out / RECORDS)
+    done = [record for record in records if record["state"] == "done"]
+    if not done:
+        raise ValueError(f"{out} has no finished frame")
+    return _gated(out, done, max_sigma, max_relative_sigma)
 
 
-def _gated(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
-    for record in read_records((out / RECORDS).read_bytes(), out / RECORDS):
-        if record["state"] != "done":
-            continue
+def _gated(out: Path, done: list[dict], max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
+    for record in done:
         maps = read_frame(frame_file(out, record["name"]))
         if "T_world_cam" not in maps:
             raise ValueError(f"{out}: the run is of an earlier version, whose frames have no poses; run it again")
@@ -76,7 +79,8 @@ def _gated(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[G
         nothing = np.float32(np.nan)
         depth, sigma = np.where(kept, depth, nothing), np.where(kept, sigma, nothing)
         camera = (maps["T_world_cam"], maps["intrinsics"])
-        yield Gated(record["name"], record["index"], record.get("timestamp"), *camera, depth, sigma)
+        about = (record["name"], record["index"], record.get("timestamp"))
+        yield Gated(*about, *camera, depth, sigma, maps.get("anchors"))
 
 
 def export_depth(frames: Iterator[Gated], out: Path) -> str:
@@ -178,9 +182,13 @@ def run_settings(out: Path) -> dict[str, Any]:
 def points_in_camera(frame: Gated) -> tuple[NDArray[np.float64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """[P, 3] the points of the pixels that are kept, in the camera's axes [m], and those pixels' rows and columns."""
     v, u = np.nonzero(np.isfinite(frame.depth))
-    z, K = frame.depth[v, u].astype(np.float64), frame.intrinsics
-    y = (v - K[1, 2]) / K[1, 1]
-    return np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1), (v, u)
+    return points_of(u, v, frame.depth[v, u], frame.intrinsics), (v, u)
+
+
+def points_of(u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any], K: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[P, 3] in the camera's axes [m] of pixels u, v [px] with a depth [m]."""
+    z, y = depth.astype(np.float64), (v - K[1, 2]) / K[1, 1]
+    return np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1)
 
 
 def _voxels(frame: Gated, voxel: float, image: Frame | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

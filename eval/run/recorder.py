@@ -6,6 +6,9 @@ import math
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
@@ -15,6 +18,7 @@ from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.run_folder import Checkpoint, RunFolder
 from ufmstar_torch.eval.run.summary import GOING_ON, NEAR_ZERO, write_summary
 from ufmstar_torch.eval.run.writers import frame_file, write_frame
+from ufmstar_torch.eval.sequences.frame import Frame
 
 _MAPS = ("depth", "variance", "disagreement", "measured", "anchored", "bias", "posterior_depth", "posterior_variance")
 _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured", "single_view")
@@ -66,7 +70,11 @@ class FrameRecorder(FrameSink):
             return {**about, "state": "skipped", "reason": result.skipped[UFM]}
         row, before = result.rows[UFM], perf_counter()
         maps = {name: getattr(row, name) for name in _MAPS}
-        camera = {"T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
+        camera: dict[str, NDArray[Any]] = {
+            "T_world_cam": row.T_world_cam,
+            "intrinsics": row.intrinsics,
+            **_anchor_array(result.frame, row),
+        }
         write_frame(frame_file(self._folder.path, result.name), row.valid, camera, **maps)
         times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
         return {**about, "state": "done", **_figures(row), **times, **_anchor_figures(row)}
@@ -137,6 +145,15 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
         "mean_bias": _mean(row.bias, row.valid),
         **_posterior_figures(row),
     }
+
+
+def _anchor_array(frame: Frame | None, row: RowResult) -> dict[str, NDArray[np.float32]]:
+    """With anchors: [N, 4] their u, v in the maps [px], depth and its standard deviation [m]."""
+    if row.landmarks is None or frame is None:
+        return {}
+    anchors = row.landmarks.anchors(frame.intrinsics, torch.from_numpy(row.intrinsics))
+    columns = (anchors.pixel[0], anchors.depth[0, :, None], anchors.variance[0, :, None].sqrt())
+    return {"anchors": torch.cat(columns, dim=1).float().numpy()}
 
 
 def _posterior_figures(row: RowResult) -> dict[str, Any]:

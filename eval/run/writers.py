@@ -3,7 +3,8 @@
 It has depth [m], variance [m^2], disagreement [m^2], measured (the share of the disagreement that rests on two views or
 more) float32 and valid bool, each [H, W]; with anchors also anchored [m^2] (B) and bias (r: depth (1 + r) is the
 depth corrected), with a posterior also posterior_depth [m] and posterior_variance [m^2]; T_world_cam [4, 4]
-camera-to-world [m] and intrinsics [3, 3] of the maps [px].
+camera-to-world [m] and intrinsics [3, 3] of the maps [px]; with anchors also anchors [N, 4]: u, v in the maps [px],
+depth and its standard deviation [m].
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ def write_frame(
     file: Path, valid: Tensor, camera: Mapping[str, NDArray[Any]] = _NO_CAMERA, **given: Tensor | None
 ) -> None:
     """Write one frame, whole or not at all. The maps are [H, W]; those that are None are left out, ``valid`` is True
-    where the pixel was used, and ``camera`` has the arrays of its pose and intrinsics.
+    where the pixel was used, and ``camera`` has the arrays of its pose, intrinsics and
+    anchors.
 
     Raises:
         ValueError: shapes or types disagree.
