@@ -108,7 +108,7 @@ class TestPreview:
         assert frame.dtype == np.uint8
         assert all(n % 2 == 0 for n in frame.shape[:2])
         step = 240 // size[0]
-        left = step * size[1] + 4  # behind the image and a gap
+        left = step * size[1]
         cell = frame[22 : 22 + 240 : step, left : left + step * size[1] : step]
         np.testing.assert_array_equal(cell, fit_scales([one])["depth"].rgb(one.maps["depth"]))
 
