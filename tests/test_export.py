@@ -49,15 +49,16 @@ def read_ply(path):
 def test_depth_is_gated(finished):
     out, _, truth = finished
     assert cli.main(["export", str(out), "--to", "depth", "--max-sigma", "0.05"]) == 0
-    depth = np.load(out / "export" / "depth" / "9.npy")
-    assert depth.dtype == np.float32
-    assert np.isnan(depth[:20]).all()
+    depth, sigma = (read_depth(out / "export" / kind / "9.png") for kind in ("depth", "sigma"))
+    assert (depth[:20] == 0).all()
+    np.testing.assert_array_equal(sigma > 0, depth > 0)
+    np.testing.assert_allclose(sigma, 0.02 * depth, atol=1e-4)
     kept = 0.02 * truth.depths[2][20:] <= 0.0499
     assert 0 < kept.sum() < kept.size
     np.testing.assert_allclose(depth[20:][kept], truth.depths[2][20:][kept], atol=1e-3)
-    assert np.isnan(depth[20:][0.02 * truth.depths[2][20:] > 0.0501]).all()
+    assert (depth[20:][0.02 * truth.depths[2][20:] > 0.0501] == 0).all()
     assert cli.main(["export", str(out), "--to", "depth", "--max-relative-sigma", "0.01"]) == 0
-    assert np.isnan(np.load(out / "export" / "depth" / "9.npy")).all()
+    assert (read_depth(out / "export" / "depth" / "9.png") == 0).all()
 
 
 def test_the_trajectory(finished):

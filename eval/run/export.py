@@ -1,4 +1,4 @@
-"""A run's result for other programs: gated depth, a cloud of points, the trajectory, or ``transforms.json``.
+"""A run's result for other programs: depth and sigma, a cloud of points, the trajectory, or ``transforms.json``.
 
 All of it is below OUT/export. Depth and sigma are the posterior's where the run has one; a pixel that is not valid, or
 whose sigma is beyond a limit, is left out.
@@ -9,16 +9,17 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.eval.run.colours import known_where
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
 from ufmstar_torch.eval.run.gaussians import vertex_table, write_ply
-from ufmstar_torch.eval.run.writers import encode_length_png, fitting_unit, read_frame
+from ufmstar_torch.eval.run.length_png import encode_length_png, fitting_unit
+from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
@@ -66,7 +67,7 @@ def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iter
 
 def _gated(out: Path, done: list[dict], max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
     for record in done:
-        maps = read_frame(out / "frames" / f"{record['name']}.npz")
+        maps = read_frame(frame_file(out, record["name"]))
         if "T_world_cam" not in maps:
             raise ValueError(f"{out}: the run is of an earlier version, whose frames have no poses; run it again")
         prefix = "posterior_" if "posterior_depth" in maps else ""
@@ -83,12 +84,14 @@ def _gated(out: Path, done: list[dict], max_sigma: float, max_relative_sigma: fl
 
 
 def export_depth(frames: Iterator[Gated], out: Path) -> str:
-    """NAME.npy [h, w] float32 [m], NaN where left out."""
-    folder, count = export_folder(out, "depth"), 0
+    """depth/NAME.png and sigma/NAME.png, 16 bits, 0 = left out."""
+    folders, unit, count = [export_folder(out, kind) for kind in ("depth", "sigma")], None, 0
     for frame in frames:
         count += 1
-        write_atomic(folder / f"{frame.name}.npy", partial(_save, frame.depth))
-    return f"{folder}: {count} maps"
+        unit = unit or fitting_unit(frame.depth)
+        for folder, values, metres in zip(folders, (frame.depth, frame.sigma), (unit, unit / 10), strict=True):
+            _write(folder / f"{frame.name}.png", encode_length_png(values, metres, folder.name))
+    return f"{folders[0]}, {folders[1]}: {count} maps each"
 
 
 def export_trajectory(frames: Iterator[Gated], out: Path) -> str:
@@ -131,7 +134,7 @@ def export_cloud(frames: Iterator[Gated], out: Path, voxel: float, sequence: Fra
         kinds |= dict.fromkeys(("red", "green", "blue"), "|u1")
         columns.append(np.rint(colour))
     file = export_folder(out) / "cloud.ply"
-    write_ply(file, {"vertex": vertex_table(kinds, *columns)}, ["x y z sigma [m], world of the poses"])
+    write_ply(file, vertex_table(kinds, *columns), "x y z sigma [m], world of the poses")
     return f"{file}: {len(keys)} points"
 
 
@@ -146,12 +149,12 @@ def export_transforms(frames: Iterator[Gated], out: Path, sequence: FrameSequenc
             continue
         K, size = image.intrinsics, (image.image.shape[0], image.image.shape[1])
         depth, sigma = (resample_nearest(values, frame.intrinsics, K, size) for values in (frame.depth, frame.sigma))
-        known = np.isfinite(depth) & (depth > 0)
-        unit = unit or fitting_unit(depth[known])
+        known = depth > 0  # the image may show more than the maps, where they are 0
+        depth, sigma = known_where(known, depth), known_where(known, sigma)
+        unit = unit or fitting_unit(depth)
         entry: dict[str, Any] = {"file_path": f"images/{frame.name}.png"}
         for kind, values in (("depth", depth), ("sigma", sigma)):
-            content, _ = encode_length_png(values, known, unit, quantity=kind)
-            _write(folder / kind / f"{frame.name}.png", content)
+            _write(folder / kind / f"{frame.name}.png", encode_length_png(values, unit, kind))
             entry[f"{kind}_file_path"] = f"{kind}/{frame.name}.png"
         _write(folder / entry["file_path"], _png(image.image))
         camera = {
@@ -236,7 +239,3 @@ def _png(image: NDArray[np.uint8]) -> bytes:
 
 def _write(path: Path, content: bytes) -> None:
     write_atomic(path, lambda file: file.write(content))
-
-
-def _save(depth: NDArray[np.float32], file: BinaryIO) -> None:
-    np.save(file, depth)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.export import Gated, points_in_camera, points_of
-from ufmstar_torch.eval.run.writers import fitting_unit
+from ufmstar_torch.eval.run.length_png import fitting_unit
 from ufmstar_torch.optional import optional
 
 WORLD, CAMERA = "world", "world/camera"
