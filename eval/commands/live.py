@@ -104,7 +104,7 @@ class LiveOptions:
 
     @property
     def recorded(self) -> bool:
-        """Whether the source is a recording."""
+        """True if the source is a recording."""
         return not (self.follow or self.source == _STANDARD_INPUT or self.source.isdecimal())
 
 
