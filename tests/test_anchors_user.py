@@ -26,7 +26,7 @@ def at(u, v, z):
 # ---- points into pixels ----
 
 
-def test_points_project_to_their_pixels():
+def test_points_project_to_their_pixels_by_each_streams_camera():
     expected = [(3.25, 40.0, 2.0), (0.0, 0.0, 0.5), (63.0, 47.0, 8.0)]
     points = torch.tensor([[at(*w) for w in expected]])
     actual = Anchors.from_points(points, torch.full((1, 3), 0.01, dtype=torch.float64), K, (H, W))
@@ -35,14 +35,10 @@ def test_points_project_to_their_pixels():
     torch.testing.assert_close(actual.depth[0], torch.tensor([2.0, 0.5, 8.0]).double(), rtol=1e-6, atol=0)
     assert actual.variance.tolist() == [[0.01] * 3]
     assert actual.valid.all()
-
-
-def test_each_stream_has_its_own_camera():
-    other = resize_intrinsics(K, (H, W), (2 * H, 2 * W))
-    points = torch.tensor([[at(10.0, 20.0, 3.0)]]).expand(2, 1, 3).float()
-    actual = Anchors.from_points(points, torch.zeros(2, 1), torch.stack([K, other]), (2 * H, 2 * W))
-    expected = torch.tensor([[[10.0, 20.0]], [[20.5, 40.5]]], dtype=torch.float64)
-    torch.testing.assert_close(actual.pixel, expected, rtol=0, atol=1e-5)
+    cameras = torch.stack([K, resize_intrinsics(K, (H, W), (2 * H, 2 * W))])
+    each = Anchors.from_points(points[:, :1].expand(2, 1, 3), torch.zeros(2, 1), cameras, (2 * H, 2 * W))
+    double = torch.tensor([[[3.25, 40.0]], [[7.0, 80.5]]], dtype=torch.float64)
+    torch.testing.assert_close(each.pixel, double, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize(

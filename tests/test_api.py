@@ -76,11 +76,3 @@ def test_the_papers_defaults():
     assert config.ema_alpha == 0.5
     assert config.variance_floor == 0.0
     assert not config.overlap_weighted
-
-
-def test_public_functions_are_documented():
-    for name in PUBLIC:
-        assert inspect.getdoc(getattr(ufmstar_torch, name)), name
-    for function in (UfMStar.forward, UfMStar.mean_uncertainty, UfMStar.query, UfMStar.reset, spgf):
-        text = inspect.getdoc(function)
-        assert "Raises" in text or "Returns" in text, function

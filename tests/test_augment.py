@@ -10,7 +10,7 @@ from torch import Tensor
 
 import scenes
 from ufmstar_torch.train import Augmentation, AugmentationConfig
-from ufmstar_torch.train.augment import Change, apply_colour, apply_geometry, camera_change
+from ufmstar_torch.train.augment import Change, apply_colour, apply_geometry
 
 SIZE = (120, 160)
 # Pixels that are not square, a principal point far from the centre, and skew: nothing may hide in symmetry.
@@ -95,21 +95,6 @@ def test_a_rendered_room_is_the_room_seen_by_the_rolled_camera(zoom):
     assert valid.float().mean() > 0.95
     assert error.median() < 2e-3
     assert (error < 0.02).float().mean() > 0.93  # what is left are edges, half a pixel wide
-
-
-def test_closed_forms_of_the_intrinsics():
-    """Flip: cx' = W - 1 - cx. Zoom about the principal point leaves K as it is, or scales f."""
-    height, width = SIZE
-    _, flipped = camera_change(K, Change(flip=True), height, width, "depth")
-    expected = K.clone()
-    expected[0, 2], expected[0, 1] = width - 1 - K[0, 2], -K[0, 1]
-    torch.testing.assert_close(flipped, expected)
-    centred = K.clone()
-    centred[:2, 2] = torch.tensor([(width - 1) / 2, (height - 1) / 2])
-    _, kept = camera_change(centred, Change(scale=1.5, angle=0.05), height, width, "depth")
-    torch.testing.assert_close(kept, centred)
-    _, longer = camera_change(centred, Change(scale=1.5), height, width, "focal")
-    torch.testing.assert_close(longer.diagonal(), centred.diagonal() * torch.tensor([1.5, 1.5, 1.0]))
 
 
 def test_depth_is_copied_and_never_mixed():

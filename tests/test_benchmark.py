@@ -13,7 +13,6 @@ from layouts import write_tum
 from onnx_files import small_network, write_fastdepth
 
 from ufmstar_torch import cli
-from ufmstar_torch.eval.bench.parts import TimedParts
 from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, paired_ratio, pinned_threads, spread
 from ufmstar_torch.eval.commands.bench import main, read
 
@@ -37,7 +36,7 @@ def test_paired_ratio_cancels_a_common_slowdown():
 
 @pytest.fixture
 def work(monkeypatch):
-    """Moves ``time.perf_counter``, which stands still otherwise, by so many seconds."""
+    """Move ``time.perf_counter``, which stands still otherwise, by a number of seconds."""
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
 
@@ -46,16 +45,6 @@ def work(monkeypatch):
         return seconds
 
     return move
-
-
-def test_parts_alternate(work):
-    log, parts = [], TimedParts(warm_up=1)
-    calls = {("row", name): lambda n=name, s=s: log.append(n) or work(s) for name, s in (("a", 1.0), ("b", 3.0))}
-    for number in range(3):
-        assert parts.run(number, calls, torch.device("cpu")) == {("row", "a"): 1.0, ("row", "b"): 3.0}
-    assert log == list("abbaab")
-    assert (parts.ms("row", "a"), parts.ms("row", "b")) == ([1000.0] * 2, [3000.0] * 2), "less the warm-up"
-    assert parts.ms("row", "c") == []
 
 
 def test_every_moment_belongs_to_the_stage_that_needs_it(work):

@@ -1,4 +1,4 @@
-"""Pinhole geometry: re-projection under resize and crop, poses, the Jacobian."""
+"""Pinhole geometry: unprojection, poses, projected covariances (resize and crop: test_preprocess.py)."""
 
 from __future__ import annotations
 
@@ -33,39 +33,6 @@ def test_unproject_is_the_papers_formula():
         d, k = depth[b, v, u], K[b]
         expected = torch.stack([(u - k[0, 2]) / k[0, 0] * d, (v - k[1, 2]) / k[1, 1] * d, d])
         torch.testing.assert_close(points[b, v, u], expected, rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize(("old", "new"), [((480, 640), (224, 224)), ((540, 360), (97, 131)), ((30, 40), (90, 120))])
-def test_resized_intrinsics_reproject(old, new):
-    """A blob drawn at a known point's projection lands, after resizing the image, at its new projection."""
-    K = torch.tensor(scenes.intrinsics(*old), dtype=torch.float64)
-    K[0, 2] += 3.3
-    point = torch.tensor([0.1, -0.15, 1.0], dtype=torch.float64)
-
-    def pixel(K):
-        return (K @ point)[:2] / point[2]
-
-    v, u = torch.meshgrid(torch.arange(old[0]).double(), torch.arange(old[1]).double(), indexing="ij")
-    radius = 0.04 * min(old)
-    blob = torch.exp(-((u - pixel(K)[0]) ** 2 + (v - pixel(K)[1]) ** 2) / (2 * radius**2))
-    options = {"mode": "bilinear", "align_corners": False, "antialias": True}
-    small = torch.nn.functional.interpolate(blob[None, None], new, **options)[0, 0]
-    v, u = torch.meshgrid(torch.arange(new[0]).double(), torch.arange(new[1]).double(), indexing="ij")
-    centroid = torch.stack([(u * small).sum(), (v * small).sum()]) / small.sum()
-    expected = pixel(camera.resize_intrinsics(K, old, new))
-    assert (centroid - expected).abs().max() < 0.05
-    # The rule that forgets the half pixel would be off by this much:
-    assert (expected[0] - pixel(K * torch.tensor([[new[1] / old[1]], [new[0] / old[0]], [1.0]]))[0]).abs() > 0.1
-
-
-def test_cropped_intrinsics_reproject():
-    K = torch.tensor(scenes.intrinsics(48, 64))
-    image = torch.arange(48 * 64).view(48, 64)
-    cropped, K_cropped = image[5:40, 7:60], camera.crop_intrinsics(K, top=5, left=7)
-    point = torch.tensor([0.2, 0.1, 1.0], dtype=torch.float64)
-    u, v = ((K @ point)[:2]).round().long().tolist()
-    u_c, v_c = ((K_cropped @ point)[:2]).round().long().tolist()
-    assert image[v, u] == cropped[v_c, u_c]
 
 
 @given(st.integers(0, 10**6))
@@ -113,16 +80,3 @@ def test_projected_covariance(seed):
         np.testing.assert_allclose(image_mean[0, i].numpy(), m, rtol=1e-12)
         own = image_cov[0, i].numpy() + oracle.PIXEL_VARIANCE * np.eye(2)
         np.testing.assert_allclose(own, S, rtol=1e-11, atol=1e-11)
-
-
-def test_jacobian_is_the_derivative_of_the_projection():
-    K = torch.tensor(scenes.intrinsics(48, 64))[None]
-    mean = torch.tensor([[[0.3, -0.2, 1.7]]], dtype=torch.float64)
-
-    def project(m):
-        return camera.project_gaussian(m, torch.zeros(1, 1, 3, 3, dtype=torch.float64), K)[0]
-
-    A = torch.autograd.functional.jacobian(project, mean)[0, 0, :, 0, 0]
-    cov = torch.diag(torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64))
-    _, image_cov = camera.project_gaussian(mean, cov[None, None], K)
-    torch.testing.assert_close(image_cov[0, 0], A @ cov @ A.T, rtol=1e-12, atol=0)

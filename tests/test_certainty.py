@@ -1,15 +1,14 @@
-"""What was not measured must not read as certain, and what no algorithm can use must not get in."""
+"""Pixels that were not measured do not read as certain, and unusable depth does not get in."""
 
 from __future__ import annotations
 
-import inspect
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from modules import CONFIG, DEPTHS, POSES, H, K, W, frame
+from modules import CONFIG, H, K, W, frame
 from walks import SPGF
 
 from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
@@ -25,9 +24,6 @@ from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.stateful import flat
 
 pytestmark = pytest.mark.numerics
-
-DEPTHS_OF = [torch.tensor(depth, dtype=torch.float32)[None] for depth in DEPTHS]
-HOSTILE = [0.0, -1.0, 1e-45, 1e-40, 1e-20, 1e-7, 1e6, 1e10, 1e20, 3e38, float("inf"), float("nan")]
 
 
 def test_beyond_the_networks_range_nothing_is_certain():
@@ -161,31 +157,6 @@ def test_what_was_not_measured_does_not_make_the_next_frame_certain(choice):
         assert float(ratio.min()) > 0.5
 
 
-def test_depth_alone_through_the_pipeline_is_never_certain_unasked():
-    """First frame, a point far from every Gaussian, and a later frame: only the paper's choice leaves a 0."""
-    network = wrap_network(lambda x: DEPTHS_OF[int(x[0, 0, 0, 0] * 255)])
-    model = UncertainDepth(network, UfMStarConfig(segment=SPGF))
-    for i in range(3):
-        image = torch.zeros(1, 3, H, W) + i / 255
-        out = model(image, torch.tensor(POSES[i]), K)
-        assert float(out.variance[out.ufm.valid].min()) > 1e-5
-    paper = UncertainDepth(network, CONFIG)
-    out = paper(torch.zeros(1, 3, H, W), torch.tensor(POSES[0]), K)
-    assert float(out.variance[out.ufm.valid].max()) == 0
-    assert int(out.ufm.statistics.unmeasured[0]) == int(out.ufm.valid.sum())
-
-
-def test_views_of_different_places_are_not_certain():
-    """Ten views 50 m apart, as of poses in millimetres: nothing is compared, and sigma is a share of the depth."""
-    ufm = UfMStar(UfMStarConfig(segment=SPGF))
-    for i in range(10):
-        depth, pose, intrinsics = frame(0)
-        pose[:, 0, 3] += 50 * i
-        out = ufm(depth, pose, intrinsics)
-        assert int(out.statistics.unmeasured[0]) == int(out.statistics.valid_pixels[0])
-        np.testing.assert_allclose(out.std[out.valid].numpy(), 0.2 * depth[out.valid].numpy(), rtol=1e-4)
-
-
 def test_a_frame_without_a_segment_warns_once(caplog):
     ufm = UfMStar(CONFIG)
     depth, pose, intrinsics = frame(0)
@@ -209,9 +180,6 @@ def test_the_papers_configuration():
     assert paper.segment.scaled_to(518, 518).slope(123.0 * 518 / 224) == pytest.approx(2.4 / 123)
     ours, theirs = flat(UfMStarConfig().to_dict()), flat(paper.to_dict())
     assert {name: theirs[name] for name in ours if ours[name] != theirs[name]} == dict(PAPER)
-    told = inspect.getdoc(UfMStarConfig.paper)
-    assert told is not None
-    assert [name for name in PAPER if name.removeprefix("segment") not in told] == []
     assert UfMStarConfig.from_dict(paper.to_dict()) == paper
 
 
@@ -219,10 +187,7 @@ def test_outputs_print_as_a_line():
     ufm = UfMStar(CONFIG)
     mean = ufm.mean_uncertainty(*frame(0), pixels=50)
     out = ufm(*frame(1))
-    for value, start in ((out, "UfMStarOutput(1 x 30 x 40, median std "), (mean, "MeanUncertainty(mean=")):
-        text = repr(value)
-        assert text.startswith(start), text
-        assert "\n" not in text
-        assert len(text) < 300
+    for text in (repr(out), repr(mean), repr(out.statistics)):
         assert "valid_pixels=" in text
-    assert "tensor(" not in repr(out.statistics)
+        assert "\n" not in text
+        assert "tensor(" not in text

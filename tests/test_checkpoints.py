@@ -86,6 +86,7 @@ def test_everything_that_does_not_fit_is_named_and_nothing_is_loaded(tmp_path: P
     del state["conv.bias"]
     state["head.weight"] = torch.zeros(1)
     state["norm.weight"] = torch.zeros(5)
+    state["norm.bias"] = torch.tensor([0.0, torch.nan])
     torch.save(state, tmp_path / "w.pth")
     target = Small()
     before = {k: v.clone() for k, v in target.state_dict().items()}
@@ -96,15 +97,8 @@ def test_everything_that_does_not_fit_is_named_and_nothing_is_loaded(tmp_path: P
     assert "1 missing: conv.bias" in text
     assert "1 unexpected: head.weight" in text
     assert "1 of another shape: norm.weight is (5,), expected (2,)" in text
+    assert "1 with NaN or infinity: norm.bias" in text
     assert same(target.state_dict(), before)
-
-
-def test_weights_that_are_not_finite(tmp_path: Path) -> None:
-    state = {k: v.clone() for k, v in Small().state_dict().items()}
-    state["conv.bias"][1] = float("nan")
-    save_checkpoint(tmp_path / "w.pth", state)
-    with pytest.raises(CheckpointError, match=r"w.pth does not fit .*1 with NaN or infinity: conv.bias"):
-        load_weights(Small(), tmp_path / "w.pth")
 
 
 def test_metadata_nested_too_deeply_names_the_file(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""MC-Dropout: closed forms for a linear decoder, only the decoder samples, both forms, seeds."""
+"""MC-Dropout: closed forms for a linear decoder, and only the decoder samples."""
 
 from __future__ import annotations
 
@@ -9,10 +9,7 @@ import torch
 from onnx_files import small_network
 from tiny_networks import Linear
 from torch import Tensor, nn
-from walks import SPGF
 
-import scenes
-from ufmstar_torch import UfMStarConfig, UncertainDepth
 from ufmstar_torch.models import (
     AleatoricNetwork,
     Backbone,
@@ -38,17 +35,6 @@ def with_dropout(p: float = P) -> FastDepth:
     network = FastDepth(source.widths, dropout=p)
     network.load_state_dict(source.state_dict(), strict=True)
     return network.eval()
-
-
-@pytest.mark.parametrize("generator", [None, seeded()], ids=["torch's", "own"])
-def test_share_and_scale(generator: torch.Generator | None) -> None:
-    """A value is 0 with probability p, otherwise it is divided by 1 - p: the mean stays."""
-    torch.manual_seed(0)
-    layer = DecoderDropout(P).eval()
-    set_sampling(layer, True, generator)
-    y = layer(torch.ones(200_000))
-    assert set(y.unique().tolist()) == {0.0, 1.25}
-    assert float((y == 0).double().mean()) == pytest.approx(P, abs=5 * (P * (1 - P) / 200_000) ** 0.5)
 
 
 def test_when_it_acts() -> None:
@@ -149,28 +135,3 @@ def test_the_encoder_does_not_sample() -> None:
         assert set_sampling(backbone, False) == 5
         with torch.no_grad():
             assert torch.equal(network(image).depth, network(image).depth)
-
-
-CONFIG = UfMStarConfig(segment=SPGF)
-K = torch.tensor(scenes.intrinsics(64, 64))
-POSE = torch.tensor(scenes.tour(30)[0])
-
-
-def test_multi_inference_form_is_ten_passes() -> None:
-    """``UncertainDepth(mode="full", samples=10)`` and the network that samples ten times are the same baseline."""
-    backbone = with_dropout()
-    calls: list[int] = []
-    backbone.encoder[0].register_forward_hook(lambda *_: calls.append(1))
-    network = AleatoricNetwork(backbone)
-    image = torch.rand(1, 3, 64, 64, generator=seeded(10))
-    full = UncertainDepth(MonteCarloDropout(network, generator=seeded(11)), CONFIG, mode="full", samples=SAMPLES)(
-        image, POSE, K
-    )
-    assert len(calls) == SAMPLES == 10
-    with torch.no_grad():
-        baseline = MonteCarloDropout(network, SAMPLES, generator=seeded(11)).eval()(image)
-    assert len(calls) == 2 * SAMPLES
-    assert torch.equal(full.depth, baseline.depth)
-    assert full.prediction.epistemic_variance is not None
-    torch.testing.assert_close(full.prediction.epistemic_variance, baseline.epistemic_variance)
-    assert float(full.prediction.epistemic_variance.mean()) > 0

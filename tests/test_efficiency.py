@@ -1,4 +1,4 @@
-"""What uncertainty costs: times and energies of networks whose cost is known, rows that do not disturb each other."""
+"""Costs of uncertainty: times and energies of networks whose cost is known, rows that do not disturb each other."""
 
 from __future__ import annotations
 

@@ -24,7 +24,6 @@ from ufmstar_torch.eval.bench.parts import MultiviewStep
 from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.report.efficiency import megabytes
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble, converted_layers
 from ufmstar_torch.models.dropout import MonteCarloDropout
@@ -38,7 +37,7 @@ from ufmstar_torch.prediction import DepthPrediction
 
 
 def step_memory(name, size, K):
-    """What the table counts for the multiview step of a row after one frame."""
+    """The bytes that the table counts for the multiview step of a row after one frame."""
     step = MultiviewStep(Row(Method.parse(name)), torch.device("cpu"))
     depth, variance, K = torch.full((1, *size), 2.0), torch.full((1, *size), 0.01), torch.tensor([K]).double()
     prediction = DepthPrediction(depth, aleatoric_variance=variance)
@@ -50,10 +49,8 @@ def step_memory(name, size, K):
 def test_100k_points_of_ufm_are_4_megabytes_and_the_smoothing_map_a_fifth():
     ufm = step_memory("UfM-Ensemble-100K", (320, 320), [[300.0, 0, 160], [0, 300, 160], [0, 0, 1]])
     assert (ufm["bytes_end"], ufm["count_end"], ufm["smoothing_bytes"]) == (4_000_000, 100_000, 0)
-    assert megabytes(ufm["bytes_end"]) == "4.0"
     star = step_memory("UfM*-Ensemble", (224, 224), [[200.0, 0, 112], [0, 200, 112], [0, 0, 1]])
     assert star["smoothing_bytes"] == 224 * 224 * 4
-    assert f"{star['smoothing_bytes'] / 1e6:.1f}" == "0.2"
     assert star["bytes_end"] == 64 * star["count_end"] > 0
 
 
@@ -63,11 +60,6 @@ def test_ten_members_are_90_percent():
     head = weight_bytes(members[0].head)
     assert memory == {"depth": 8, "uncertainty": 9 * 8 + 10 * head}  # the backbone has two weights
     assert overhead_percent(9, 1) == pytest.approx(90)
-
-
-def test_shared_tensors_count_once():
-    one = network()
-    assert weight_bytes(one, one, one.backbone) == weight_bytes(one)
 
 
 def fast_depth(method, dropout=0.0):

@@ -1,4 +1,4 @@
-"""Ensembles: the mixture of their members, and members that are loaded when needed and kept off the device."""
+"""Members of an ensemble that are loaded when needed and kept off the device (their mixture: test_pipeline.py)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from ufmstar_torch import DepthPrediction, UncertainDepth
-from ufmstar_torch.models import CheckpointError, DepthNetwork, Ensemble, LazyMember, Preprocess
+from ufmstar_torch.models import CheckpointError, DepthNetwork, LazyMember, Preprocess
 
 INPUT = Preprocess(size=(8, 10))
 POSE, K = torch.eye(4), torch.tensor([[8.0, 0, 4.5], [0, 8, 3.5], [0, 0, 1]])
@@ -54,17 +54,6 @@ def lazy(*gains, **options):
 
 def image(batch=2):
     return torch.rand(batch, 3, 8, 10, generator=torch.Generator().manual_seed(0))
-
-
-def test_an_ensemble_is_the_mixture_of_its_members():
-    networks = [Gain(1.0), Gain(1.5), Gain(3.0)]
-    mixture = Ensemble(networks)(image())
-    depths = torch.stack([network(image()).depth for network in networks])
-    mean = depths.sum(0) / 3
-    torch.testing.assert_close(mixture.depth, mean)
-    torch.testing.assert_close(mixture.aleatoric_variance, 0.01 * mean)
-    torch.testing.assert_close(mixture.epistemic_variance, (depths**2).sum(0) / 3 - mean**2)
-    assert Ensemble(networks).preprocess == INPUT
 
 
 def test_only_the_members_in_turn_are_loaded_each_once():

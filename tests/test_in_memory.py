@@ -1,4 +1,4 @@
-"""What is in memory already as input: kornia's camera, models and pipelines of ``transformers``, ``torch.hub``."""
+"""Objects in memory as input: kornia's camera, models and pipelines of ``transformers``."""
 
 from __future__ import annotations
 
@@ -88,15 +88,6 @@ def test_depth_pro_takes_the_cameras_focal_length(tmp_path):
         network(x)
 
 
-def test_a_model_of_torch_hub_is_a_module(tmp_path):
-    """``torch.hub.load`` returns what its repository's function does: a module."""
-    (tmp_path / "hubconf.py").write_text("import torch\ndef depth():\n    return torch.nn.Conv2d(3, 1, 1)\n")
-    model = torch.hub.load(str(tmp_path), "depth", source="local")
-    network = wrap_network(model, preprocess=Preprocess(size=(24, 32)))
-    x, _ = network.preprocess(IMAGES, CAMERA)
-    assert torch.equal(network(x).depth, model(x)[:, 0])
-
-
 def glpn():
     small = {"depths": [1] * 4, "hidden_sizes": [8] * 4, "num_attention_heads": [1] * 4, "decoder_hidden_size": 8}
     return transformers.GLPNConfig(**small)
@@ -116,7 +107,7 @@ REFUSED = {
         lambda: wrap_network(transformers.GLPNModel(glpn())), TypeError, "a ...ForDepthEstimation .*got GLPNModel"
     ),
     "no processor": (
-        lambda: wrap_network(tiny()), ValueError, "does not say what its input needs"
+        lambda: wrap_network(tiny()), ValueError, "has no preprocessor_config.json, .* declare it in a spec"
     ),
     "two declarations": (
         lambda: wrap_network(tiny(), focal=300.0), ValueError, "only scale, takes_int"

@@ -309,10 +309,3 @@ def test_a_bad_frame_of_one_stream_stops_neither_it_nor_the_others(tour, kind, a
         torch.testing.assert_close(out.variance[1], expected.variance[1], rtol=1e-6, atol=1e-9)
         assert model.landmarks.last[0].none.startswith(("pose", "intrinsics") if i == 3 else ("no ", "poses"))
     assert bool(out.variance[0].isfinite().all())
-
-
-def test_a_source_needs_the_anchored_configuration():
-    with pytest.raises(ValueError, match="AnchorConfig"):
-        UncertainDepth(Brightness(), anchors="corners")
-    with pytest.raises(ValueError, match="neither 'corners', 'dense' nor a file"):
-        wrapped("lidar")

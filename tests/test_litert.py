@@ -1,4 +1,4 @@
-"""FastDepth in ONNX Runtime and LiteRT from Python: what ``load_network`` returns, its crop, its depths, refusals."""
+"""FastDepth in ONNX Runtime and LiteRT from Python: results of ``load_network``, the crop, depths, refusals."""
 
 from __future__ import annotations
 
@@ -24,14 +24,11 @@ def weights(tmp_path_factory):
 
 
 def test_fastdepth_runs_in_onnx_runtime_unless_asked_otherwise(weights):
-    image = torch.rand(2, 3, 224, 224, generator=torch.Generator().manual_seed(0))
     graph, network = load_network("fastdepth", weights), load_network("fastdepth", weights, runtime="torch")
     assert isinstance(graph, OnnxNetwork)
     assert isinstance(network, FastDepth)
     assert graph.preprocess == network.preprocess == Preprocess.nyu()
     assert graph.threads == torch.get_num_threads()
-    with torch.no_grad():
-        torch.testing.assert_close(graph(image).depth, network(image).depth, rtol=1e-3, atol=1e-3)
     assert isinstance(load_network("fastdepth", weights, dropout=0.2), FastDepth)
     assert isinstance(load_network("fastdepth", weights, size=(64, 64)), FastDepth)  # the graph's size is fixed
     with pytest.raises(ValueError, match="runtime must be 'auto', 'onnx' or 'torch', got 'tensorrt'"):

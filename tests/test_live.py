@@ -22,7 +22,7 @@ PICTURE = np.zeros((48, 64, 3), np.uint8)
 
 
 class Network(torch.nn.Module):
-    """Two metres everywhere; ``gate`` holds it up, ``entered`` tells that it was called."""
+    """Predicts 2 m everywhere; ``gate`` holds it up, ``entered`` is set when it is called."""
 
     def __init__(self):
         super().__init__()
@@ -39,7 +39,7 @@ class Network(torch.nn.Module):
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled():
-    """The first image need not wait for a compiler."""
+    """Compile all kernels before the first image of a test."""
     UncertainDepth(Network())(PICTURE, np.eye(4), K)
 
 
@@ -59,6 +59,13 @@ def at(x):
     return T
 
 
+def show(live, stamp, picture=PICTURE, x=0.0):
+    """Push a pose and an image of its stamp, and wait until nothing is left to do."""
+    live.push_pose(stamp, at(x))
+    live.push_image(stamp, picture)
+    assert live.wait_idle(20)
+
+
 def stamps(results):
     return [result.stamp for result in results]
 
@@ -70,13 +77,15 @@ def require_all_counted(live):
 
 
 def test_a_result_has_the_pose_at_its_stamp(model):
+    """Poses come in any order, and a later one of a stamp replaces the earlier."""
     results = []
     with LiveDepth(model, results.append, K) as live:
-        live.push_pose(0.0, at(0))
-        live.push_pose(0.1, at(1))
-        live.push_image(0.025, PICTURE)
+        for stamp, x in ((0.1, 1), (0.0, 5), (0.0, 0)):
+            live.push_pose(stamp, at(x))
+        live.push_image(0.025, torch.zeros(3, 48, 64, dtype=torch.uint8))
         assert live.wait_idle(20)
     (result,) = results
+    assert live.statistics.poses == 3
     np.testing.assert_allclose(result.T_world_cam, at(0.25), atol=1e-12)
     assert result.out.depth.shape == (1, 48, 64)
     assert bool((result.out.variance > 0).any())
@@ -155,37 +164,21 @@ def test_why_images_are_skipped(model, caplog):
     assert caplog.text.count(BACKWARDS) == 1
 
 
-def test_poses_in_any_order_and_replaced(model):
-    results = []
-    with LiveDepth(model, results.append, K) as live:
-        live.push_pose(0.1, at(1))
-        live.push_pose(0.0, at(5))
-        live.push_pose(0.0, at(0))
-        live.push_image(0.05, torch.zeros(3, 48, 64, dtype=torch.uint8))
-        assert live.wait_idle(20)
-    assert results[0].T_world_cam[0, 3] == pytest.approx(0.5)
-    assert live.statistics.poses == 3
-
-
 def test_a_reset_forgets_views_and_times(model):
     results = []
     with LiveDepth(model, results.append, K, max_wait=0.02) as live:
-        live.push_pose(9, at(0))
-        live.push_image(9, PICTURE)
-        assert live.wait_idle(20)
+        show(live, 9)
         live.reset()
         live.push_image(1, PICTURE)  # the old pose would be no help, and is gone
         assert live.wait_idle(20)
-        live.push_pose(2, at(0))
-        live.push_image(2, PICTURE)
-        assert live.wait_idle(20)
+        show(live, 2)
     assert stamps(results) == [9, 2]
     assert live.statistics.skipped == {LATE: 1}
     assert int(model.image_index) == 1
 
 
 def test_a_reset_after_an_image_was_taken_holds_for_the_next_one(model):
-    """The image that is computed then is still of the old poses."""
+    """The image that is being computed belongs to the old poses."""
     with LiveDepth(model, lambda _: None, K) as live:
         process = live._process
 
@@ -195,10 +188,8 @@ def test_a_reset_after_an_image_was_taken_holds_for_the_next_one(model):
             return process(*chosen)
 
         live._process = reset_first
-        for stamp in (0, 1):
-            live.push_pose(stamp, at(0))
-            live.push_image(stamp, PICTURE)
-            assert live.wait_idle(20)
+        show(live, 0)
+        show(live, 1)
     assert int(model.image_index) == 1
 
 
@@ -327,9 +318,7 @@ def test_impossible_settings_are_refused(model, tmp_path):
 def test_the_state_goes_on_where_it_ended(model, network, tmp_path):
     with LiveDepth(model, lambda _: None, K, state=tmp_path / "state.pt", save_every=0) as live:
         for n in range(3):
-            live.push_pose(n, at(n / 100))
-            live.push_image(n, PICTURE)
-            assert live.wait_idle(20)
+            show(live, n, x=n / 100)
     assert live.statistics.saved == 3
     again = UncertainDepth(Network())
     again.load_state_dict(torch.load(tmp_path / "state.pt"))
@@ -345,9 +334,7 @@ def test_the_state_goes_on_where_it_ended(model, network, tmp_path):
 def test_a_state_that_cannot_be_written_is_an_error(model, tmp_path):
     (tmp_path / "state.pt").mkdir()
     live = LiveDepth(model, lambda _: None, K, state=tmp_path / "state.pt")
-    live.push_pose(0, at(0))
-    live.push_image(0, PICTURE)
-    assert live.wait_idle(20)
+    show(live, 0)
     with pytest.raises(OSError, match=r"state\.pt"):
         live.close()
 
@@ -357,9 +344,7 @@ def test_sigterm_saves_and_comes_again_to_the_handler_before(model, tmp_path):
     before = signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
     try:
         live = LiveDepth(model, lambda _: None, K, state=tmp_path / "state.pt", save_every=1e9, at_sigterm=True)
-        live.push_pose(0, at(0))
-        live.push_image(0, PICTURE)
-        assert live.wait_idle(20)
+        show(live, 0)
         assert not (tmp_path / "state.pt").exists()
         os.kill(os.getpid(), signal.SIGTERM)
         deadline = time.monotonic() + 20

@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import io
 import json
+import re
+import subprocess
 import sys
 import threading
 import time
@@ -17,10 +19,14 @@ import torch
 from demo_networks import write_members
 from layouts import quaternion_line, write_generic
 from PIL import Image
+from rerun_stand_in import stand_in
 
 from ufmstar_torch import cli
+from ufmstar_torch.eval.run import rerun_log
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
+
+__all__ = ["stand_in"]
 
 TOUR = "tour:3?frames=5&size=64x96"
 POSE = [1, 2, 3, 0, 0, 0, 1]
@@ -40,6 +46,17 @@ def ufmstar(capsys, weights):
         return code, *capsys.readouterr()
 
     return run
+
+
+def malicious(folder):
+    """A file of torch.save that makes FOLDER/ran when its objects are loaded."""
+
+    class Code:
+        def __reduce__(self):
+            return open, (str(folder / "ran"), "w")
+
+    torch.save({"ufm": Code()}, folder / "malicious.pt")
+    return (folder / "malicious.pt").read_bytes()
 
 
 def content(image):
@@ -75,7 +92,7 @@ def test_poses_are_read_as_their_lines_are_completed(tmp_path):
             events = list(poses.new())
             assert [event.stamp for event in events] == expected
             if expected == [1.5]:
-                np.testing.assert_allclose(events[0].T_world_cam[:3, 3], [-2, -4, -6])
+                np.testing.assert_allclose(events[0].T_world_cam[:3, 3], [-2, -4, -6], atol=1e-12)
         assert np.isnan(events[-1].T_world_cam).all()
         file.write("4 1 2 3\n")
         file.flush()
@@ -164,19 +181,31 @@ def test_a_recording_live(ufmstar, tmp_path):
     assert "UfM*'s share of the time" in err
     assert 0 < summary["ours_share"] < 1
     assert summary["latency_ms"]["p50"] <= summary["latency_ms"]["p99"]
+    assert (summary["program"], summary["state"]) == ("ufmstar live", "finished")
     with np.load(tmp_path / "out" / f"{lines[-1]['stamp']:.6f}.npz") as maps:
         assert maps["depth"].shape == maps["variance"].shape == (64, 96)
-        np.testing.assert_allclose(maps["T_world_cam"], open_sequence(TOUR)[-1].T_world_cam)
+        np.testing.assert_allclose(maps["T_world_cam"], open_sequence(TOUR)[-1].T_world_cam, atol=1e-12)
         assert float(np.median(maps["depth"])) == pytest.approx(lines[-1]["depth_m"], abs=1e-3)
     images = int(torch.load(tmp_path / "state.pt")["image_index"])
     assert images == summary["results"]
     code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt", "--speed", "0.2")
     assert code == 0, err
     assert int(torch.load(tmp_path / "state.pt")["image_index"]) > images  # it went on
-    (tmp_path / "state.pt").write_bytes(b"no state")
-    code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt")
+    before = sorted((tmp_path / "out").iterdir())
+    code, _, err = ufmstar(TOUR, "--out", tmp_path / "out")
     assert code == 2
-    assert "cannot be continued" in err
+    assert f"--out {tmp_path / 'out'} holds an earlier live run: --overwrite replaces it" in err
+    assert sorted((tmp_path / "out").iterdir()) == before
+    assert ufmstar("tour:4?frames=2&size=64x96", "--out", tmp_path / "out", "--overwrite")[0] == 0
+    assert not any((tmp_path / "out" / f"{line['stamp']:.6f}.npz").exists() for line in lines[2:])
+    for content, text in ((b"no state", "it begins with b'no state'"), (malicious(tmp_path), "never loaded because")):
+        (tmp_path / "state.pt").write_bytes(content)
+        code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt")
+        assert code == 2
+        assert "cannot be continued" in err
+        assert text in err
+        assert "weights_only" not in err, "torch's advice is to run the code"
+        assert not (tmp_path / "ran").exists()
 
 
 def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):
@@ -228,11 +257,11 @@ def test_a_folder_that_grows_live(ufmstar, tmp_path):
     [
         ("0", "0 needs --trajectory FILE"),
         ("images --follow --intrinsics 1 1 1 1", "images needs --trajectory FILE"),
+        ("- --overwrite", "--overwrite goes with --out"),
         ("- --drive 3", "--drive goes with recordings, not with -"),
         ("tour:3 --speed 0", "--speed must be positive"),
         ("tour:3 --scale-from network", "--scale-from goes with ufmstar run"),
         ("tour:3 --ufm.anchors.half_life 5", "needs --anchors"),
-        ("nowhere", "no such file or folder: nowhere"),
         ("{images}", "has no known layout"),
     ],
 )
@@ -247,3 +276,40 @@ def test_refusals(ufmstar, tmp_path, words, text):
 def test_a_network_is_needed(capsys):
     assert cli.main(["live", TOUR]) == 2
     assert "live needs a network" in capsys.readouterr().err
+
+
+_VIEWER = """
+import socket, sys
+host, port = (sys.argv[sys.argv.index(option) + 1] for option in ("--bind", "--port"))
+with socket.create_server((host, int(port))) as server:
+    server.accept()
+    server.accept()
+"""
+
+
+@pytest.mark.parametrize("display", [True, False])
+def test_a_viewer_shows_the_results_on_this_computer_alone(ufmstar, stand_in, monkeypatch, display):
+    started, start = [], subprocess.Popen
+
+    def viewer(words, **how):
+        assert words[words.index("--bind") + 1] == "127.0.0.1"
+        assert words[1:3] == ["-m", "rerun_cli"]
+        started.append(start([sys.executable, "-c", _VIEWER if display else "", *words[3:]], **how))
+        return started[0]
+
+    monkeypatch.setattr(rerun_log.subprocess, "Popen", viewer)
+    code, out, err = ufmstar(TOUR, "--view", "--speed", "0.2")
+    started[0].terminate()
+    started[0].wait(10)
+    if not display:
+        assert code == 2
+        assert "rerun's viewer does not start: is there a display?" in err
+        return
+    assert code == 0, err
+    (address,) = [words[0] for name, words, _ in stand_in.calls if name == "connect_grpc"]
+    assert address.startswith("rerun+http://127.0.0.1:")
+    (count,) = re.findall(r"(\d) of 5 images", out)
+    depths, images = stand_in.logged("world/camera/maps/depth"), stand_in.logged("world/camera/image/rgb")
+    assert len(depths) == len(images) == len(stand_in.logged("plots/latency_ms")) == int(count)
+    assert images[0].words[0].shape == (64, 96, 3)
+    assert depths[0].words[0].dtype == np.uint16

@@ -15,7 +15,7 @@ from random_gaussians import as_lists, covariances, mixture
 import scenes
 from ufmstar_torch import AnchorConfig, MergeConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.kernels.select import select_merge
-from ufmstar_torch.merge import merge, merged
+from ufmstar_torch.merge import merge
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import regress
 
@@ -119,19 +119,6 @@ def test_the_limit_is_the_divergence_of_the_lighter_from_the_heavier(backend, st
     assert int(merge_one(two, backend, share=0.0).components) == (1 if step < 0 else 2)
 
 
-def test_equal_weights_have_a_closed_form():
-    """Two equal shapes at distance d: |Sigma| = (1 + d^2 / 4 sigma^2) |Sigma_i|, l = log(1 + d^2 / 4 sigma^2)."""
-    for factor, left in ((0.999, 1), (1.001, 2)):
-        d = factor * 0.1 * 2 * math.sqrt(math.e - 1)
-        two = one([[0.0, 0.0, 2.0], [d, 0.0, 2.0]], [0.01, 0.01], [50.0, 50.0], [0.1, 0.3], [2, 3])
-        after = merge_one(two, share=0.0)
-        assert int(after.components) == left
-        if left == 1:
-            assert after.count[0, 0] == 4
-            assert after.disagreement[0, 0] == pytest.approx(0.2)
-            assert after.covariance[0, 0, 0, 0] == pytest.approx(0.01 + d**2 / 4)
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_what_was_seen_from_one_view_stays_unmeasured(backend):
     """Two first views that join were compared with nothing, and a measured component does not join a heavier one of
@@ -219,11 +206,3 @@ def test_a_walk_merges_when_due_and_goes_on_from_a_saved_state():
     again = walk(config, 12, 24, walk(config, 0, 12).state_dict())
     for name, value in merging.state_dict().items():
         assert torch.equal(again.state_dict()[name], value), name
-
-
-def test_a_skipped_frame_merges_nothing():
-    state = walk(UfMStarConfig(), 0, 4).state
-    config = UfMStarConfig(merge=MergeConfig(every=4))
-    kernels = select_merge("torch", "cpu")
-    assert merged(state, torch.tensor([False]), config, kernels) is state
-    assert merged(state, torch.tensor([True]), config, kernels) is not state

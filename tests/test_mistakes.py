@@ -18,7 +18,6 @@ from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.eval.check.image_fit import depth_fit, image_fit, track_corners
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import check_intrinsics
-from ufmstar_torch.models import Preprocess
 
 H, W = 48, 64
 K = scenes.intrinsics(H, W)
@@ -34,7 +33,7 @@ def scaled(T, factor):
 
 
 def said(caplog, change=lambda T: T, config=CONFIG, anchors=None, frames=WALK):
-    """What the logger got from a walk before rendered boxes, two streams of which the second has right poses."""
+    """Warnings during a walk before rendered boxes, with two streams of which the second has right poses."""
     caplog.clear()
     ufm = UfMStar(config)
     for T in frames:
@@ -137,7 +136,7 @@ def followed(name):
 
 
 def problems(name, change=same, spoil=same):
-    """What is said of a sequence with changed poses or intrinsics and spoilt depth."""
+    """The problem that is found in a sequence with changed poses or intrinsics and spoilt depth."""
     sequence, corners, depth = followed(name)
     try:
         sequence = change(sequence)
@@ -150,17 +149,15 @@ def problems(name, change=same, spoil=same):
     return "" if depths is None else depths.problem
 
 
-@pytest.mark.parametrize("name", [*RECORDINGS, *(pytest.param(tour, marks=pytest.mark.slow) for tour in TOURS)])
+@pytest.mark.parametrize("name", RECORDINGS)
 def test_right_input_raises_no_alarm(name):
     assert problems(name) == ""
 
 
-@pytest.mark.parametrize("name", [RECORDINGS[0], pytest.param(TOURS[0], marks=pytest.mark.slow)])
-def test_each_mistake_is_named(name):
-    missed = [
-        m for m, (change, spoil, words) in MISTAKES.items() if not re.search(words, problems(name, change, spoil))
-    ]
-    assert [one for one in missed if name == RECORDINGS[0] or one not in LATE] == []
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_each_mistake_is_named(mistake):
+    change, spoil, words = MISTAKES[mistake]
+    assert re.search(words, problems(RECORDINGS[0], change, spoil))
 
 
 def rigid(R, t):
@@ -214,8 +211,3 @@ def test_in_how_many_clips_each_mistake_is_named():
         else:
             assert found[0] == len(RECORDINGS), mistake
             assert found[1] >= LATE.get(mistake, len(TOURS)), mistake
-
-
-def test_images_of_another_range_are_refused():
-    with pytest.raises(ValueError, match=r"must lie in \[0, 1\], got \[0, 255\]"):
-        Preprocess(size=(24, 32))(torch.linspace(0, 255, 3 * 48 * 64).reshape(1, 3, 48, 64), torch.tensor(K))

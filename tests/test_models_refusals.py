@@ -1,4 +1,4 @@
-"""What the networks' settings and calls refuse: the call, the exception, and the argument that the message names."""
+"""Refusals of the networks' settings and calls: the call, and the argument that the message names."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from torch import nn
 
 from ufmstar_torch.models import (
     AleatoricNetwork,
+    AlignedNetwork,
     Alignment,
     BatchEnsemble,
     DecoderDropout,
@@ -145,6 +146,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: batch_ensemble().distribution(IMAGE, 3), "member"),
     (lambda: Inference("onnx", "bf16"), "precision"),
     (lambda: Inference("tensorrt"), "runtime"),
+    (lambda: AlignedNetwork(nn.Conv2d(3, 1, 1, 2), Alignment("affine", 1.0, 0.0))(IMAGE), "network must return"),
     (lambda: Alignment("metric", 1.0, 0.0), "kind"),
     (lambda: Alignment("inverse", 0.0, 0.0), "scale"),
     (lambda: Alignment("inverse", NAN, 0.0), "scale"),

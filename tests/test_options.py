@@ -8,14 +8,13 @@ from typing import Any
 
 import pytest
 
-from ufmstar_torch import cli
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.options import as_dict, fields_of, option, parse, positional
 
 
 @dataclass(frozen=True)
 class _Output:
-    """Where it goes.
+    """Folders.
 
     Attributes:
         out: folder of the results.
@@ -145,30 +144,6 @@ def test_a_file_that_is_no_configuration(text, tmp_path):
     assert "\n" not in str(refused.value)
 
 
-_BOMB = "a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
-    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 10)
-)
-
-
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ("[" * 200_000, "nested deeper than 50 levels"),
-        ("out: " + "{a: " * 200_000, "nested deeper than 50 levels"),
-        (_BOMB, "more than 100,000 values"),
-        ("a: &a [*a]\n", "more than 100,000 values"),
-        ("out: " + "x" * 1_000_001, "larger than 1,000,000 bytes"),
-    ],
-)
-def test_a_configuration_has_limits(text, reason, tmp_path):
-    file = tmp_path / "bomb.yaml"
-    file.write_text(text)
-    with pytest.raises(ValueError, match=rf"bomb\.yaml.* {reason}"):
-        _parse(f"seq --out o --config {file}")
-    with pytest.raises(ValueError, match=reason):
-        parse(_Options, ["seq", "--out", "o", "--config", text], "prog")
-
-
 def test_help_has_the_attributes_texts(capsys):
     with pytest.raises(SystemExit) as ended:
         _parse("--help-all")
@@ -176,7 +151,7 @@ def test_help_has_the_attributes_texts(capsys):
     text = " ".join(capsys.readouterr().out.split())
     for expected in (
         "Do something with a sequence.",
-        "Where it goes: --out",
+        "Folders: --out",
         "--fps FPS frames per second, over two lines.",
         "--rate RATE frames per second, over two lines.",
         "--no-video leave the video out.",
@@ -184,25 +159,3 @@ def test_help_has_the_attributes_texts(capsys):
         "v_min [m^2], [0, inf]",
     ):
         assert expected in text
-
-
-def test_the_short_help_leaves_out_the_settings(capsys):
-    with pytest.raises(SystemExit):
-        cli.main(["run", "--help"])
-    text = capsys.readouterr().out
-    assert "--ufm.eta" not in text
-    assert "--ufm.segment.sparse" not in text
-    assert "--help-all" in text
-    assert "--ufm-preset" in text
-    assert len(text.splitlines()) < 150
-    assert _parse("seq --out o --ufm.eta .25").ufm["eta"] == 0.25
-
-
-def test_the_help_of_a_flag_names_no_default(capsys):
-    """--no-register would have "(default: True)", that of the field that it switches off."""
-    with pytest.raises(SystemExit):
-        cli.main(["run", "--help"])
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "--no-register leave 7-Scenes' depth in its own camera --T-color-depth" in printed
-    assert "(default: True)" not in printed
-    assert "leave preview.mp4 out --no-sheet" in printed

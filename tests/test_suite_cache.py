@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from layouts import truncate, write_generic, write_image
-from tiny_suite import CPU, base_network, evaluate, row, same, write_networks
+from tiny_suite import CPU, base_network, evaluate, row, same
 
 from ufmstar_torch.eval.engine.predictions import Predicted, frame_digest, sequence_digest
 from ufmstar_torch.eval.sequences import open_sequence
@@ -17,7 +17,7 @@ from ufmstar_torch.eval.suite.cache import CacheError, PredictionCache
 from ufmstar_torch.prediction import DepthPrediction
 
 ROWS = [row(name) for name in ("Ensemble", "UfM*-Ensemble", "UfM*-MCD", "MC-Dropout", "Evidential", "UfM-DepthOnly")]
-PATH, CONTENT = Path("network", "sequence", "frame-7@all.maps"), "c" * 64
+PATH, CONTENT = Path("network", "sequence", "frame-7@all.npz"), "c" * 64
 
 
 @pytest.fixture(scope="module")
@@ -26,10 +26,8 @@ def path(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def networks(tmp_path_factory):
-    written = write_networks(tmp_path_factory.mktemp("networks"))
-    expected = {one.method.base for one in ROWS}
-    return {base: base_network(text, samples=3) for base, text in written.items() if base in expected}
+def networks(network_files):
+    return {base: base_network(network_files[base], samples=3) for base in {one.method.base for one in ROWS}}
 
 
 def maps(seed=0):
@@ -69,7 +67,7 @@ def test_what_is_stored_is_read_bit_for_bit(tmp_path, left_out):
 def test_path_and_content_matter(tmp_path):
     cache = Counted(tmp_path)
     cache.store(PATH, CONTENT, maps())
-    assert cache.load(PATH.with_name("frame-7@0.maps"), CONTENT, CPU) is None
+    assert cache.load(PATH.with_name("frame-7@0.npz"), CONTENT, CPU) is None
     assert cache.load(PATH, "d" * 64, CPU) is None
     assert (cache.hits, cache.misses) == (0, 2)
 
@@ -87,7 +85,6 @@ def test_a_damaged_file_is_noticed_and_replaced(tmp_path, damage):
     assert cache.load(PATH, CONTENT, CPU) is None
     cache.store(PATH, CONTENT, maps())
     assert cache.load(PATH, CONTENT, CPU) is not None
-    assert file.read_bytes()[32:] == content[32:]
 
 
 def test_two_who_write_the_same_do_no_harm(tmp_path):

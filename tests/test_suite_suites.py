@@ -13,7 +13,7 @@ from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.methods.method import BASES, MANY, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.methods.setting import configured, default_of
-from ufmstar_torch.eval.methods.suite import Suite, names, suite_named
+from ufmstar_torch.eval.methods.suite import names, suite_named
 from ufmstar_torch.eval.report.data import listed_rows
 from ufmstar_torch.eval.report.names import row_labels
 
@@ -30,7 +30,7 @@ TABLE_3 = "UfM-DepthOnly-300K UfM*-DepthOnly-fixed-param UfM*-DepthOnly"
 
 
 def value_of(row, name):
-    """What a row sets a name to, or UfM*'s own value."""
+    """Return the value that a row gives to a name, or UfM*'s own."""
     changed = row.setting.to_dict()
     return changed[name] if name in changed else default_of(name, row.setting.ufm_preset)
 
@@ -85,23 +85,14 @@ def test_one_preset_for_all_rows():
     assert {"none", "both", "either"} == {configured(r.setting).segment.prune for r in rows[1:]}
     tried = {configured(r.setting).regression for r in suite_named("ablation-regression", preset="paper").rows[1:]}
     assert tried == {"exact", "neighbourhood"}
-    with pytest.raises(ValueError, match="ufm_preset must be"):
-        suite_named("paper-table-1", preset="papers")
 
 
 def test_every_suite_can_be_made_for_every_base():
     for name in names():
         assert suite_named(name).name == name
         if name == "anchors" or name.startswith(("ablation", "paper-figure")):
-            for base in BASES:
-                if name == "ablation-no-alternating" and base not in MANY:
-                    with pytest.raises(ValueError, match="no rows of"):
-                        suite_named(name, base)
-                else:
-                    assert suite_named(name, base).bases == (base,)
-        else:
-            with pytest.raises(ValueError, match="--base goes with figures"):
-                suite_named(name, "depth_only")
+            for base in MANY if name == "ablation-no-alternating" else BASES:
+                assert suite_named(name, base).bases == (base,)
 
 
 def test_figures_vary_what_the_paper_varies():
@@ -109,7 +100,6 @@ def test_figures_vary_what_the_paper_varies():
     assert [row.method.name for row in noise.rows] == ["Ensemble"] + ["UfM*-Ensemble"] * 22
     assert [r.setting.rotation_noise for r in noise.rows[1:13]] == [0.0, 0.5, 1.0, 2.0, 5.0, 10.0] * 2
     assert [r.setting.translation_noise for r in noise.rows[13:]] == [0.01, 0.02, 0.05, 0.1, 0.2] * 2
-    assert noise.sweep == ("rotation_noise", "translation_noise")
     overlap = suite_named("paper-figure-overlap")
     # Both are judged on the same frames: the figure shows their difference.
     assert [(r.setting.skip, r.method.name) for r in overlap.rows] == [
@@ -130,37 +120,21 @@ def test_figures_vary_what_the_paper_varies():
 def test_an_ablation_tries_the_default_and_others_against_the_base_alone(name, field):
     suite = suite_named(f"ablation-{name}", "depth_only")
     assert suite.rows[:2] == rows_of("DepthOnly", "UfM*-DepthOnly")
-    assert field in suite.sweep
     tried = {value_of(row, field) for row in suite.rows[1:]}
     assert len(tried) > 1
     assert getattr(UfMStarConfig(), field) in tried
-
-
-def test_impossible_suites():
-    rows = rows_of("Ensemble")
-    with pytest.raises(ValueError, match="has a row twice: Ensemble"):
-        Suite("x", "", rows * 2)
-    with pytest.raises(ValueError, match="at least one row"):
-        Suite("x", "", ())
-    with pytest.raises(ValueError, match="small letters"):
-        Suite("../x", "", rows)
-    with pytest.raises(ValueError, match="no setting is called 'etta'"):
-        Suite("x", "", rows, sweep=("etta",))
 
 
 def test_rows_without_a_network_are_left_out():
     left = suite_named("paper-table-1").with_bases(["aleatoric", "depth_only"])
     assert left.bases == ("aleatoric",)
     assert len(left.rows) == 5
-    with pytest.raises(ValueError, match="there are networks of depth_only only"):
-        suite_named("paper-table-1").with_bases(["depth_only"])
 
 
 # ---- TOML ----
 
 TOML = """
 title = "Smoothing"
-sweep = ["ema_alpha"]
 [[rows]]
 methods = ["Ensemble", "UfM*-Ensemble"]
 [[rows]]
@@ -200,7 +174,7 @@ methods = ["Ensemble"]
 def test_a_suite_from_a_file(tmp_path):
     (tmp_path / "my-own.toml").write_text(TOML)
     suite = suite_named(str(tmp_path / "my-own.toml"))
-    assert (suite.name, suite.title, suite.sweep) == ("my-own", "Smoothing", ("ema_alpha",))
+    assert (suite.name, suite.title) == ("my-own", "Smoothing")
     assert suite.rows[:2] == rows_of("Ensemble", "UfM*-Ensemble")
     assert [row.setting.to_dict() for row in suite.rows[2:]] == [
         {"ema_alpha": alpha, "segment.min_pixels": 2000, **({"skip": skip} if skip else {})}
@@ -209,23 +183,21 @@ def test_a_suite_from_a_file(tmp_path):
     ]
 
 
-def test_a_file_names_bases_multiples_and_other_suites(tmp_path):
+def test_a_file_names_bases_and_other_suites(tmp_path):
     (tmp_path / "mine.toml").write_text("""
 base = "ensemble"
 include = ["ablation-eta", "ablation-no-alternating"]
-sweep = ["segment.line_thresh"]
 [[rows]]
 bases = ["aleatoric"]
 methods = ["{alone}", "UfM*-{behind}"]
 [[rows]]
 methods = ["UfM*-{behind}", "UfM*-{behind}"]
-multiples = { "segment.line_thresh" = [1.0, 2.0] }
+each = { "segment.line_thresh" = [0.3, 0.6] }
 """)
     suite = suite_named(str(tmp_path / "mine.toml"), "aleatoric")
     twice = {"segment.line_thresh": 2 * UfMStarConfig().segment.line_thresh}
     assert suite.rows[:3] == (*rows_of("Aleatoric", "UfM*-Aleatoric"), *rows_of("UfM*-Aleatoric", overrides=twice))
     assert set(suite.rows[3:]) == set(suite_named("ablation-eta", "aleatoric").rows[2:])
-    assert suite.sweep == ("segment.line_thresh", "eta")
     own = suite_named(str(tmp_path / "mine.toml"))
     assert [row.method.name for row in own.rows[:2]] == ["UfM*-Ensemble"] * 2
     assert "UfM*-FullEnsemble" in {row.method.name for row in own.rows}

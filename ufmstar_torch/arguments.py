@@ -87,7 +87,9 @@ def as_pose(pose: CameraLike) -> Tensor:
     if T.dim() in (2, 3) and T.shape[-2:] == (3, 4):
         return torch.cat([T, T.new_tensor([[0.0, 0.0, 0.0, 1.0]]).expand(*T.shape[:-2], 1, 4)], dim=-2)
     if T.dim() not in (2, 3) or T.shape[-2:] != (4, 4):
-        raise ValueError(f"pose must be camera-to-world [B, 4, 4] or [4, 4], or [..., 3, 4], got {tuple(T.shape)}")
+        swapped = "; are these the intrinsics? The pose comes before them" if _of_intrinsics(T) else ""
+        expected = "camera-to-world [B, 4, 4] or [4, 4], or [..., 3, 4]"
+        raise ValueError(f"pose must be {expected}, got {tuple(T.shape)}{swapped}")
     return T
 
 
@@ -113,6 +115,11 @@ def as_intrinsics(intrinsics: CameraLike) -> Tensor:
     if K.dim() not in (2, 3) or K.shape[-2:] != (3, 3):
         raise ValueError(f"intrinsics must be [B, 3, 3], [3, 3] or fx, fy, cx, cy, got {tuple(K.shape)}")
     return K
+
+
+def _of_intrinsics(values: Tensor) -> bool:
+    """Whether the shape is that of intrinsics and of no pose."""
+    return values.shape == (4,) or values.shape[-2:] == (3, 3)
 
 
 def _camera(value: object) -> PinholeCamera | None:

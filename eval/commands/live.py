@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import pickle
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields
 from itertools import takewhile
 from pathlib import Path
@@ -20,13 +19,17 @@ from ufmstar_torch.eval.commands.run import NetworkOptions, UfMOptions, read_ufm
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ufmstar_torch.eval.engine.realtime import RealTime
     from ufmstar_torch.eval.sequences.live import LiveEvent
     from ufmstar_torch.live import LiveDepth, LiveResult
     from ufmstar_torch.pipeline import UncertainDepth
 
-_STANDARD_INPUT = "-"
-# What a source that is no recording takes, of the options for opening.
+    _View = Callable[[LiveResult, dict[str, float]], None]
+
+_STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
+# Options for opening that also go with a source that is no recording.
 _OF_LIVE = ("intrinsics", "trajectory", "poses", "pose_scale", "max_pose_gap")
 
 
@@ -49,6 +52,8 @@ class LiveOptions:
         state: file in which the state is kept, and from which it goes on
         save_every: of the state [s]
         out: folder for realtime.json and a .npz with depth, variance, disagreement, pose and intrinsics per image
+        overwrite: replace the results in --out
+        view: show the images, depth and plots in rerun, on this computer alone
         json: print a line of JSON per image instead of the status
         device: cpu, cuda or cuda:N
         threads: number of CPU threads of network and step; default: all cores but one
@@ -66,6 +71,8 @@ class LiveOptions:
     state: Path | None = None
     save_every: float = 10.0
     out: Path | None = None
+    overwrite: bool = False
+    view: bool = False
     json: bool = False
     device: str = "cpu"
     threads: int | None = None
@@ -82,6 +89,8 @@ class LiveOptions:
                 raise ValueError(f"--{name} must be positive, got {getattr(self, name)}")
         if self.network.model is None or not self.network.weights:
             raise ValueError("live needs a network: --model NAME --weights FILE")
+        if self.overwrite and self.out is None:
+            raise ValueError("--overwrite goes with --out")
         if self.uncertainty.scale_from is not None:
             raise ValueError("--scale-from goes with ufmstar run, which sees the whole recording")
         if self.recorded:
@@ -95,7 +104,7 @@ class LiveOptions:
 
     @property
     def recorded(self) -> bool:
-        """Whether the source is a recording."""
+        """True if the source is a recording."""
         return not (self.follow or self.source == _STANDARD_INPUT or self.source.isdecimal())
 
 
@@ -109,27 +118,36 @@ def main(options: LiveOptions) -> int:
     from ufmstar_torch.eval.engine.realtime import RealTime
     from ufmstar_torch.eval.report.text import realtime_table
     from ufmstar_torch.eval.run.files import write_json_atomic
+    from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
     from ufmstar_torch.eval.run.machine import share_threads
 
     if options.threads is None:
         share_threads()
-    try:
-        events = _events(options)
-        model = _model(options)
+    kind = FolderKind("ufmstar live", "live run", _SUMMARY, remover("*.npz"), lock=".lock")
+    started = {"state": "started"}  # and not finished, which would allow the next run to replace it
+    with ExitStack() as held:
+        try:
+            if options.out is not None:
+                kind.earlier(options.out, resume=False, overwrite=options.overwrite)
+            events = _events(options)
+            model = _model(options)
+            view = _view() if options.view else None
+            if options.out is not None:
+                held.enter_context(OutputFolder.open(options.out, kind, started, overwrite=options.overwrite))
+        except (ImportError, OSError, RuntimeError, ValueError) as error:
+            raise UsageError(error) from error
+        times = RealTime(model)
+        live = _run(options, model, events, times, view)
+        summary = times.summary(live.statistics)
         if options.out is not None:
-            options.out.mkdir(parents=True, exist_ok=True)
-    except (ImportError, OSError, ValueError) as error:
-        raise UsageError(error) from error
-    times = RealTime(model)
-    live = _run(options, model, events, times)
-    summary = times.summary(live.statistics)
-    if options.out is not None:
-        write_json_atomic(options.out / "realtime.json", summary)
+            write_json_atomic(options.out / _SUMMARY, {"program": kind.program, "state": "finished", **summary})
     print(realtime_table(summary), file=sys.stderr if options.json else sys.stdout)
     return 0 if summary["results"] else 1
 
 
-def _run(options: LiveOptions, model: UncertainDepth, events: Iterator[LiveEvent], times: RealTime) -> LiveDepth:
+def _run(
+    options: LiveOptions, model: UncertainDepth, events: Iterator[LiveEvent], times: RealTime, view: _View | None
+) -> LiveDepth:
     """Push the events until they end, the time is over, or a signal comes."""
     from ufmstar_torch.live import LiveDepth
 
@@ -140,7 +158,13 @@ def _run(options: LiveOptions, model: UncertainDepth, events: Iterator[LiveEvent
         times.take(result)
         if options.out is not None:
             _write(options.out, result)
-        _say(result, live, times, as_json=options.json)
+        about = _figures(result, live)
+        if view is not None:
+            view(result, about)
+        if options.json:
+            print(json.dumps(about), flush=True)
+        elif len(times.latency) % 30 == 1:
+            print("  ".join(f"{name} {value}" for name, value in about.items()), file=sys.stderr, flush=True)
 
     how: dict[str, Any] = {"max_wait": options.max_wait, "max_gap": options.opening.max_pose_gap}
     with (
@@ -158,7 +182,7 @@ def _run(options: LiveOptions, model: UncertainDepth, events: Iterator[LiveEvent
 
 
 def _events(options: LiveOptions) -> Iterator[LiveEvent]:
-    """What the source yields; errors as ``open_sequence``."""
+    """The source's images and poses; errors as ``open_sequence``."""
     from ufmstar_torch.eval.sequences import live
     from ufmstar_torch.eval.sequences.open import open_sequence
 
@@ -186,6 +210,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
     from ufmstar_torch.eval.engine.progress import Progress
     from ufmstar_torch.eval.engine.warm_up import warm_up_command
     from ufmstar_torch.eval.run.make_job import recalibration_of
+    from ufmstar_torch.models.checkpoints import read_tensors
     from ufmstar_torch.models.inference import Inference
     from ufmstar_torch.pipeline import UncertainDepth
 
@@ -214,14 +239,16 @@ def _model(options: LiveOptions) -> UncertainDepth:
         )
     if options.state is not None and options.state.exists():
         try:
-            model.load_state_dict(torch.load(options.state, map_location=options.device, weights_only=True))
-        except (RuntimeError, ValueError, OSError, pickle.UnpicklingError) as error:
+            with options.state.open("rb") as file:
+                state = read_tensors(file, "it")
+            model.load_state_dict(state)
+        except (RuntimeError, TypeError, ValueError, OSError) as error:
             raise ValueError(f"--state {options.state} cannot be continued: {error}") from error
     return model
 
 
 def _anchors(value: bool | str) -> Path | Literal["corners", "dense"] | None:
-    """What ``--anchors`` means to ``UncertainDepth``."""
+    """The anchors of ``UncertainDepth`` that ``--anchors`` names."""
     if value is True or value == "corners":
         return "corners"
     return "dense" if value == "dense" else Path(value) if isinstance(value, str) else None
@@ -246,12 +273,35 @@ def _write(out: Path, result: LiveResult) -> None:
     write_atomic(out / f"{result.stamp:.6f}.npz", lambda file: np.savez(file, allow_pickle=False, **arrays, **camera))
 
 
-def _say(result: LiveResult, live: LiveDepth, times: RealTime, *, as_json: bool) -> None:
-    """A line of JSON for every image, or a status every 30 images."""
-    if not as_json and len(times.latency) % 30 != 1:
-        return
+def _view() -> _View:
+    """A function that shows results in a new viewer. Raises ModuleNotFoundError, RuntimeError: as ``open_viewer``."""
+    from itertools import count
+
+    import numpy as np
+    import torch
+
+    from ufmstar_torch.eval.run.export import Gated
+    from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
+
+    log, numbers = RerunLog(open_viewer()[0]), count()
+
+    def show(result: LiveResult, about: dict[str, float]) -> None:
+        out, valid = result.out, result.out.ufm.valid[0]
+        depth, sigma = (
+            torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std)
+        )
+        camera = (result.T_world_cam, out.intrinsics[0].cpu().double().numpy())
+        frame = Gated(f"{result.stamp:.6f}", next(numbers), result.stamp, *camera, depth, sigma)
+        plots = {name: value for name, value in about.items() if name != "stamp"}
+        log.add(frame, np.asarray(result.image), None, plots)
+
+    return show
+
+
+def _figures(result: LiveResult, live: LiveDepth) -> dict[str, float]:
+    """The figures of an image, and the counts so far."""
     depth, std, counts = result.out.depth, result.out.std, live.statistics
-    about = {
+    return {
         "stamp": round(result.stamp, 6),
         "latency_ms": round(1000 * result.latency, 2),
         "depth_m": round(float(depth.median()), 3),
@@ -260,10 +310,6 @@ def _say(result: LiveResult, live: LiveDepth, times: RealTime, *, as_json: bool)
         "dropped": sum(counts.dropped.values()),
         "skipped": sum(counts.skipped.values()),
     }
-    if as_json:
-        print(json.dumps(about), flush=True)
-    else:
-        print("  ".join(f"{name} {value}" for name, value in about.items()), file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -14,10 +14,13 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.choose import choose
 from ufmstar_torch.eval.engine.judge import UFM
+from ufmstar_torch.eval.engine.predictions import FramePredictions
 from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink
+from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.panels import FramePanel
 from ufmstar_torch.eval.run.pictures import panel_of
+from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.sample import sample_statistics
 
 # By what images are ranked: V, M, A, E or B, and the map of ``RowResult`` that has it.
@@ -70,13 +73,11 @@ class ImageScores(FrameSink):
         self._shown: list[_Shown] = []
 
     def take(self, result: FrameResult) -> None:
-        """Score an image. Raises ValueError: the network does not state the part that ranks the images."""
+        """Score an image."""
         row = result.rows.get(UFM)
         if row is None or result.frame is None:
             return
         parts = {name: _statistics(getattr(row, of), row) for name, of in PARTS.items() if getattr(row, of) is not None}
-        if self._by not in parts:
-            raise ValueError(f"--by {self._by}: there is none here, only {', '.join(parts)}")
         assert row.measured is not None
         share = float((row.measured >= 0.5)[row.valid].float().mean())
         score = parts[self._by]["mean"] if share >= self._measured else float("nan")
@@ -106,6 +107,21 @@ class ImageScores(FrameSink):
     def panels(self) -> Sequence[FramePanel]:
         """The most certain images and the least certain ones, the latter first."""
         return [one.panel for one in reversed(self._shown)]
+
+
+def require_part(job: RunJob, by: str) -> None:
+    """Raise a ValueError unless the images can be ranked ``by`` a part: the first readable frame is predicted."""
+    if by == "anchored" and job.config.anchors is None:
+        raise ValueError("--by anchored needs --anchors or --posterior")
+    for index in job.indices if by in ("aleatoric", "epistemic") else ():
+        try:
+            predicted = FramePredictions(job.sequence[index], job.device, None, "").of(job.source, 0, job.every).maps
+        except FrameError:
+            continue
+        if {"aleatoric": predicted.aleatoric_variance, "epistemic": predicted.epistemic_variance}[by] is None:
+            source = "the network states" if job.source.networks else "the depth comes with"
+            raise ValueError(f"--by {by}: {source} no {by} variance")
+        return
 
 
 def _statistics(values: torch.Tensor, row: RowResult) -> dict[str, float]:

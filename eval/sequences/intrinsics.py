@@ -37,7 +37,9 @@ def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
 
 def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | None:
     """Words of a command line as :func:`read_intrinsics` takes them: a file, or fx, fy, cx, cy [px]; None for no words.
-    Raises ValueError: neither; the message names ``option``."""
+    Raises ValueError: neither, or no such file; the message names ``option``."""
+    if len(words) == 1 and not Path(words[0]).is_file():
+        raise ValueError(f"{option}: no such file: {words[0]}")
     if len(words) <= 1:
         return words[0] if words else None
     try:
