@@ -68,6 +68,12 @@ class TestContactSheet:
             expected = {tuple(c) for c in scales["depth"].rgb(one.maps["depth"]).reshape(-1, 3).tolist()}
             assert len(expected & shown) > 0.95 * len(expected)
 
+    def test_sigma_and_error_share_a_scale(self) -> None:
+        one = panel()  # the error is twice sigma
+        length = fit_scales([one])["length"]
+        assert length.high == pytest.approx(np.percentile(2 * one.maps["sigma"][4:], 99))
+        assert [column.scale for column in map_columns([one])[1:]] == [length, length]
+
     def test_a_small_sigma_of_the_posterior_is_not_black_beside_the_networks_errors(self) -> None:
         one = panel()
         small = {name: one.maps[of] / 10 for name, of in (("posterior_sigma", "sigma"), ("posterior_error", "error"))}
