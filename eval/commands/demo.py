@@ -25,7 +25,7 @@ class DemoOptions:
     """The method on rendered rooms, without data or weights.
 
     Walks through rendered rooms with small depth networks that come with the package, compares their own variance with
-    UfM's and UfM*'s, and makes the report of an evaluation. Nothing else is needed; two minutes on two cores.
+    UfM's and UfM*'s, and makes the report of an evaluation. Nothing else is needed; one to two minutes on two cores.
 
     Attributes:
         out: folder for the results
