@@ -18,9 +18,6 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences.open import open_sequence
 
 
-@pytest.fixture(scope="module")
-def tour():
-    return walk()
 
 
 def test_after_a_jump_of_the_poses_landmarks_from_before_are_not_believed(tour):

@@ -18,9 +18,6 @@ INT8 = "weights/fastdepth_nyu_int8.tflite"
 METRIC = {"outputs": {"kind": "metric"}}
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory):
-    return write_fastdepth(tmp_path_factory.mktemp("onnx") / "small.onnx", small_network(), 224)
 
 
 def test_fastdepth_runs_in_onnx_runtime_unless_asked_otherwise(weights):
