@@ -15,7 +15,7 @@ from random_gaussians import as_lists, covariances, mixture
 import scenes
 from ufmstar_torch import AnchorConfig, MergeConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.kernels.select import select_merge
-from ufmstar_torch.merge import merge
+from ufmstar_torch.merge import merge, merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import regress
 
@@ -206,3 +206,10 @@ def test_a_walk_merges_when_due_and_goes_on_from_a_saved_state():
     again = walk(config, 12, 24, walk(config, 0, 12).state_dict())
     for name, value in merging.state_dict().items():
         assert torch.equal(again.state_dict()[name], value), name
+
+
+def test_a_skipped_frame_merges_nothing():
+    state = walk(UfMStarConfig(), 0, 4).state
+    config, kernels = UfMStarConfig(merge=MergeConfig(every=4)), select_merge("torch", "cpu")
+    assert merged(state, torch.tensor([False]), config, kernels) is state
+    assert merged(state, torch.tensor([True]), config, kernels) is not state
