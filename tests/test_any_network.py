@@ -131,7 +131,7 @@ class Metric(nn.Module):
 
 @pytest.mark.parametrize("around", ["wrapped", "declared", "ensemble", "lazy", "samples", "batched", "aligned"])
 def test_the_intrinsics_pass_through_every_wrapper(image: Tensor, around: str) -> None:
-    """Whatever contains a network that takes intrinsics takes them as well and passes them on, in single precision."""
+    """Every wrapper takes the intrinsics and passes them on, in single precision."""
     inner: DepthNetwork = wrap_network(Metric())
     networks: dict[str, Callable[[], DepthNetwork]] = {
         "wrapped": lambda: inner,

@@ -67,7 +67,7 @@ def variances(config, unit, count=12, **how):
 
 
 def test_values_against_the_oracle():
-    """Over frames, from before the first anchor until it is used; V without the confidence is the plain module's."""
+    """Frames run from before the first anchor until it is used; V without the confidence is the plain module's."""
     state, plain = oracle.start(), variances(PLAIN, None, count=14)[0]
     maps, _ = variances(CONFIG, lambda sigma: 1 / (1 + sigma), count=14)
     for out, before, (depth, sigma, given, _, at) in zip(maps, plain, frames(14), strict=True):
@@ -112,7 +112,7 @@ def test_what_says_nothing_is_ignored(kind):
 
 
 def test_what_the_confidence_meant_is_forgotten():
-    """It is inverted in the middle: soon ignored, later used again the other way round."""
+    """A confidence that is inverted in the middle is soon ignored, and later used the other way round."""
     ufm, used = UfMStar(CONFIG), []
     for i, (depth, sigma, given, T, _) in enumerate(frames(60, dtype=torch.float32)):
         out = ufm(depth, T, K, anchors=given, confidence=sigma.float() if i < 20 else -sigma.float())
@@ -250,7 +250,7 @@ def test_the_commands_pass_it(tmp_path, capsys):
 
 
 class Tuple(nn.Module):
-    """As :class:`Stated`, without names."""
+    """Returns the values of :class:`Stated` without names."""
 
     def forward(self, x):
         return 1 + x.mean(1), x[:, 0]

@@ -121,7 +121,7 @@ def test_heads_at_four_scales_as_the_paper_has_them(method: str, size: int) -> N
 
 @pytest.mark.parametrize("method", ["aleatoric", "evidential"])
 def test_coarse_heads_learn_and_do_not_predict(method: str) -> None:
-    """In training four predictions per image with one depth; in eval mode the network with one head, to the bit."""
+    """Training has four predictions per image with one depth; eval mode is the network with one head, to the bit."""
     network = with_head(small_network(), method, 4)
     single = with_head(network.backbone, method).eval()
     single.head.load_state_dict(network.head.state_dict())

@@ -148,7 +148,7 @@ def test_a_superseded_component_is_dissolved_and_a_lonely_one_is_not(backend):
 @given(st.integers(0, 10**6))
 @settings(max_examples=8)
 def test_the_map_stays_within_the_stated_bound_where_components_are_dissolved(seed):
-    """At a dissolved component's own point a feature in [0, 1] moves by little more than its share; joining is off."""
+    """A feature in [0, 1] at a dissolved component's own point moves by little more than its share; joining is off."""
     before, _ = crowd(seed)
     config = UfMStarConfig(merge=MergeConfig(loss=1e-9, share=0.05), features=2)
     after, _ = merge(before, before.mean.new_zeros(*before.weight.shape, 0), ALL, config, select_merge("torch", "cpu"))
