@@ -254,30 +254,3 @@ class Tuple(nn.Module):
 
     def forward(self, x):
         return 1 + x.mean(1), x[:, 0]
-
-
-REFUSED = {
-    "a confidence as a spread": (
-        lambda: wrap_network(Stated(), "depth", aleatoric="conf", aleatoric_kind="confidence"), "declare it as conf"
-    ),
-    "a confidence of another size": (
-        lambda: DepthPrediction(torch.ones(1, 4, 4), confidence=torch.ones(1, 2, 2)), "confidence must have the depth's"
-    ),
-    "a confidence that is not used": (
-        lambda: UfMStar()(torch.ones(1, 4, 4), torch.eye(4), torch.eye(3), confidence=torch.ones(1, 4, 4)),
-        "confidence must be None where",
-    ),
-    "a section without anchors": (
-        lambda: UfMStarConfig(confidence=ConfidenceConfig()), "UfMStarConfig.confidence needs anchors"
-    ),
-    "whole numbers": (
-        lambda: UfMStar(CONFIG)(torch.ones(1, 4, 4), torch.eye(4), torch.eye(3), confidence=torch.ones(1, 4, 4).int()),
-        "confidence must have a floating-point",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("call", "message"), REFUSED.values(), ids=REFUSED)
-def test_refusals(call, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        call()
