@@ -9,7 +9,7 @@ CC BY-NC 4.0: not for commercial use.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -20,9 +20,6 @@ from ufmstar_torch.models.alignment import Alignment
 from ufmstar_torch.models.checkpoints import CheckpointError
 from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
 from ufmstar_torch.models.network import DepthNetwork
-
-# The published checkpoints' image processors, for directories without preprocessor_config.json.
-_PROCESSOR = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225], "resample": 3}
 
 
 class DepthAnything(HuggingFaceDepth):
@@ -44,8 +41,7 @@ class DepthAnything(HuggingFaceDepth):
         revision: str | None = None,
         local_files_only: bool = False,
     ) -> Self:
-        """As :func:`from_hugging_face`, for this architecture; where the directory does not state colours, they are
-        those of the published checkpoints.
+        """As :func:`from_hugging_face`, for this architecture.
 
         Args:
             size: (height, width) [px] of the input, multiples of the patch (14).
@@ -63,8 +59,6 @@ class DepthAnything(HuggingFaceDepth):
         multiple = checkpoint.patch
         if len(size) != 2 or any(side < 1 or side % multiple for side in size):
             raise ValueError(f"size must be (height, width) in multiples of the patch, {multiple} px, got {size}")
-        if not checkpoint.processor:
-            checkpoint = replace(checkpoint, processor=_PROCESSOR)
         return cls.of_checkpoint(checkpoint, HuggingFaceSpec(size=size, keep_aspect=keep_aspect), dtype).to(device)
 
 

@@ -33,6 +33,16 @@ _LINEAR, _CUBIC = 2, 3  # Pillow's numbers, which the configurations use
 _ALWAYS_METRIC = {"depth_anything": False, "depth_pro": True, "dpt": False, "glpn": False, "zoedepth": True}
 # "depth_estimation_type" in the terms of this package; "relative" is inverse depth in all of them.
 _DECLARED = {"metric": METRIC, "relative": "inverse"}
+# Image processors that all published checkpoints share, where preprocessor_config.json is missing.
+_PUBLISHED: dict[str, dict[str, Any]] = {
+    "depth_anything": {
+        "size": {"height": 518, "width": 518},
+        "keep_aspect_ratio": True,
+        "image_mean": [0.485, 0.456, 0.406],
+        "image_std": [0.229, 0.224, 0.225],
+        "resample": _CUBIC,
+    }
+}
 # [1/m] Depth Pro's inverse depth is kept between these: 0.1 mm and 10 km.
 _INVERSE_RANGE = (1e-4, 1e4)
 _PADDING = 3.0  # [sqrt(px)] ZoeDepth pads each border by this times the square root of half the side
@@ -361,19 +371,27 @@ def _load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: tuple
 def _preprocess(checkpoint: Checkpoint, size: tuple[int, int] | None, keep_aspect: bool | None) -> Preprocess:
     """The preprocessing that a checkpoint's image processor describes. Raises ValueError: the description lacks what is
     needed, or contains what ``Preprocess`` cannot do."""
-    processor, name = checkpoint.processor, checkpoint.name
+    processor, name = checkpoint.processor or _PUBLISHED.get(checkpoint.model_type, {}), checkpoint.name
+    declare = (
+        'in a spec: {"preprocess": {"size": [518, 518], "mean": [...], "std": [...]}}, or preprocess=Preprocess(...)'
+    )
+    if not processor:
+        raise ValueError(
+            f"{name} has no preprocessor_config.json, which states how images are resized and normalised: copy it "
+            f"there from where the weights are from, or declare it {declare}"
+        )
     unknown = [option for option in ("do_center_crop", "do_flip_channel_order") if processor.get(option)]
     resample = processor.get("resample", _CUBIC)
     if unknown or resample not in (_LINEAR, _CUBIC):
         raise ValueError(
-            f"{name}: its image processor needs {unknown or f'resample {resample}'}, which is not supported: give a "
-            "Preprocess of your own"
+            f"{name}: its image processor needs {unknown or f'resample {resample}'}, which is not supported: "
+            f"declare another one {declare}"
         )
     own = processor.get("size")
     if size is None and isinstance(own, dict) and {"height", "width"} <= set(own):
         size = (int(own["height"]), int(own["width"]))
-    if size is None or not processor:
-        raise ValueError(f"{name} does not say what its input needs: give size or a Preprocess of your own")
+    if size is None:
+        raise ValueError(f"{name}: preprocessor_config.json states no size with height and width: declare it {declare}")
     if len(size) != 2:
         raise ValueError(f"{name}: size must be (height, width) in pixels, got {size}")
     keep = bool(processor.get("keep_aspect_ratio")) if keep_aspect is None else keep_aspect

@@ -66,7 +66,7 @@ def _names_files(config: pytest.Config) -> bool:
 
 
 def _compiled(dtype: str) -> bool:
-    """Whether the kernels on disk were compiled since the last change of a file that they depend on."""
+    """Return True if the kernels on disk were compiled after the last change of a file that they depend on."""
     done = CORE / "kernels" / "__pycache__" / f"{dtype}.compiled"
     sources = [path for folder in ("", "kernels", "posterior") for path in (CORE / folder).glob("*.py")]
     return done.is_file() and done.stat().st_mtime > max(path.stat().st_mtime for path in sources)
@@ -140,6 +140,14 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tiny_suite import write_rooms
 
     return write_rooms(tmp_path_factory.mktemp("rooms"))
+
+
+@pytest.fixture(scope="session")
+def network_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """A file of tiny networks for every base: {base: what a user types}. Nobody may change them."""
+    from tiny_suite import write_networks
+
+    return write_networks(tmp_path_factory.mktemp("networks"))
 
 
 @pytest.fixture(scope="session")

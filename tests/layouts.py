@@ -18,7 +18,7 @@ NED_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a layout's files were rendered from."""
+    """The scene that a layout's files were rendered from."""
 
     T_world_cam: list[np.ndarray]
     K: np.ndarray

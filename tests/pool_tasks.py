@@ -15,7 +15,7 @@ from ufmstar_torch.eval.suite.shards import run_pool
 
 
 def pool(folder, items, stop=lambda: False):
-    """Whether all items were done by two processes, and the lines that were reported."""
+    """Do all items by two processes: (all were done, the lines that were reported)."""
     lines: list[str] = []
     return run_pool(partial(task, str(folder)), items, 2, 1, stop=stop, report=lines.append), lines
 

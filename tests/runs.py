@@ -1,4 +1,4 @@
-"""What the tests of the runner and of the command line share: small jobs, and what must not depend on interruptions."""
+"""Small jobs for the tests of the runner and of the command line, and outputs that no interruption may change."""
 
 from __future__ import annotations
 
@@ -80,6 +80,11 @@ def outputs(out):
 def without_times(record):
     """A record or summary without what a clock says."""
     return {key: value for key, value in record.items() if key not in ("ms", "time")}
+
+
+def records(out):
+    """The lines of frames.jsonl."""
+    return [json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines()]
 
 
 def read_summary(out):

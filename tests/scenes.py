@@ -58,7 +58,7 @@ def tour(frames=30):
 
 
 def flicker(depth, amount, seed):
-    """What a network makes of it: a smooth random relative error, new in every frame."""
+    """Add a smooth random relative error, new in every frame, as a network's depth has it."""
     rng = np.random.default_rng(seed)
     height, width = depth.shape
     y, x = np.linspace(0, 1, height)[:, None], np.linspace(0, 1, width)[None]

@@ -13,7 +13,6 @@ from shared_data import require_shared
 from torch import Tensor
 from walks import oracle_settings
 
-from ufmstar_torch.camera import resize_intrinsics, unproject
 from ufmstar_torch.config import SPGFConfig
 
 REFERENCES = ("spgf_224_tum", "spgf_224_tartanair_indoor", "spgf_vga_tum")
@@ -95,17 +94,3 @@ def clutter(seed: int, height: int, width: int) -> tuple[Tensor, Tensor]:
         z[: rng.integers(1, height + 1), : rng.integers(1, width + 1)] *= 8
     K = camera(*(rng.uniform(0.7, 1.6, 2) * width), *(rng.uniform(0.3, 0.7, 2) * (width, height)))
     return torch.from_numpy(z)[None], K
-
-
-def room(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Depth [1, H, W] and camera of one smooth scene at any size: floor, ceiling, three walls, two boxes."""
-    K = resize_intrinsics(camera(200.0, 205.0, 111.5, 111.5), (224, 224), (height, width))
-    x, y, one = unproject(torch.ones(1, height, width, dtype=K.dtype), K)[0].unbind(-1)
-    z = 4.0 * one
-    for normal, distance in (((0, 1, 0), 1.2), ((0, -1, 0), 1.3), ((1, 0, 0.15), 1.9), ((-1, 0, 0.1), 1.7)):
-        towards = normal[0] * x + normal[1] * y + normal[2] * one
-        z = torch.minimum(z, torch.where(towards > 0, distance / towards.clamp_min(1e-9), torch.inf))
-    for left, right, top, bottom, near in ((-0.9, -0.2, 0.3, 1.2, 2.4), (0.3, 1.1, -0.2, 0.5, 3.0)):
-        inside = (x * near > left) & (x * near < right) & (y * near > top) & (y * near < bottom)
-        z = torch.where(inside, z.clamp_max(near), z)
-    return z[None], K

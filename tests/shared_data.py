@@ -1,4 +1,4 @@
-"""Where the tests find the shared material (real sequences, weights, reference partitions)."""
+"""Paths of the shared material: real sequences, weights, reference partitions."""
 
 from __future__ import annotations
 

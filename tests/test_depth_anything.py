@@ -149,7 +149,7 @@ def test_an_image_processor_may_be_missing_or_say_something_else(broken):
     )
     for change in ({"resample": 1}, {"do_center_crop": True}):
         file.write_text(json.dumps(says | change))
-        with pytest.raises(ValueError, match="is not supported: give a Preprocess of your own"):
+        with pytest.raises(ValueError, match="is not supported: declare another one in a spec"):
             DepthAnything.from_pretrained(broken)
     file.write_text("{")
     with pytest.raises(CheckpointError, match=r"broken: preprocessor_config\.json cannot be read"):
@@ -234,7 +234,7 @@ def test_another_model_in_one_line_with_its_meaning_declared(other):
     affine = from_hugging_face(other, kind="affine", size=(64, 96))
     with pytest.raises(ValueError, match=r"\(depth up to scale and shift\), not metres"):
         affine(images.float() / 255)
-    with pytest.raises(ValueError, match="does not say what its input needs: give size"):
+    with pytest.raises(ValueError, match=r"preprocessor_config\.json states no size with height and width: declare it"):
         from_hugging_face(other, kind="metric")
     with pytest.raises(ValueError, match="scale goes with kind 'metric' only"):
         from_hugging_face(other, kind="affine", scale=2.0, size=(64, 96))

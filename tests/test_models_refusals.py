@@ -115,7 +115,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: wrap_network([nn.ReLU()]), "several networks are a list of wrapped ones"),
     (lambda: wrap_network(nn.ReLU(), preprocess=(224, 224)), "preprocess must be a Preprocess"),
     (lambda: wrap_network(transformers.GLPNModel(GLPN)), "a ...ForDepthEstimation .*got GLPNModel"),
-    (lambda: wrap_network(glpn(GLPN)), "does not say what its input needs"),
+    (lambda: wrap_network(glpn(GLPN)), "has no preprocessor_config.json, .* declare it in a spec"),
     (lambda: wrap_network(glpn(GLPN), focal=300.0), "only scale, takes_int"),
     (lambda: wrap_network(glpn(GLPN), takes_intrinsics=True), "takes_intrinsics goes with Depth Pro"),
     (lambda: UncertainDepth(glpn(GLPN).eval())(IMAGE, torch.eye(4), CAMERA), "got DepthEstimatorOutput: wrap it"),

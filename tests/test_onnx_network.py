@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import pickle
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +123,6 @@ def image() -> Tensor:
 
 @pytest.mark.parametrize("shape", [["n", 3, "h", "w"], [1, 3, 6, 8], [3, 3, 6, 8], ["n", 3, 6, 8]], ids=str)
 def test_depth_of_every_image_in_the_batch(tmp_path: Path, image: Tensor, shape: list[int | str]) -> None:
-    """Fixed batches of 1 and 3 and free ones give the same maps."""
     network = OnnxNetwork(write(tmp_path / "n.onnx", shape), OnnxSpec(METRIC), threads=1)
     torch.testing.assert_close(network(image).depth, depth_of(image))
     assert network(image).aleatoric_variance is None
@@ -165,7 +163,7 @@ def test_variances_in_square_metres(tmp_path: Path, image: Tensor, kind: str) ->
 
 
 def test_a_fixed_size_becomes_the_preprocessing(tmp_path: Path) -> None:
-    """What the graph states need not be declared; what contradicts it is refused."""
+    """The size in the graph need not be declared, and a contradicting declaration is refused."""
     path = write(tmp_path / "n.onnx", ["n", 3, 6, 8])
     assert OnnxNetwork(path, OnnxSpec(METRIC)).preprocess == Preprocess(size=(6, 8))
     cropped = Preprocess(resize_height=20, crop=(12, 16))
@@ -178,7 +176,6 @@ def test_a_fixed_size_becomes_the_preprocessing(tmp_path: Path) -> None:
 
 
 def test_fastdepth_through_the_adapter() -> None:
-    """The published file, declared in JSON's terms, gives what the network in torch gives."""
     path = require_shared("weights/fastdepth_nyu.onnx")
     values = {"preprocess": {"resize_height": 250, "crop": [228, 304]}, "outputs": {"kind": "metric"}}
     adapter, network = OnnxNetwork(path, OnnxSpec.from_dict(values), threads=1), FastDepth.from_onnx(path)
@@ -190,7 +187,6 @@ def test_fastdepth_through_the_adapter() -> None:
 
 
 def test_copies_and_pickles(tmp_path: Path, image: Tensor) -> None:
-    """A session cannot be copied, so a copy opens its own."""
     network = OnnxNetwork(write(tmp_path / "n.onnx"), OnnxSpec(METRIC), threads=1)
     for twin in (copy.deepcopy(network), pickle.loads(pickle.dumps(network))):
         assert twin.session is not network.session
@@ -248,16 +244,6 @@ def test_files_that_are_no_graphs(tmp_path: Path, content: bytes | None) -> None
         OnnxNetwork(path, OnnxSpec(METRIC))
     with pytest.raises(FileNotFoundError, match=r"none.onnx"):
         OnnxNetwork(tmp_path / "none.onnx", OnnxSpec(METRIC))
-
-
-def test_missing_packages_name_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write(tmp_path / "n.onnx")
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ModuleNotFoundError, match=r"needs the package onnxruntime: .*ufmstar-torch\[models\]"):
-        OnnxNetwork(path, OnnxSpec(METRIC))
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(ModuleNotFoundError, match=r"needs the package onnx: .*ufmstar-torch\[models\]"):
-        FastDepth.from_onnx(path)
 
 
 def test_a_node_that_fails_at_run_time_names_the_file(tmp_path: Path) -> None:

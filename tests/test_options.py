@@ -8,14 +8,13 @@ from typing import Any
 
 import pytest
 
-from ufmstar_torch import cli
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.options import as_dict, fields_of, option, parse, positional
 
 
 @dataclass(frozen=True)
 class _Output:
-    """Where it goes.
+    """Folders.
 
     Attributes:
         out: folder of the results.
@@ -176,7 +175,7 @@ def test_help_has_the_attributes_texts(capsys):
     text = " ".join(capsys.readouterr().out.split())
     for expected in (
         "Do something with a sequence.",
-        "Where it goes: --out",
+        "Folders: --out",
         "--fps FPS frames per second, over two lines.",
         "--rate RATE frames per second, over two lines.",
         "--no-video leave the video out.",
@@ -184,25 +183,3 @@ def test_help_has_the_attributes_texts(capsys):
         "v_min [m^2], [0, inf]",
     ):
         assert expected in text
-
-
-def test_the_short_help_leaves_out_the_settings(capsys):
-    with pytest.raises(SystemExit):
-        cli.main(["run", "--help"])
-    text = capsys.readouterr().out
-    assert "--ufm.eta" not in text
-    assert "--ufm.segment.sparse" not in text
-    assert "--help-all" in text
-    assert "--ufm-preset" in text
-    assert len(text.splitlines()) < 150
-    assert _parse("seq --out o --ufm.eta .25").ufm["eta"] == 0.25
-
-
-def test_the_help_of_a_flag_names_no_default(capsys):
-    """--no-register would have "(default: True)", that of the field that it switches off."""
-    with pytest.raises(SystemExit):
-        cli.main(["run", "--help"])
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "--no-register leave 7-Scenes' depth in its own camera --T-color-depth" in printed
-    assert "(default: True)" not in printed
-    assert "leave preview.mp4 out --no-sheet" in printed

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,15 +29,3 @@ def test_its_table_has_every_row(tmp_path, capsys, monkeypatch):
     # The head leaves the depth as it is.
     assert figures["constant"]["rmse"] == pytest.approx(figures["head: network"]["rmse"], rel=1e-6)
     assert len(EXAMPLE.read_text().splitlines()) < 60
-
-
-@pytest.mark.slow
-def test_a_strict_type_checker_accepts_it(tmp_path):
-    mypy = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "--cache-dir", str(tmp_path)]
-    root, package = EXAMPLE.parent.parent, tmp_path / "ufmstar_torch"  # as it is installed
-    package.mkdir()
-    for part in (*(root / "ufmstar_torch").iterdir(), root / "models", root / "eval", root / "train"):
-        (package / part.name).symlink_to(part)
-    environment = os.environ | {"MYPYPATH": str(tmp_path)}
-    done = subprocess.run([*mypy, EXAMPLE], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout

@@ -53,21 +53,6 @@ def test_eval_and_report_show_them(walk, tmp_path, capfd):
     assert settings["plugin"] == [PLUGIN]
 
 
-def test_the_metric_equals_a_loop(walk):
-    """On numbers with errors of which some are beyond two sigma."""
-    import torch
-
-    rng = np.random.default_rng(0)
-    target, depth, variance = rng.uniform(1, 5, 500), rng.uniform(1, 5, 500), rng.uniform(0, 1, 500)
-    target[:50] = 0
-    metric = example.Coverage()
-    for part in (slice(0, 200), slice(200, 500)):
-        metric.update(*(torch.from_numpy(values[part]) for values in (depth, variance, target)))
-    hits = [abs(d - t) <= 2 * v**0.5 for d, v, t in zip(depth, variance, target, strict=True) if t > 0]
-    assert 0.2 < np.mean(hits) < 0.8
-    assert float(metric.compute()["within_2_sigma"]) == pytest.approx(np.mean(hits))
-
-
 def test_the_reader_is_everywhere(walk, tmp_path, capfd):
     path, scene = walk
     sequence = open_sequence(path, plugin=[PLUGIN])

@@ -93,14 +93,6 @@ def test_full_stochastic_network_samples():
     assert relative == pytest.approx(0.1, rel=0.2)
 
 
-def test_stochastic_network_samples_once_per_image():
-    torch.manual_seed(0)
-    model = UncertainDepth(Noisy(), CONFIG)
-    a, b = model(image(0), POSES[0], K), model(image(0), POSES[0], K)
-    assert not torch.equal(a.depth, b.depth)
-    assert b.prediction.epistemic_variance is None
-
-
 def test_combine():
     x = torch.ones(1, 2, 2)
     with_e = [DepthPrediction(x, x, 0.5 * x), DepthPrediction(3 * x, x, 1.5 * x)]
@@ -159,14 +151,6 @@ def test_networks_stay_in_eval_mode():
     assert not any(m.training for m in model.networks.modules())
 
 
-def test_a_failed_frame_does_not_advance_the_alternation():
-    model = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG)
-    model(image(0), POSES[0], K)
-    with pytest.raises(ValueError, match="NaN"):
-        model(image(1), torch.full((4, 4), torch.nan), K)
-    assert model(image(1), POSES[1], K).member == 1
-
-
 def test_state_continues_and_resets():
     def fresh():
         return UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG)
@@ -179,21 +163,6 @@ def test_state_continues_and_resets():
     assert torch.equal(second(image(3), POSES[3], K).variance, expected[3])
     whole.reset()
     assert whole(image(0), POSES[0], K).member == 0
-
-
-def test_inference_mode_leaves_loadable_buffers():
-    model, other = UncertainDepth(Scaled(1.0), CONFIG), UncertainDepth(Scaled(1.0), CONFIG)
-    with torch.inference_mode():
-        model(image(0), POSES[0], K)
-    other(image(0), POSES[0], K)
-    model.load_state_dict(other.state_dict())
-    assert model(image(1), POSES[1], K).member == 0
-
-
-def test_the_networks_own_variance_is_a_and_e():
-    both = DepthPrediction(torch.ones(1, 2, 2), torch.ones(1, 2, 2), 2 * torch.ones(1, 2, 2))
-    assert torch.equal(both.variance, torch.full((1, 2, 2), 3.0))
-    assert DepthPrediction(torch.ones(1, 2, 2)).variance is None
 
 
 def test_stream_and_a_device_for_the_multiview_part_change_no_bit():

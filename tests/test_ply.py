@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from ufmstar_torch.eval.run.gaussians import (
     OPACITY,
     SIGMA_FLOOR,
-    icosphere,
     write_ellipsoids_ply,
     write_mixture_npz,
     write_mixture_ply,
@@ -116,19 +115,11 @@ class TestSplats:
         mix = mixture(30, streams=1)
         mix = mix.replace(count=torch.where(torch.arange(30) % 5 == 0, 1, mix.count + mix.valid))
         write_mixture_ply(tmp_path / "m.ply", mix)
-        elements, comments = parse(tmp_path / "m.ply")
-        rgb = 0.5 + 0.28209479177387814 * stack(elements["vertex"], "f_dc_0", "f_dc_1", "f_dc_2")
-        assert rgb.min() > -1e-6
-        assert rgb.max() < 1 + 1e-6
-        compared = elements["vertex"]["count"] > 1
-        assert 0 < (~compared).sum() < compared.sum()
-        brightness, m = rgb @ [0.3, 0.6, 0.1], elements["vertex"]["disagreement"]
-        assert (np.diff(brightness[compared][np.argsort(m[compared])]) >= -1e-6).all()
+        vertex = parse(tmp_path / "m.ply")[0]["vertex"]
+        rgb, compared = 0.5 + 0.28209479177387814 * stack(vertex, "f_dc_0", "f_dc_1", "f_dc_2"), vertex["count"] > 1
+        brightness = (rgb @ [0.3, 0.6, 0.1])[compared][np.argsort(vertex["disagreement"][compared])]
+        assert (np.diff(brightness) >= -1e-6).all()
         np.testing.assert_allclose(rgb[~compared], 150 / 255, atol=1e-6)
-        high = np.percentile(np.sqrt(mix.disagreement[mix.valid & (mix.count > 1)].numpy()), 99)
-        assert (
-            comments[0] == f"comment colour: sqrt(disagreement), magma from 0 to {high:.4g} m; grey: seen from one view"
-        )
 
     def test_flat_and_point_components_are_finite(self, tmp_path: Path) -> None:
         mix = mixture(4, streams=1)
@@ -158,17 +149,6 @@ class TestSplats:
 
 
 class TestEllipsoids:
-    @pytest.mark.parametrize("s", [0, 1, 2, 3])
-    def test_icosphere(self, s: int) -> None:
-        vertices, faces = icosphere(s)
-        assert (len(vertices), len(faces)) == (10 * 4**s + 2, 20 * 4**s)
-        np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1, atol=1e-15)
-        corners = vertices[faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        assert (np.einsum("fi,fi->f", normal, corners.mean(1)) > 0).all()  # outwards
-        edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-        assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()  # closed
-
     def test_mesh(self, tmp_path: Path) -> None:
         mix, radius = mixture(), 2.0
         assert write_ellipsoids_ply(tmp_path / "e.ply", mix, T_world_first=world()[None]) == 5
@@ -216,8 +196,3 @@ class TestNpz:
             assert getattr(back, name).dtype == value.dtype
         assert T is not None
         assert torch.equal(T, world())
-
-    def test_empty(self, tmp_path: Path) -> None:
-        write_mixture_npz(tmp_path / "m.npz", GaussianMixture.empty(2, 4, dtype=torch.float32, device="cpu"))
-        back, T = read_mixture_npz(tmp_path / "m.npz")
-        assert (back.streams, back.capacity, T) == (2, 0, None)

@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ufmstar_torch import cli
-from ufmstar_torch.eval.commands.poses import read
 from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
 from ufmstar_torch.eval.reconstruct.reconstruct import scale_model
 from ufmstar_torch.eval.reconstruct.scale import endpoint, similarity
@@ -155,21 +154,6 @@ def test_similarity_is_exact_and_leaves_outliers_out():
     for bad in (x[:2], np.ones((5, 3))):
         with pytest.raises(ValueError, match="--trajectory"):
             similarity(bad, y[: len(bad)])
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--length", "a", "b"], "--length must be A B METRES"),
-        (["--length", "a", "b", "-1"], "--length must be A B METRES"),
-        (["--length", "a", "b", "1", "--trajectory", "x"], "contradict each other"),
-        (["--intrinsics", "none.txt"], "--intrinsics: no such file: none.txt"),
-        (["--distortion", "0.1", "0", "0", "0"], "--distortion goes with --intrinsics"),
-    ],
-)
-def test_impossible_options(words, message):
-    with pytest.raises(ValueError, match=message):
-        read(["walk", "--out", "out", *words])
 
 
 def test_images_that_fit_no_model(tmp_path, capfd):

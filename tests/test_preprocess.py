@@ -76,7 +76,6 @@ def test_a_point_is_seen_where_the_new_intrinsics_project_it(preprocess: Preproc
 @given(height=st.integers(1, 2000), width=st.integers(1, 2000))
 @example(height=480, width=640)
 def test_the_crop_fits_into_every_image(height: int, width: int) -> None:
-    """Aspect kept, crop inside and as large as the rule says, whatever the size."""
     g = NYU.geometry(height, width)
     assert g.final == (224, 224)
     assert g.cropped == (228, 304)
@@ -153,7 +152,6 @@ def test_bytes_and_floats_agree_and_are_scaled() -> None:
 @pytest.mark.parametrize("size", [(480, 640), (375, 1242), (100, 120)])
 @pytest.mark.parametrize("preprocess", [NYU, Preprocess(size=(224, 224)), Preprocess(crop=(64, 96)), Preprocess()])
 def test_the_kernel_equals_the_reference(size, preprocess):
-    """Of bytes, in either order of axes in memory, to the rounding of fused products."""
     image = torch.randint(0, 256, (2, *size, 3), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
     image = image.permute(0, 3, 1, 2)
     fast, slow = preprocess.apply_image(image), preprocess.resampled(image)

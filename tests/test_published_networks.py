@@ -94,26 +94,13 @@ def run(line: str, **names: Any) -> package.DepthNetwork:
 
 
 def write(folder: Path, name: str) -> dict[str, Any]:
-    """What a line's names stand for."""
+    """Write a line's files, and return the values of its names."""
     if name == "Depth Anything V2":
         write_depth_anything(folder, "metric")
     elif name in ("ZoeDepth", "Depth Pro"):
         write_other(folder, {"ZoeDepth": "zoedepth", "Depth Pro": "depth_pro"}[name])
     stand_ins = {"unidepth": UniDepth(), "moge": MoGe(), "metric3d": Metric3D(), "da3": DepthAnything3()}
     return {"DIR": folder, **stand_ins}
-
-
-def test_every_network_has_a_row() -> None:
-    published = {
-        "Depth Anything V2",
-        "Depth Anything 3",
-        "UniDepth V2",
-        "MoGe-2",
-        "Metric3D v2",
-        "ZoeDepth",
-        "Depth Pro",
-    }
-    assert set(LINES) == published | set(RECORDINGS)
 
 
 @pytest.mark.parametrize("name", sorted(set(LINES) - set(RECORDINGS)))
@@ -155,7 +142,6 @@ class Scene:
 
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_a_reconstruction_is_a_recording(name: str) -> None:
-    """Depth, camera-to-world poses, K and confidence of every view, as UfM* takes them."""
     generator = torch.Generator().manual_seed(0)
     depth, conf = (1 + torch.rand(3, 70, 98, generator=generator) for _ in range(2))
     T = torch.eye(4).repeat(3, 1, 1)

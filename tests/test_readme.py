@@ -57,7 +57,6 @@ def test_links_and_pictures_exist():
 
 
 def test_nothing_names_a_machine():
-    """No absolute path of a workplace and no placeholder left in what a reader sees."""
     for document in [
         ROOT / "README.md",
         ROOT / "CHANGELOG.md",

@@ -45,12 +45,6 @@ def test_the_map_is_linear_in_logarithms_between_its_knots():
     assert MAP(v.reshape(2, 4)).shape == (2, 4)
 
 
-def test_a_map_of_one_knot():
-    v = torch.tensor([0.0, 0.3, 5.0])
-    single = Recalibration((0.5,), (1.0,))
-    torch.testing.assert_close(single(v), torch.tensor([1.0, 1.0, 10.0]))
-
-
 @given(
     knots=st.lists(st.floats(1e-6, 1e6), min_size=1, max_size=8, unique=True),
     steps=st.lists(st.floats(0, 10), min_size=8, max_size=8),
@@ -61,23 +55,6 @@ def test_the_map_never_reverses_an_order(knots, steps, v):
     mapped = Recalibration(tuple(sorted(knots)), recalibrated)(torch.tensor(sorted(v), dtype=torch.float64))
     assert (mapped.diff() >= -1e-9 * mapped[1:]).all()
     assert (mapped > 0).all()
-
-
-BAD = {
-    "no knot": ((), ()),
-    "another number": ((1.0, 2.0), (1.0,)),
-    "not increasing": ((1.0, 1.0), (1.0, 2.0)),
-    "decreasing": ((1.0, 2.0), (2.0, 1.0)),
-    "zero": ((0.0, 1.0), (1.0, 2.0)),
-    "infinite": ((1.0, math.inf), (1.0, 2.0)),
-    "text": (("a",), (1.0,)),
-}
-
-
-@pytest.mark.parametrize("knots", BAD.values(), ids=BAD)
-def test_impossible_knots_are_refused(knots):
-    with pytest.raises(ValueError, match="Recalibration"):
-        Recalibration(*knots)
 
 
 def test_a_file_comes_back(tmp_path):
@@ -115,11 +92,6 @@ def test_every_sequence_has_the_same_weight():
     short, long = drawn(v, v), drawn(v.repeat(50), 9 * v.repeat(50), seed=5)
     one, other = fit([short, long]).recalibrated[0], fit([short, long / 50]).recalibrated[0]
     assert one == pytest.approx(other)
-
-
-def test_impossible_counts_are_refused():
-    with pytest.raises(ValueError, match="pixels with ground truth"):
-        fit([np.zeros((514, 514))])
 
 
 # ---- the module ----

@@ -38,7 +38,6 @@ def rendered(seed: int = 0) -> torch.Tensor:
 @BOTH
 @given(seed=st.integers(0, 10**6))
 def test_agrees_with_the_oracle(backend, config, seed):
-    """At the pixels of a noisy image, some near components, and at a subset of them."""
     m, camera = mixture(2, 9, seed, features=2), torch.tensor(scenes.intrinsics(3, 5))
     generator = torch.Generator().manual_seed(seed)
     depth = 1 + 4 * torch.rand(2, 3, 5, generator=generator, dtype=torch.float64)
@@ -175,19 +174,6 @@ def test_chunks_change_nothing(monkeypatch):
     monkeypatch.setattr(regress_module, "_CHUNK", 9 * 100)
     torch.testing.assert_close(regress(m, points, EXACT).disagreement, whole, rtol=1e-13, atol=0)
     assert regress(m, points[:, :0], EXACT).disagreement.shape == (1, 0)
-
-
-def test_on_cuda_free_memory_decides_how_much_is_regressed_at_a_time(monkeypatch):
-    def pairs(free: int, kept: int = 0, device: str = "cuda") -> int:
-        monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
-        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 80 << 30))
-        monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: kept)
-        monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 0)
-        return regress_module._pairs_at_a_time(torch.device(device), 4)
-
-    assert pairs(64 << 30) == pairs(32 << 30, 32 << 30) == 2**28
-    assert pairs(64 << 30) // (256 * 1024) == 1024, "points at a time, with 256 streams of 1024 components"
-    assert pairs(1 << 20) == pairs(64 << 30, device="cpu") == 2**22
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -9,24 +9,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluations import confident, draw_maps, in_memory, judge, record_of, rows_of, write_evaluation
+from evaluations import confident, draw_maps, in_memory, judge, record_of, rows_of
 
-from ufmstar_torch.eval.methods.method import BASES, Method
+from ufmstar_torch.anchors.tracker import TrackerConfig
+from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.methods.setting import Setting, setting_from
+from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import Merged, Results
 from ufmstar_torch.eval.report.figures_cost import STAGES, draw_stages
 from ufmstar_torch.eval.report.figures_curves import (
-    Histogram,
-    chosen_sequences,
     draw_calibration,
     draw_entropy,
     draw_error,
-    draw_sequence_calibration,
     entropies,
-    entropy_range,
 )
-from ufmstar_torch.eval.report.figures_sweep import Point, draw_sweep, sweep_lines, sweeps
+from ufmstar_torch.eval.report.figures_sweep import Point, default_value, draw_sweep, sweep_lines, sweeps
 from ufmstar_torch.eval.report.means import difference, mean_of
 from ufmstar_torch.eval.report.names import NLL
 from ufmstar_torch.eval.report.style import (
@@ -34,7 +32,7 @@ from ufmstar_torch.eval.report.style import (
     new_figure,
     save_figure,
 )
-from ufmstar_torch.eval.report.write import write_report
+from ufmstar_torch.eval.report.write import figures_of
 
 ROWS = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "DepthOnly", "UfM*-DepthOnly")
 ALONE, UFM, UFM_STAR, DEPTH, STAR_OF_DEPTH = ROWS
@@ -87,17 +85,6 @@ class TestCalibration:
         assert list(drawn(shown[1])) == ["exactly right", "UfM*"]  # a network of depth alone has no variance of its own
         assert named(shown[0]) == {"alone", "UfM-100K", "UfM*", "exactly right"}
 
-    def test_single_sequences_from_best_to_worst(self, results):
-        records = {r.sequence: r for r in results.of(UFM_STAR)}
-        by_error = sorted(SEQUENCES, key=lambda s: records[s].figures["ece_delta"])
-        assert chosen_sequences(results, "rooms", "ensemble") == by_error
-        figure = draw_sequence_calibration(results, "rooms", "ensemble")
-        first = records[by_error[0]]
-        line = drawn(figure.axes[len(SEQUENCES)])["UfM*"]
-        np.testing.assert_array_equal(line.get_ydata(), first.curves["ece_q_observed"])
-        assert figure.axes[0].get_title(loc="left").startswith(f"{by_error[0]}\nECE_δ ")
-        assert figure.axes[0].get_title(loc="left").endswith(f"→ {first.figures['ece_delta']:.3f}")
-
 
 class TestError:
     def test_a_panel_per_reference(self, results):
@@ -132,24 +119,6 @@ class TestEntropy:
             f"{name}: mean {mean:.2f}" for name, mean in zip(("alone", "UfM-100K", "UfM*"), means, strict=True)
         ]
 
-    def test_environments_in_the_papers_order(self):
-        curves = {"entropy_counts": [0, 3, 1, 0], "entropy_edges": [-1.0, 0.0, 1.0]}
-        names = [
-            ("kitti360", "2013_05_28_drive_0007_sync"),
-            ("scannet", "scene0000_00"),
-            ("own", "x"),
-            ("scannet", "b"),
-        ]
-        names += [("tartanair", "soulcity__P000"), ("tartanair", "seasonsforest_winter__P001")]
-        values = {(UFM_STAR, where): {"entropy": 0.5} for where in names}
-        swept = in_memory(values)
-        swept = replace(swept, records=tuple(replace(r, curves=curves) for r in swept.records))
-        result = entropies(swept, "ensemble")
-        assert list(result) == ["indoor", "forest", "driving", "city", "own"]
-        assert result["indoor"][UFM_STAR].counts.tolist() == [0, 6, 2, 0]
-        titles = [axes.get_title(loc="left") for axes in draw_entropy(swept, "ensemble").axes]
-        assert titles == list(result)
-
     def test_pixels_without_a_variance_are_told(self):
         curves = {"entropy_counts": [25, 0, 75, 0], "entropy_edges": [-1.0, 0.0, 1.0]}
         result = in_memory({(UFM_STAR, ("d", "s")): {"entropy": 0.5}})
@@ -157,11 +126,6 @@ class TestEntropy:
         # The share of all pixels, those without a variance among them.
         assert entropies(result, "ensemble")["d"][UFM_STAR].density.tolist() == [0.0, 0.75]
         assert words(draw_entropy(result, "ensemble").axes[0]) == ["UfM*: mean 0.50\n(25 % with hardly any V)"]
-
-    def test_range_holds_the_pixels(self):
-        counts = np.zeros(66)
-        counts[1 + 20], counts[1 + 30] = 500, 500  # [-3, -2.75) and [-.5, -.25)
-        assert entropy_range([Histogram(counts, np.linspace(-8, 8, 65), 0.0)]) == (-3.5, 0.25)
 
 
 def noisy(value: float, seed: int = 0) -> Row:
@@ -220,24 +184,6 @@ class TestCost:
         assert draw_stages(results) is None
 
 
-def test_the_files_say_what_they_are(tmp_path):
-    out = write_evaluation(tmp_path / "o", ROWS[:1] + ROWS[2:3], [("rooms", "one two")], suite="own")
-    names = {path.relative_to(out).as_posix() for path in write_report(out, pictures="png").files}
-    kinds = {"calibration-rooms", "calibration-sequences-rooms-ensemble", "error-rooms", "entropy-ensemble"}
-    assert {f"figures/{kind}.png" for kind in kinds} <= names
-    assert all((out / name).stat().st_size > 1000 for name in names if name.endswith(".png"))
-    with pytest.raises(ValueError, match="figures must be svg or png, got 'jpg'"):
-        write_report(out, pictures="jpg")
-
-
-def test_every_kind_of_method_has_a_look_of_its_own():
-    kinds = ["Ensemble", "UfM-Ensemble", "UfM-Ensemble-100K", "UfM-FullEnsemble", "UfM*-Ensemble"]
-    kinds += ["UfM*-FullEnsemble", "UfM*-Ensemble-fixed-param"]
-    styles = [look_of(Method.parse(name)) for name in kinds]
-    assert len({s.colour for s in styles}) == len({s.marker for s in styles}) == len(kinds)
-    assert {look_of(Method(base)) for base in BASES} == {styles[0]}  # the same whatever the network
-
-
 def test_the_same_figure_gives_the_same_file_and_no_global_state(tmp_path):
     import matplotlib
 
@@ -249,3 +195,79 @@ def test_the_same_figure_gives_the_same_file_and_no_global_state(tmp_path):
     assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
     assert dict(matplotlib.rcParams) == before
     assert ("matplotlib.pyplot" in sys.modules) == pyplot
+
+
+# ---- sweeps with anchors ----
+
+STAR = STAR_OF_DEPTH.method
+MOST = TrackerConfig().max_points
+ROTATION_DRIFTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5)
+
+
+def results_of(rows: list[Row], nll: float = 2.0) -> Results:
+    return in_memory({(row, ("d", "s")): {"nll": nll, "ece_delta": 0.1} for row in rows}, "ablation-anchors")
+
+
+@pytest.fixture(scope="module")
+def anchored() -> Results:
+    return results_of(list(suite_named("ablation-anchors").rows))
+
+
+def row(**values: Any) -> Row:
+    return Row(STAR, setting_from(values))
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("rotation_drift", ROTATION_DRIFTS),
+        ("track_noise", (0.0, 1.0, 2.0, 4.0, 8.0)),
+        ("anchors.half_life", (10.0, 30.0, 100.0)),
+    ],
+)
+def test_anchored_rows_are_a_line_that_goes_through_the_row_without_noise(anchored, name, values):
+    lines = sweep_lines(anchored, "depth_only", name)
+    tracked = [line for line in lines if dict(line.rest) == {"anchors": "tracked"}]
+    assert [point.value for point in tracked[0].points] == pytest.approx(values)
+    (at_default,) = (point for point in tracked[0].points if point.value == default_value(name))
+    assert at_default.rows == (row(anchors="tracked"),)
+    assert tracked[0].words == "anchored"
+    # And no row of another line is among those of plain UfM*.
+    (alone,) = (line for line in lines if line.method == STAR and not line.rest)
+    assert all(not r.setting.anchors for point in alone.points for r in point.rows)
+
+
+def test_numbers_of_anchors_begin_with_none(anchored):
+    lines = {line.words: line for line in sweep_lines(anchored, "depth_only", "anchor_count") if len(line.points) > 1}
+    assert set(lines) == {"anchored", "truth anchors"}
+    assert [point.value for point in lines["truth anchors"].points] == [0, 5, 20, 100, 300]
+    assert [point.value for point in lines["anchored"].points] == [0, 5, 20, MOST]
+    # Plain UfM* where no row says 0; and a row that says nothing has as many as the tracker follows.
+    assert lines["anchored"].points[0].rows == (Row(STAR),)
+    assert lines["anchored"].points[-1].rows == (row(anchors="tracked"),)
+    assert lines["truth anchors"].points[0].rows == (row(anchors="truth", anchor_count=0),)
+    both = results_of([row(anchors="truth"), *(row(anchors="truth", anchor_count=n) for n in (0, 20))])
+    assert [point.value for point in sweep_lines(both, "depth_only", "anchor_count")[0].points] == [0, 20, TRUTH_COUNT]
+
+
+def test_words_and_switches_are_no_values():
+    rows = [row(), *(row(disagreement="overlap", prior_weight=v) for v in (1.0, 2.0, 3.0))]
+    rows += [row(**{"segment.prune": rule}) for rule in ("either", "none")] + [row(overlap_weighted=True)]
+    assert sweeps(results_of(rows)) == [("depth_only", "prior_weight")]
+    assert math.isnan(default_value("segment.prune"))
+    assert math.isnan(default_value("no_such_setting"))
+    assert math.isnan(default_value("anchor_count"))
+
+
+def test_nlls_beyond_measure_leave_the_others_to_be_seen():
+    rows = [row(**({"rotation_drift": v} if v else {})) for v in (0.0, 0.1, 0.2)]
+    wild = draw_sweep(results_of(rows, nll=1e30), "depth_only", "rotation_drift")
+    assert [axes.get_yscale() for axes in wild.axes[:3]] == ["symlog", "linear", "linear"]
+    low, high = wild.axes[0].get_ylim()
+    assert low < 0 < 1e30 < high < 1e31
+
+
+def test_the_report_has_them(anchored):
+    names = {name for name, _ in figures_of(anchored)}
+    assert names >= {f"sweep depth_only {name}" for name in ("anchor_count", "track_noise", "anchors.shrinkage")}
+    assert draw_sweep(anchored, "depth_only", "anchor_count").axes[0].get_xscale() == "symlog"

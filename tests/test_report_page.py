@@ -9,12 +9,12 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from evaluations import HOSTILE, KITCHEN, LATER, TITLE, in_memory, rows_of, write_evaluation
+from evaluations import HOSTILE, KITCHEN, TITLE, in_memory, rows_of, write_evaluation
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.metrics import mean_and_ci
 from ufmstar_torch.eval.report.data import Failed, Results
-from ufmstar_torch.eval.report.page import command, limits, write_page
+from ufmstar_torch.eval.report.page import command, limits
 
 VOID = {"br", "hr", "img", "meta", "input"}
 
@@ -92,14 +92,6 @@ def test_every_picture_is_there_with_words(page: Page, evaluation: Path) -> None
     assert any(KITCHEN[1] in (i["alt"] or "") for i in images)
 
 
-def test_the_table_comes_first_and_the_contents_lead_to_every_part(page: Page) -> None:
-    ids = [a["id"] for _, a in page.elements if "id" in a]
-    assert ids == ["table", "curves", "pictures", "cost", "further", "limits", "made"]
-    assert [a["href"] for a in page.all("a")] == [f"#{name}" for name in ids]
-    assert page.all("html") == [{"lang": "en"}]
-    assert any(a.get("name") == "viewport" for a in page.all("meta"))
-
-
 def test_hostile_names_stay_text(page: Page) -> None:
     assert len(page.all("script")) == 1
     assert TITLE in page.text
@@ -125,12 +117,6 @@ def test_numbers_are_the_results_with_the_papers_beside(page: Page, results: Res
     assert paper == ["0.68", "0.96 ± 0.19", "0.12 ± 0.02", "0.13 ± 0.02"]
 
 
-def test_limits_and_how_it_was_made(page: Page) -> None:
-    assert "2 × pose is not finite" in page.text
-    assert LATER[1] in page.text
-    assert "ufmstar eval --suite paper-table-1 --root 7-scenes=DIR --root scannet=DIR --root tum=DIR" in page.text
-
-
 def test_everything_that_is_missing_is_a_limit() -> None:
     (row,) = rows_of("Ensemble")
     results = in_memory({(row, ("d", "s")): {"nll": 1.0}}, failed=(Failed("d", "x", "broken"),))
@@ -147,12 +133,6 @@ def test_everything_that_is_missing_is_a_limit() -> None:
         "Figures that could not be drawn": [("latency", "no glyph")],
         "Further problems": [("a note",)],
     }
-
-
-def test_a_complete_evaluation_says_so(tmp_path: Path) -> None:
-    results = in_memory({(row, ("d", "s")): {"nll": 1.0} for row in rows_of("Ensemble")})
-    complete = replace(results, out=tmp_path, records=tuple(replace(r, frames={"done": 3}) for r in results.records))
-    assert "every frame was used" in Page(write_page(complete, [], []).read_text(encoding="utf-8")).text
 
 
 def test_a_figure_that_fails_does_not_lose_the_page(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from evaluations import KITCHEN, SHAPE, rows_of
+from evaluations import KITCHEN, SHAPE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLL
-from ufmstar_torch.eval.report import pictures as pictures_module
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.report.examples import Example, RowMaps, find_examples
 from ufmstar_torch.eval.report.pictures import (
@@ -28,16 +24,12 @@ from ufmstar_torch.eval.report.pictures import (
     ROOM,
     STRIP,
     ZOOM,
-    choose,
-    draw_breakdown,
     draw_comparison,
     draw_strip,
-    figures_of,
     fit_strip_scales,
     largest_difference,
     mean_nll,
     pictures_of,
-    strip_rows,
 )
 from ufmstar_torch.eval.report.rooms import (
     SIGMAS,
@@ -48,9 +40,7 @@ from ufmstar_torch.eval.report.rooms import (
     oblique_view,
     project,
 )
-from ufmstar_torch.eval.report.write import write_report
 from ufmstar_torch.eval.run.colours import INVALID_GREY
-from ufmstar_torch.eval.run.panels import break_name
 from ufmstar_torch.eval.suite.work_items import WorkItem
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -73,7 +63,7 @@ def example(rows: dict[str, RowMaps], truth: np.ndarray[Any, Any] | None = None,
 
 
 def pixels(path: Path, colour: np.ndarray[Any, Any]) -> int:
-    """How many pixels of a picture have a colour."""
+    """Count the pixels of a colour in a picture."""
     with Image.open(path) as picture:
         return int((np.asarray(picture.convert("RGB")) == colour.astype(np.uint8)).all(-1).sum())
 
@@ -95,18 +85,6 @@ class TestExample:
         judged = (truth > 0) & (variance > 0)
         np.testing.assert_array_equal(np.isfinite(one.nll("a")), judged)
         np.testing.assert_array_equal(np.isfinite(one.error("a")), (truth > 0) & (variance >= 0))
-
-    def test_aspect_is_that_of_the_view(self) -> None:
-        squeezed = K @ np.diag([0.5, 1.0, 1.0])
-        assert example({}).aspect == pytest.approx(12 / 16)
-        assert example({}, K=squeezed).aspect == pytest.approx(12 / 32)
-
-    def test_figures_in_words(self) -> None:
-        one = example({"a": RowMaps(full(2.0), full(0.25)), "zero": RowMaps(full(2.0), full(0.0))})
-        nll = 1 / 0.5 + 0.5 * np.log(2 * np.pi * 0.25)
-        assert figures_of(one, "a") == [f"mean NLL {nll:.2f}", "RMSE 1.00 m", "rms σ 0.50 m"]
-        assert figures_of(one, "zero")[0] == "no NLL: V = 0"
-        assert figures_of(replace(one, truth=full(0.0)), "a") == ["no ground truth"]
 
 
 class TestFindExamples:
@@ -163,21 +141,6 @@ class TestStrips:
         # No truth on the right half: of the truth itself, two errors and two NLLs.
         assert pixels(path, np.full(3, INVALID_GREY)) == pytest.approx(2.5 * CELL, rel=0.12)
 
-    def test_breakdown_adds_up(self, tmp_path: Path) -> None:
-        parts = {"aleatoric": full(0.0625), "disagreement": full(0.1875)}
-        one = example({"star": RowMaps(full(2.0), full(0.25), **parts)})
-        path = tmp_path / draw_breakdown(tmp_path, one, ["star"]).file
-        scales = fit_strip_scales(one, ["star"])
-        for value in (0.25, np.sqrt(np.float32(0.1875)), 0.5, 1.0):  # sqrt A, sqrt M, sigma, error; E is missing
-            colour = scales.length.rgb(np.array(value))
-            assert pixels(path, colour) == pytest.approx(CELL, rel=0.12)
-
-    @given(st.text(alphabet="ab-_ *", max_size=60))
-    def test_broken_names_keep_their_letters(self, name: str) -> None:
-        broken = break_name(name, 20)
-        assert broken.replace("\n", "").replace(" ", "") == name.replace(" ", "")
-        assert max(map(len, broken.split("\n"))) <= 20
-
 
 class TestCompare:
     @settings(max_examples=20)
@@ -225,18 +188,6 @@ class TestProjection:
             a, b = axes.T
             np.testing.assert_allclose(np.hypot(a * np.cos(off), b * np.sin(off)), expected, rtol=1e-9)
 
-    @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)])
-    def test_views_find_up(self, up: tuple[float, float, float]) -> None:
-        above = np.array(up)
-        forward = np.cross(above, [0.3, 0.5, 0.1])
-        forward /= np.linalg.norm(forward)
-        T = np.eye(4)
-        T[:3, :3] = np.stack([np.cross(forward, above), -above, forward], axis=1)
-        oblique = oblique_view(T[None])
-        np.testing.assert_allclose(oblique.vertical, above, atol=1e-12)
-        assert oblique.towards @ above == pytest.approx(np.sin(np.radians(35)))
-        assert oblique.towards @ forward == pytest.approx(-np.cos(np.radians(35)))
-
 
 def snapshot(frame: str, mean: list[list[float]], m: list[float], sigma: float = 0.3) -> Snapshot:
     covariance = np.eye(3)[None].repeat(len(m), 0) * sigma**2
@@ -271,23 +222,6 @@ class TestRooms:
         assert self.pixels(tmp_path / "r.png", [one], 2.0) == 0
         assert self.pixels(tmp_path / "r.png", [higher], 2.0) > 300
 
-    def test_same_scale_at_all_times_and_colours_of_root_m(self, tmp_path: Path) -> None:
-        times = [snapshot("0", [[0, 0, 2]], [0.25]), snapshot("1", [[0, 0, 2], [2, 0, 2]], [0.25, 4.0])]
-        scale = draw_room(tmp_path / "r.png", times, "room")
-        assert scale.high == pytest.approx(np.percentile([0.5, 0.5, 2.0], 99))
-        with Image.open(tmp_path / "r.png") as picture:
-            drawn = np.asarray(picture.convert("RGB")).astype(int)
-        expected = 0.85 * scale.rgb(np.array(0.5)).astype(float) + 0.15 * 255  # on white
-        halves_ = np.array_split(drawn, 2, axis=1)
-        for half in halves_:
-            assert (np.abs(half - expected).max(-1) <= 2).sum() > 300
-
-    def test_what_was_seen_once_is_grey(self, tmp_path: Path) -> None:
-        one = snapshot("f", [[0, 0.2, 2], [2, 0.2, 2]], [0.25, 0.0])
-        assert self.pixels(tmp_path / "r.png", [one], 0.0) > 300
-        assert self.pixels(tmp_path / "r.png", [replace(one, count=np.array([2, 1]))], 0.0) == 0
-        assert self.pixels(tmp_path / "r.png", [replace(one, count=np.array([2, 1]))], np.nan) > 300
-
     def test_snapshots_are_found_in_order(self, tmp_path: Path) -> None:
         (tmp_path / "room").mkdir()
         maps = {"mean_world": np.zeros((0, 3)), "covariance_world": np.zeros((0, 3, 3)), "disagreement": np.zeros(0)}
@@ -306,19 +240,6 @@ class TestRooms:
             find_rooms(tmp_path)
 
 
-class TestChoice:
-    def test_frames_of_many_sequences_first(self) -> None:
-        names = [("a", "1"), ("a", "2"), ("a", "3"), ("b", "1"), ("c", "1"), ("c", "2")]
-        result = choose([example({}, sequence=s, frame=f) for s, f in names], 4)
-        assert [(e.sequence, e.frame) for e in result] == [("a", "3"), ("a", "2"), ("b", "1"), ("c", "2")]
-
-    def test_rows_of_a_strip(self) -> None:
-        rows = rows_of("UfM-MCD", "Ensemble", "UfM-Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "UfM*-FullEnsemble")
-        noisy = Row(rows[4].method, Setting(skip=2))
-        assert strip_rows([*rows, noisy], "ensemble") == [rows[1], rows[3], rows[4]]
-        assert strip_rows(rows[:3], "ensemble") == [rows[1], rows[2]]
-
-
 class TestWritePictures:
     def test_all_kinds_with_their_words(self, evaluation: Path, tmp_path: Path) -> None:
         sequence = KITCHEN[1]  # no name for a folder
@@ -330,12 +251,3 @@ class TestWritePictures:
         assert f"Ensemble (mean NLL {nll:.2f})" in pictures[0].alt
         assert "2 Gaussians" in pictures[3].alt
         assert all(p.title.startswith(sequence) for p in pictures)
-
-    def test_a_picture_that_fails_is_named(self, evaluation: Path, tmp_path: Path, monkeypatch: Any) -> None:
-        def broken(*_: object) -> None:
-            raise ValueError("broken")
-
-        monkeypatch.setattr(pictures_module, "draw_breakdown", broken)
-        monkeypatch.setattr("ufmstar_torch.eval.report.write.figures_of", lambda _: [])
-        out = shutil.copytree(evaluation, tmp_path / "o")
-        assert write_report(out).undrawn == {f"{KITCHEN[1]}, frame 7: breakdown": "broken"}

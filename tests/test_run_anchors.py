@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
 import torch
-from runs import Brightness, job_of, networks, outputs, read_summary
+from runs import job_of, outputs, read_summary, records
 
-from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig, UncertainDepth, cli
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig, cli
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.commands.run import job_from, read
 from ufmstar_torch.eval.engine.maps import MapSource
@@ -18,19 +17,15 @@ from ufmstar_torch.eval.report.text import run_table
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.panels import map_columns
 from ufmstar_torch.eval.run.pictures import Finished
-from ufmstar_torch.eval.run.recorder import why_none
 from ufmstar_torch.eval.run.run import run
-from ufmstar_torch.eval.run.video import preview_frame
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.sequences.images import read_depth
 from ufmstar_torch.eval.sequences.open import open_sequence
-from ufmstar_torch.models import Preprocess
 
 TOUR = "tour:5?frames=8&size=120x160"
 ON = UfMStarConfig(on_bad_frame="skip", anchors=AnchorConfig())
 OFF = ON.replace(anchors=None)
-CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
@@ -62,14 +57,6 @@ def finished(tour, tmp_path_factory):
     """An undisturbed run: its folder and summary."""
     out = tmp_path_factory.mktemp("finished") / "out"
     return out, run(map_job(tour), out)
-
-
-def records(out):
-    return [json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines()]
-
-
-def same(stored, expected):
-    np.testing.assert_array_equal(stored, expected[0].numpy())
 
 
 # ---- the same as by hand ----
@@ -109,22 +96,6 @@ def test_a_run_with_maps_equals_a_loop_by_hand(tour, finished):
     assert summary["time"]["median_ms"]["anchors"] > 0
 
 
-def test_a_run_with_a_network_equals_a_loop_by_hand(tour, tmp_path):
-    preprocess = Preprocess(size=(60, 80))
-    by_hand = UncertainDepth(Brightness(), ON, preprocess=preprocess)
-    run(job_of(tour, networks(Brightness(), preprocess=preprocess), config=ON), tmp_path / "out")
-    tracker = LandmarkTracker()
-    for frame in tour:
-        K = torch.from_numpy(frame.intrinsics)
-        anchors = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics).anchors(frame.intrinsics, K)
-        image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
-        result = by_hand(image, torch.from_numpy(frame.T_world_cam)[None], K[None], anchors=anchors)
-        stored = read_frame(tmp_path / "out" / "frames" / f"{frame.name}.npz")
-        same(stored["variance"], result.variance)
-        same(stored["anchored"], result.ufm.anchored)
-    assert stored["anchored"].max() > 0
-
-
 def test_without_anchors_nothing_is_said_of_them(tour, tmp_path):
     summary = run(map_job(tour, OFF, frames=slice(2)), tmp_path / "out")
     assert summary["anchors"] is None
@@ -151,17 +122,12 @@ def test_a_standing_camera_is_plain_ufm_star_and_the_summary_says_so(tour, tmp_p
         "no corner followed from the frame before": 1,
         "no parallax, or no track that fits the poses": 3,
     }
-    assert "without anchors: 4 of 4 frames (1 x no corner followed" in run_table(summary)
-    assert "; 4 before the first anchors: plain UfM*\n" in run_table(summary)
-    dense = {**summary, "source": {**summary["source"], "anchors": "dense"}}
-    assert "searched or seen again" in run_table(dense)
     for name in still.names:
         on, off = (read_frame(tmp_path / folder / "frames" / f"{name}.npz") for folder in ("on", "off"))
         np.testing.assert_array_equal(on["variance"], off["variance"])
 
 
 def test_what_was_learnt_stays_where_anchors_end(tour, finished, tmp_path):
-    """The last two frames have no image: their B is what was learnt before."""
     blind = with_entries(tour, lambda i, e: dataclasses.replace(e, load_image=None) if i >= 6 else e)
     summary = run(map_job(blind), tmp_path / "out")
     before, *rest = records(tmp_path / "out")[5:]
@@ -170,23 +136,7 @@ def test_what_was_learnt_stays_where_anchors_end(tour, finished, tmp_path):
         assert 0.6 < record["mean_anchored"] / before["mean_anchored"] < 1.5
     before = summary["anchors"]["frames_before_the_first"]
     assert before < 6
-    assert "1 x no corner followed" in run_table(summary)
     assert "2 x no image" in run_table(summary)
-    later = sum(summary["anchors"]["frames_without"].values()) - before
-    message = f"; {before} before the first anchors: plain UfM*; {later} later: with what was learnt before"
-    assert message in run_table(summary)
-
-
-@pytest.mark.parametrize(
-    ("counts", "why"),
-    [
-        ((0, 0), "no parallax"),
-        ((4, 0), "none lies on a pixel with a depth"),
-        ((4, 4), "contradict each other"),
-    ],
-)
-def test_why_a_frame_has_none(counts, why):
-    assert why in why_none(*counts, "no parallax")
 
 
 def test_a_frame_with_a_bad_pose_does_not_spoil_the_tracks(tour, tmp_path):
@@ -273,26 +223,12 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
     assert np.nanmean(panel.maps["posterior_error"]) < 0.7 * np.nanmean(panel.maps["error"])
 
 
-def test_pictures_have_a_column_for_what_anchors_add(tour, finished, tmp_path):
-    out, done = finished[0], records(finished[0])
-    panel = Finished(out, tour, done, with_error=True).panel(7)
-    stored = read_frame(out / "frames" / f"{tour.names[7]}.npz")
+def test_pictures_have_a_column_for_what_anchors_add(tour, finished):
+    panel = Finished(finished[0], tour, records(finished[0]), with_error=True).panel(7)
+    stored = read_frame(finished[0] / "frames" / f"{tour.names[7]}.npz")
     expected = np.where(stored["valid"], np.sqrt(stored["anchored"]), np.nan)
     np.testing.assert_array_equal(panel.maps["anchored"], expected)
-    assert panel.note == f"K = {done[7]['components']}, {done[7]['anchors']['used']} anchors"
-    plain = dataclasses.replace(panel, maps={k: v for k, v in panel.maps.items() if k != "anchored"})
-    columns, fewer = map_columns([panel]), map_columns([plain])
-    assert [column.label for column in columns] == ["depth", "σ", "√B", "|error|"]
-    width = panel.shape[1] * 240 / panel.shape[0]
-    gained = preview_frame(panel, columns).shape[1] - preview_frame(plain, fewer).shape[1]
-    assert abs(gained - width) < 8
-
-
-def test_settings_of_anchors_without_anchors_are_a_mistake(tmp_path, capfd):
-    words = ["run", TOUR, "--depth", "self", "--ufm.anchors.half_life", "10", "--out", str(tmp_path / "out")]
-    assert cli.main(words) == 2
-    assert "--ufm.anchors.* needs --anchors" in capfd.readouterr().err
-    assert not (tmp_path / "out").exists()
+    assert [column.label for column in map_columns([panel])] == ["depth", "σ", "√B", "|error|"]
 
 
 def test_images_and_opencv_are_needed(tour, monkeypatch, tmp_path):
@@ -306,23 +242,3 @@ def test_images_and_opencv_are_needed(tour, monkeypatch, tmp_path):
     monkeypatch.setattr("ufmstar_torch.eval.run.make_job.find_spec", lambda _: None)
     with pytest.raises(ModuleNotFoundError, match=r"--anchors needs OpenCV: pip install 'ufmstar-torch\[eval\]'"):
         job_from(options)
-
-
-# ---- the tracker's state ----
-
-
-def test_a_tracker_goes_on_from_its_state(tour):
-    whole, parts = LandmarkTracker(), LandmarkTracker()
-    for frame in tour:
-        fresh = LandmarkTracker()
-        fresh.load_state(parts.state())
-        parts = fresh
-        a, b = (t.update(frame.image, frame.T_world_cam, frame.intrinsics) for t in (whole, parts))
-        for name in ("pixel", "depth", "variance", "tracked"):
-            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-    assert len(a.depth) > 10
-    kept = parts.state()
-    parts.update(frame.image, frame.T_world_cam, frame.intrinsics)
-    assert int(kept["view"]) == int(parts.state()["view"]) - 1, "a copy"
-    with pytest.raises(ValueError, match=r"state\['pixel'\] must have shape"):
-        LandmarkTracker(TrackerConfig(max_points=9)).load_state(kept)

@@ -1,4 +1,4 @@
-"""What a run judges and shows: ground truth at the prediction's pixels, and the network's view of an image."""
+"""Inputs of a run's figures and pictures: truth at the prediction's pixels, and the network's view of an image."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from layouts import write_scannet
 from scenes import render
 from ufmstar_torch.eval.run.colours import INVALID_GREY
 from ufmstar_torch.eval.run.panels import FramePanel, map_columns
-from ufmstar_torch.eval.run.pictures import field_of_view, square_pixels
+from ufmstar_torch.eval.run.pictures import field_of_view
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.models import Preprocess
@@ -65,18 +65,6 @@ def test_sigma_is_striped_where_nothing_was_compared():
     assert grey[:, :40].mean() == pytest.approx(1 / 3, abs=0.02)
     assert not grey[:, 40:].any()
     assert not (depth == INVALID_GREY).all(-1).any()
-
-
-def test_square_pixels_keep_the_view():
-    K = np.array([[198.3, 0, 111.5], [0, 264.3, 119.6], [0, 0, 1]])
-    K_square, size = square_pixels(K, (224, 224))
-    assert size == (224, 299)
-    assert abs(K_square[0, 0] / K_square[1, 1] - 1) < 0.002
-    for corner in ([-0.5, -0.5], [223.5, 223.5]):
-        ray = (np.array(corner) - K[:2, 2]) / np.diag(K)[:2]
-        seen = np.diag(K_square)[:2] * ray + K_square[:2, 2]
-        edge = [-0.5, -0.5] if corner[0] < 0 else [size[1] - 0.5, size[0] - 0.5]
-        np.testing.assert_allclose(seen, edge, atol=1e-9)
 
 
 def test_the_shown_image_is_what_the_network_saw():

@@ -8,7 +8,6 @@ import pytest
 from layouts import quaternion_line
 
 from ufmstar_torch.eval.sequences import Trajectory, interpolate_pose, open_sequence
-from ufmstar_torch.eval.sequences.attach import frame_numbers
 
 FRAMES = 6
 # Frame numbers as the layouts' writers name them.
@@ -78,14 +77,6 @@ def test_kitti_rows_by_place_and_a_wrong_count(numbered):
         open_sequence(path, **options)
 
 
-def test_the_layouts_own_poses_are_not_needed(tmp_path):
-    path, _, _ = layouts.write_scannet(tmp_path)
-    (path / "pose" / "1.txt").write_text("-inf -inf -inf -inf\n" * 4)
-    (path / "pose" / "2.txt").unlink()
-    write(tmp_path / "slam.txt", range(FRAMES), form="{}")
-    assert_moved(open_sequence(path, trajectory=tmp_path / "slam.txt"), range(FRAMES))
-
-
 def test_orb_slam3_in_nanoseconds(tmp_path):
     """EuRoC's format: whole nanoseconds since 1970, of a recording whose images have seconds."""
     path, _ = layouts.write_tum(tmp_path)
@@ -130,20 +121,3 @@ def test_whole_seconds_of_a_video_are_seconds(tmp_path):
     assert len(sequence) == 41
     expected = interpolate_pose(Trajectory(np.arange(5.0), np.stack([poses[10 * i] for i in range(5)])), 1.5, 1.0)
     np.testing.assert_allclose(sequence.entries[15].T_world_cam, expected, atol=1e-9)
-
-
-def test_frame_numbers_of_names():
-    assert frame_numbers(["frame-000012", "frame-000013"]).tolist() == [12, 13]
-    assert frame_numbers(["000012_left", "7"]).tolist() == [12, 7]
-    assert frame_numbers(["1.5", "2"]) is None
-    assert frame_numbers(["a", "b"]) is None
-    assert frame_numbers([]) is None
-
-
-@pytest.mark.parametrize("layout", ["scannet", "7scenes", "tartanair"])
-def test_frames_per_second_go_with_a_trajectory(tmp_path, layout):
-    path = NUMBERED[layout][0](tmp_path, frames=1)[0]
-    with pytest.raises(ValueError, match=f"layout '{layout}' takes no fps"):
-        open_sequence(path, fps=30)
-    with pytest.raises(FileNotFoundError, match=r"no such file or folder: absent\.txt"):
-        open_sequence(path, trajectory="absent.txt")

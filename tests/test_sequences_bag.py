@@ -189,12 +189,6 @@ def test_what_does_not_fit_is_named(tmp_path, how, options, message):
         open_sequence(path, **options)
 
 
-def test_other_layouts_take_no_topics(tmp_path):
-    path, _ = layouts.write_generic(tmp_path)
-    with pytest.raises(ValueError, match="layout 'generic' takes no topics"):
-        open_sequence(path, topics=["/image"])
-
-
 def test_a_trajectory_replaces_the_poses(tmp_path):
     path, truth = written.write_bag(tmp_path, poses="")
     times = [(written.START + i * written.STEP) * 1e-9 for i in range(6)]
@@ -222,7 +216,6 @@ def test_a_topic_whose_messages_are_missing_is_named(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_bags(tmp_path, kind):
-    """Cut anywhere, spoiled, emptied: an error that names the file, or frames that can be read or are named."""
     path, truth = written.write_bag(tmp_path, kind, depth="16UC1")
     file = path if kind == "ros1" else next(path.glob(f"*.{kind}"))
     whole, rng, read = file.read_bytes(), random.Random(0), 0

@@ -42,10 +42,19 @@ WRITERS = {
 }
 
 
-@pytest.mark.parametrize("kind", WRITERS)
+OTHERS = {
+    "tum": layouts.write_tum,
+    "tartanair": layouts.write_tartanair,
+    "tartanair-below": lambda root: (layouts.write_tartanair(root)[0].parent, layouts.write_tartanair(root / "o")[1]),
+    "generic": layouts.write_generic,
+}
+
+
+@pytest.mark.parametrize("kind", [*WRITERS, *OTHERS])
 def test_what_is_read_is_what_was_written(tmp_path, kind):
-    path, truth, *_ = WRITERS[kind](tmp_path)
-    sequence = pickle.loads(pickle.dumps(open_sequence(path)))
+    path, truth, *_ = (WRITERS | OTHERS)[kind](tmp_path)
+    distortion = {"distortion": "none"} if kind == "tum" else {}
+    sequence = pickle.loads(pickle.dumps(open_sequence(path, **distortion)))
     assert sequence.layout == kind.split("-")[0]
     assert sequence.metric == (sequence.layout != "colmap")
     assert (len(sequence), sequence.image_size, sequence.skipped) == (6, layouts.SIZE, ())
@@ -53,6 +62,7 @@ def test_what_is_read_is_what_was_written(tmp_path, kind):
         np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-9)
         np.testing.assert_array_equal(frame.image, truth.images[i])
         np.testing.assert_allclose(frame.intrinsics, truth.K, atol=1e-9)
+        assert (frame.image.dtype, frame.T_world_cam.dtype) == (np.uint8, np.float64)
         if sequence.layout == "euroc":
             assert frame.depth is None
             assert frame.timestamp == pytest.approx(1403715273.262142976 + 0.05 * i, abs=1e-6)
@@ -144,16 +154,16 @@ def test_distortion_of_any_layout_and_tum_s_own(tmp_path):
     np.testing.assert_allclose(sequence.intrinsics, lens.K, atol=1e-12)
     assert (sequence[0].image != truth.images[0]).any()
     assert (sequence[0].depth != open_sequence(path)[0].depth).any(), "depth was registered to the distorted image"
-    with pytest.raises(ValueError, match="'own' is known for layout 'tum' only"):
-        open_sequence(path, distortion="own")
     for bad in ((0.1,), ("fisheye", 1, 2), "k1", (0.1, np.nan, 0, 0)):
         with pytest.raises(ValueError, match="distortion"):
             open_sequence(path, distortion=bad)
     with pytest.raises(ValueError, match=r"fold the image's border|shrink the image"):
         open_sequence(path, distortion=(-9.0, 0, 0, 0))[0]
     tum, _ = layouts.write_tum(tmp_path)
-    own = open_sequence(tum, distortion="own")
-    assert own.intrinsics[0, 0] != open_sequence(tum).intrinsics[0, 0]
+    K = open_sequence(tum, distortion="none").intrinsics
+    published = Lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), layouts.SIZE, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172))
+    np.testing.assert_allclose(open_sequence(tum).intrinsics, published.K, atol=1e-12)
+    np.testing.assert_allclose(open_sequence(tum, intrinsics=K).intrinsics, K, atol=1e-12)
     assert parse_distortion(["fisheye", "1", "2", "3", "4"]) == ((1, 2, 3, 4), True)
 
 
@@ -241,8 +251,6 @@ def test_transforms_from_structure_from_motion_have_no_scale(tmp_path):
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_damaged_files_are_named_or_their_frames_skipped(tmp_path, kind):
-    """Every text or binary file cut anywhere, spoiled, emptied: the frames read stay right, or the error names a
-    file."""
     path, truth, *_ = WRITERS[kind](tmp_path / "good")
     rng, messages = random.Random(0), []
     suffixes = (".bin", ".txt", ".json", ".csv", ".yaml", ".traj", ".pincam")

@@ -54,13 +54,6 @@ def test_sorted_order_counts_skipped_frames(tmp_path):
         folder.for_frames(NAMES[1:])
 
 
-def test_missing_maps_are_listed(tmp_path):
-    write_pngs(tmp_path, NAMES)
-    (tmp_path / f"{NAMES[1]}.png").unlink()
-    with pytest.raises(ValueError, match=r"no map for 1 of 3 frames \(000001_left\)"):
-        DepthFolder(tmp_path, scale=1e-3).for_frames(NAMES)
-
-
 def test_variance_beside_depth_in_one_npz(tmp_path):
     for name, depth in zip(NAMES, DEPTHS, strict=True):
         variance = 0.01 * depth

@@ -247,16 +247,6 @@ def test_the_depth_channel_is_found(tmp_path, names):
     np.testing.assert_array_equal(read_depth(tmp_path / "d.exr"), channels[expected])
 
 
-@pytest.mark.parametrize("compression", ["NO", "PIZ", "ZIPS"])
-@pytest.mark.parametrize("tiled", [False, True])
-def test_compressions_and_tiles(tmp_path, compression, tiled):
-    OpenEXR = pytest.importorskip("OpenEXR")
-    values = RNG.uniform(1, 2, (70, 90)).astype(np.float32)
-    tiles = {"tiles": OpenEXR.TileDescription()} if tiled else {}
-    write_exr(tmp_path / "d.exr", {"Z": values}, compression, **tiles)
-    np.testing.assert_array_equal(read_depth(tmp_path / "d.exr"), values)
-
-
 def test_what_is_no_depth_in_an_exr_is_named(tmp_path, capfd):
     values = np.ones((4, 6), np.float32)
     write_exr(tmp_path / "d.exr", {"B": values, "U": values})

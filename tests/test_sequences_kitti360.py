@@ -12,8 +12,7 @@ from layouts_more import DRIVE, T_car_rect, write_kitti360
 
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences import FrameError, find_sequences, open_sequence
-from ufmstar_torch.eval.sequences.ground_truth import project
-from ufmstar_torch.eval.sequences.kitti360 import read_scan, unroll
+from ufmstar_torch.eval.sequences.kitti360 import read_scan
 
 NUMBERS = (3, 4, 6, 7, 8)
 NAMES = tuple(f"{n:010d}" for n in NUMBERS)
@@ -109,7 +108,6 @@ def test_a_root_with_several_drives(root):
 
 
 def test_the_right_camera(tmp_path):
-    """Its poses follow from camera 00's and both mountings; its depth too."""
     drive, truth = write_kitti360(tmp_path, camera="01")
     sequence = open_sequence(drive)
     assert sequence.name == f"{DRIVE}_image_01"
@@ -172,18 +170,6 @@ def test_missing_and_broken_files(root):
     assert "size must be a multiple of 16 bytes" in str(errors[2])
 
 
-def test_a_pose_that_is_not_finite_is_skipped(root):
-    text = (root / POSES).read_text().splitlines()
-    text[2] = " ".join(["6", *["-inf"] * 16])
-    (root / POSES).write_text("\n".join(text))
-    sequence = open_sequence(root, scans=1)
-    assert {frame.name: frame.reason for frame in sequence.skipped} == {
-        "0000000005": "no pose for this frame number",
-        "0000000006": "non-finite pose",
-    }
-    assert np.isfinite(sequence[2].depth).all()
-
-
 @pytest.mark.parametrize(
     ("file", "old", "new", "error"),
     [
@@ -224,18 +210,6 @@ def test_a_trajectory_by_time_and_by_frame_number(written, tmp_path):
         np.testing.assert_allclose(sequence[3].depth[::2, ::3], truth.depths[3][::2, ::3], rtol=1e-4)
 
 
-def test_unroll_closed_forms():
-    """Forward motion of 1 m per turn; then a turn of the car by 0.1 rad per turn of the head."""
-    left, right, front = np.array([0.0, 10, 1]), np.array([0.0, -10, 1]), np.array([10.0, 0, 1])
-    points = np.stack([left, right, front], axis=1)
-    T_before = layouts_more.rigid(np.eye(3), (-1.0, 0, 0))  # a turn ago the laser stood 1 m behind
-    moved = unroll(points, T_before)
-    np.testing.assert_allclose(moved.T, [[-0.25, 10, 1], [0.25, -10, 1], [10, 0, 1]], atol=1e-12)
-    turned = unroll(points, layouts_more.rigid(layouts_more.turn(0, 0, np.degrees(0.1)), (0, 0, 0)))
-    angles = np.arctan2(turned[1], turned[0])
-    np.testing.assert_allclose(angles, [np.pi / 2 + 0.025, -np.pi / 2 - 0.025, 0], atol=1e-12)
-
-
 def test_read_scan_leaves_the_car_and_what_is_not_finite_out(tmp_path):
     rows = [[1, 0.5, 0, 9], [10, 0, 0, 9], [np.nan, 10, 0, 9], [-3, 0, 0, 9]]
     (tmp_path / "a.bin").write_bytes(np.array(rows, "<f4").tobytes())
@@ -244,11 +218,3 @@ def test_read_scan_leaves_the_car_and_what_is_not_finite_out(tmp_path):
     for name, reason in (("b.bin", "is no scan"), ("c.bin", "cannot be read")):
         with pytest.raises(FrameError, match=reason):
             read_scan(tmp_path / name)
-
-
-def test_project_takes_the_nearest_point_in_front():
-    K = np.array([[10.0, 0, 2], [0, 10, 1], [0, 0, 1]])
-    points = np.array([[0.0, 0, 2], [0.05, 0, 1], [0, 0, -1], [9, 0, 1], [0.1, -0.1, 1]]).T
-    expected = np.zeros((3, 5), np.float32)
-    expected[1, 2], expected[0, 3] = 1, 1
-    np.testing.assert_array_equal(project(points, K, (3, 5)), expected)

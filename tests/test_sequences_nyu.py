@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from layouts import truncate
 from layouts_more import write_h5, write_nyu
 from tiny_suite import evaluate
@@ -14,8 +13,6 @@ from ufmstar_torch.eval.engine.evaluate import SequenceError
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences import FrameError, find_sequences, open_sequence
-from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.models.preprocess import Preprocess
 
 NAMES = ("kitchen_1__9", "kitchen_1__10", "office_2__11", "office_2__12")
 
@@ -45,23 +42,6 @@ def test_parts_and_scenes(written):
     assert open_sequence(root / "train").names == ("den__1",)
     result = find_sequences(root.parent)  # one set, not one per scene, and not the training part
     assert [(one.name, one.layout, one.path) for one in result] == [("nyudepthv2__val", "nyu", root / "val")]
-
-
-def test_the_validation_crop_is_the_fields(written):
-    """480 x 640 -> height 250 -> centre 228 x 304 -> 224 x 224, with K and truth that follow."""
-    root, _ = written
-    rng = np.random.default_rng(0)
-    depth = rng.uniform(1, 5, (480, 640)).astype(np.float32)
-    write_h5(root / "val" / "zoo" / "1.h5", rng.integers(0, 256, (3, 480, 640), np.uint8), depth)
-    frame = open_sequence(root / "val" / "zoo")[0]
-    nyu = Preprocess.nyu()
-    K = nyu.apply_intrinsics(torch.from_numpy(frame.intrinsics), 480, 640)
-    rx, ry = 333 / 640, 250 / 480
-    assert float(K[0, 0]) == pytest.approx(518.857901 * rx * 224 / 304, rel=1e-9)
-    assert float(K[1, 1]) == pytest.approx(519.469611 * ry * 224 / 228, rel=1e-9)
-    assert float(K[0, 2]) == pytest.approx(((325.582449 + 0.5) * rx - 14) * 224 / 304 - 0.5, rel=1e-9)
-    expected = nyu.apply_depth(torch.from_numpy(depth)).numpy()
-    np.testing.assert_array_equal(truth_at(frame, K.numpy(), (224, 224)), expected)
 
 
 def test_holes_are_no_depth(written):

@@ -146,14 +146,6 @@ def test_interpolation_needs_samples_around(tmp_path):
         interpolate_pose(without_times, 0.0, 1.0)
 
 
-def test_association_prefers_the_closest_and_uses_each_once():
-    first, second = np.array([0.00, 0.03]), np.array([0.02, 0.021])
-    # 0.03 takes 0.021 (9 ms); 0.02 is left for 0.00, exactly at the limit
-    assert associate(first, second, 0.02) == {1: 1, 0: 0}
-    assert associate(first, second, 0.019) == {1: 1}
-    assert associate(np.array([0.0, 0.01]), np.array([0.009]), 0.02) == {1: 0}
-
-
 def brute_force_association(first, second, limit):
     """All pairs within the limit, closest first, each index used once."""
     pairs, used = {}, set()

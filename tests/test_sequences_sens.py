@@ -33,7 +33,7 @@ def file(written, tmp_path):
 
 
 def frame_offsets(path):
-    """Where each frame begins, by the sizes in the file alone."""
+    """Return the byte at which each frame begins, from the sizes in the file alone."""
     data, here, result = path.read_bytes(), HEADER, []
     for _ in range(struct.unpack_from("<Q", data, HEADER - 8)[0]):
         result.append(here)
@@ -164,7 +164,6 @@ def test_a_broken_header_is_refused(file, frames, message):
 
 
 def test_broken_frames_are_found_when_decoding(file):
-    """Bytes of a JPEG and of a depth map overwritten, an image of another size, a depth map too short."""
     data, offsets = bytearray(file.read_bytes()), frame_offsets(file)
     data[offsets[0] + FRAME : offsets[0] + FRAME + 60] = bytes(60)
     color, _ = struct.unpack_from("<2Q", data, offsets[1] + 80)
@@ -198,17 +197,3 @@ def test_frames_without_image_or_depth(file):
     assert {f.name: f.reason for f in sequence.skipped} == {"2": "non-finite pose", "3": "no image in the file"}
     assert sequence.without_depth == ("4",)
     assert sequence[-1].depth is not None
-
-
-def test_options_and_trajectories(written, tmp_path):
-    path, _, of_depth = written
-    assert open_sequence(path, depth_scale=2e-3)[0].depth.max() == pytest.approx(2 * open_sequence(path)[0].depth.max())
-    lines = [f"{i} {layouts.quaternion_line(T)}" for i, T in enumerate(of_depth.T_world_cam) if i != 4]
-    (tmp_path / "slam.txt").write_text("\n".join(lines))
-    sequence = open_sequence(path, trajectory=tmp_path / "slam.txt")
-    assert sequence.names == ("0", "1", "2", "3", "5")  # the lost frame 2 has a pose now, frame 4 none
-    np.testing.assert_allclose(sequence[2].T_world_cam, of_depth.T_world_cam[2], atol=1e-9)
-    with pytest.raises(ValueError, match="layout 'sens' takes no images"):
-        open_sequence(path, images="x")
-    with pytest.raises(ValueError, match="layout 'sens' takes no fps"):
-        open_sequence(path, fps=30)

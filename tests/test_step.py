@@ -94,7 +94,7 @@ def test_a_walk_agrees_with_the_oracle(backend, variant):
 
 
 def test_the_rendered_sequence_has_what_it_is_meant_to_test():
-    depths, poses, K, _, maps, matches, mixture = oracle_walk("default", 20)
+    *_, maps, matches, mixture = oracle_walk("default", 20)
     sizes = [len(frame.weights) for frame in maps]
     per_c = [len(ks) for frame in matches for ks in frame]
     per_k = [sum(k in ks for ks in frame) for frame in matches for k in range(100)]
@@ -103,22 +103,6 @@ def test_the_rendered_sequence_has_what_it_is_meant_to_test():
     assert min(per_c) == 0
     assert sizes[-1] > sizes[0] + 5, "new places must be seen"
     assert max(g["count"] for g in mixture) > 8, "places must be revisited"
-    # The occlusion filter must have had work to do: without it, other matches follow.
-    judge = oracle.Oracle(oracle_settings(SPGF), eta_occl=1.0)
-    hidden = 0
-    for i in range(12):
-        valid = np.isfinite(depths[i])
-        current = oracle.segment(np.where(valid, depths[i], 0), K, judge.spgf, valid=valid)
-        if judge.T_first is None:
-            judge.T_first = poses[i]
-        to_cam = oracle.relative(judge.T_first, poses[i])
-        previous = [oracle.transform(g, *to_cam) for g in judge.mixture]
-        loose, overlaps = oracle.correspond(previous, current, K, depths[i].shape, 0.5, 1.0, 0.05)
-        strict, _ = oracle.correspond(previous, current, K, depths[i].shape, 0.5, 0.7, 0.05)
-        hidden += sum(len(a) - len(b) for a, b in zip(loose, strict, strict=True))
-        to_first = oracle.relative(poses[i], judge.T_first)
-        judge.mixture = oracle.fuse(judge.mixture, [oracle.transform(g, *to_first) for g in current], strict, overlaps)
-    assert hidden > 0
 
 
 CONFIGS = {
@@ -158,7 +142,7 @@ def frames(count: int, config: UfMStarConfig, dtype: torch.dtype, streams: int =
 
 
 def tensors(out) -> dict[str, torch.Tensor]:
-    """What a frame returned, by name."""
+    """Return the tensors of a frame's output by name."""
     result = {f"statistics.{name}": value for name, value in vars(out.statistics).items()}
     result |= {f"current_cam.{name}": value for name, value in out.current_cam.tensors().items()}
     return {name: value for name, value in (result | vars(out)).items() if isinstance(value, torch.Tensor)}

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from layouts import truncate, write_generic, write_image
-from tiny_suite import CPU, base_network, evaluate, row, same, write_networks
+from tiny_suite import CPU, base_network, evaluate, row, same
 
 from ufmstar_torch.eval.engine.predictions import Predicted, frame_digest, sequence_digest
 from ufmstar_torch.eval.sequences import open_sequence
@@ -26,10 +26,8 @@ def path(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def networks(tmp_path_factory):
-    written = write_networks(tmp_path_factory.mktemp("networks"))
-    expected = {one.method.base for one in ROWS}
-    return {base: base_network(text, samples=3) for base, text in written.items() if base in expected}
+def networks(network_files):
+    return {base: base_network(network_files[base], samples=3) for base in {one.method.base for one in ROWS}}
 
 
 def maps(seed=0):

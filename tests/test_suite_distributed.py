@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import subprocess
 import sys
 import threading
@@ -16,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from pool_tasks import pool
-from tiny_suite import NAMES, TRUTH, Stub, go, job_on, kept
+from tiny_suite import NAMES, Stub, go, job_on, kept
 from trainings import SPEC
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
@@ -34,7 +33,7 @@ TORCHRUN = {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"}
 
 @pytest.fixture
 def whole(rooms, tmp_path):
-    """What one process that is not disturbed leaves, judging by the real judge."""
+    """The records that one undisturbed process leaves, from the real judge."""
     go(job_on(rooms, tmp_path / "whole"), evaluate_sequence)
     return kept(tmp_path / "whole")
 
@@ -79,7 +78,7 @@ def is_alive(number):
 
 
 def all_end(numbers):
-    """Whether processes end within seconds."""
+    """Return True if the processes end within seconds."""
     for _ in range(500):
         if not any(is_alive(number) for number in numbers):
             return True
@@ -137,16 +136,6 @@ def test_devices_go_round(monkeypatch):
     assert machine.device_of("cuda:1", 0) == "cuda:1"
 
 
-def test_a_job_is_the_same_in_another_process(rooms, tmp_path):
-    words = ["--suite", "ablation-anchors", "--network", TRUTH, "--root", f"rooms={rooms}", "--out", str(tmp_path)]
-    words += ["--frames", "1::2", "--cache", str(tmp_path / "cache"), "--truth-scale", "0.5", "--samples", "3"]
-    job = job_from(read(words))
-    again = pickle.loads(pickle.dumps(job))
-    assert again == job
-    assert [item.opening for item in again.items] == [item.opening for item in job.items]
-    assert [row.setting.to_dict() for row in again.suite.rows] == [row.setting.to_dict() for row in job.suite.rows]
-
-
 # ---- shards ----
 
 
@@ -189,9 +178,6 @@ def test_ranks_of_torchrun():
     assert rank_of(TORCHRUN) == (Shard(4, 4), 1)
     alone = {**TORCHRUN, "RANK": "0", "WORLD_SIZE": "1", "LOCAL_RANK": "0"}
     assert rank_of({}) == rank_of({"WORLD_SIZE": "4"}) == rank_of(alone) == (Shard(), 0)
-    for wrong, message in (({"RANK": "first"}, "must be numbers"), ({"RANK": "4"}, "RANK 4 must be in")):
-        with pytest.raises(ValueError, match=message):
-            rank_of({**TORCHRUN, **wrong})
 
 
 # ---- SLURM ----
@@ -214,9 +200,6 @@ def test_words_of_slurm():
     assert dict(slurm.parameters) == {
         "slurm_partition": "gpu", "mem_gb": 16, "slurm_qos": "high", "slurm_gres": "gpu:1"
     }  # fmt: skip
-    for words in (["gpu"], ["a=1", "a=2"], ["jobs=0"], ["jobs=many"], ["cluster=moon"], ["nodes=2"]):
-        with pytest.raises(ValueError, match="--slurm"):
-            Slurm.parse(words)
 
 
 class Submitted:
@@ -262,9 +245,3 @@ def test_jobs_that_fail_are_reported_and_stopping_cancels_all(
     assert (outcome.finished, outcome.stopped, outcome.complete) == (finished, stops, False)
     assert lines == [f"jobs 1, 2; their output is in {tmp_path}/slurm", *failed]
     assert cluster.cancelled == cancelled
-
-
-def test_without_submitit_the_error_names_what_to_install(rooms, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "submitit", None)
-    with pytest.raises(ImportError, match=r"pip install 'ufmstar-torch\[cluster\]'"):
-        evaluate_on_slurm(job_on(rooms, tmp_path), Slurm.parse([]), stop=lambda: False, report=print)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from layouts import truncate, write_generic, write_tum
-from tiny_suite import CPU, base_network, evaluate, row, same, unbatched, write_networks
+from tiny_suite import CPU, base_network, evaluate, row, same, unbatched
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.eval.engine.judge import SequenceError
@@ -19,7 +19,7 @@ from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.models import load_trained
-from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
+from ufmstar_torch.models.dropout import set_sampling
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction
@@ -29,13 +29,8 @@ FRAMES = 5
 
 
 @pytest.fixture(scope="module")
-def texts(tmp_path_factory):
-    return write_networks(tmp_path_factory.mktemp("networks"))
-
-
-@pytest.fixture(scope="module")
-def networks(texts):
-    return {base: base_network(text, samples=3) for base, text in texts.items()}
+def networks(network_files):
+    return {base: base_network(text, samples=3) for base, text in network_files.items()}
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +68,7 @@ def judged(sequence, maps, indices=None):
 
 
 def agrees(figures, expected):
-    """Whether all figures are equal but for those of what was left out, which a mask hides by hand."""
+    """Compare all figures but those of the pixels left out, which a mask hides by hand."""
     names = [name for name in expected if "left_out" not in name]
     assert figures.keys() == expected.keys()
     for name in names:
@@ -94,8 +89,8 @@ def through(estimator, members, sequence, *, aleatoric=True, poses=None, indices
 
 
 @pytest.mark.parametrize("base", ["ensemble", "batch_ensemble", "evidential", "aleatoric", "depth_only"])
-def test_a_row_equals_a_loop_by_hand(base, texts, networks, sequence):
-    members = members_of(texts[base])
+def test_a_row_equals_a_loop_by_hand(base, network_files, networks, sequence):
+    members = members_of(network_files[base])
     behind = {"ensemble": "Ensemble", "batch_ensemble": "BatchEnsemble", "depth_only": "DepthOnly"}
     name = behind.get(base, base.capitalize())
     rows = [row(f"UfM*-{name}"), row(f"UfM-{name}"), row(f"UfM-{name}-1K")]
@@ -111,8 +106,8 @@ def test_a_row_equals_a_loop_by_hand(base, texts, networks, sequence):
     assert result[rows[0].slug].state["smoothing_bytes"] == 4 * 32 * 64
 
 
-def test_full_and_alone_put_the_members_together(texts, networks, sequence):
-    members = members_of(texts["ensemble"])
+def test_full_and_alone_put_the_members_together(network_files, networks, sequence):
+    members = members_of(network_files["ensemble"])
     rows = [row("Ensemble"), row("UfM*-FullEnsemble"), row("UfM*-Ensemble")]
     result = evaluate(sequence, rows, networks)
     full = UncertainDepth(members, SKIP, mode="full", preprocess=members[0].preprocess)
@@ -141,14 +136,14 @@ def test_full_and_alone_put_the_members_together(texts, networks, sequence):
     assert result["Ensemble"].figures["delta1"] == result["UfMstar-FullEnsemble"].figures["delta1"]
 
 
-def test_depth_only_ignores_variances(texts, sequence):
-    with_head = base_network(texts["aleatoric"].replace("aleatoric", "depth_only", 1))
+def test_depth_only_ignores_variances(network_files, sequence):
+    with_head = base_network(network_files["aleatoric"].replace("aleatoric", "depth_only", 1))
     rows = [row("DepthOnly"), row("UfM*-DepthOnly")]
     result = evaluate(sequence, rows, {"depth_only": with_head})
     assert {"delta1", "rmse", "abs_rel"} < result["DepthOnly"].figures.keys()
     assert not {"nll", "ece_delta", "spearman"} & result["DepthOnly"].figures.keys(), "it has no variance"
     assert list(result["DepthOnly"].sums) == ["metrics"]
-    members = members_of(texts["aleatoric"])
+    members = members_of(network_files["aleatoric"])
     by_hand = judged(sequence, through(UfMStar(SKIP), members, sequence, aleatoric=False))
     assert agrees(result["UfMstar-DepthOnly"].figures, by_hand)
 
@@ -167,24 +162,24 @@ def test_ground_truth_as_prediction_shows_the_floor(sequence):
 # ---- MC-Dropout ----
 
 
-def test_samples_depend_on_the_frame_and_their_number_alone(texts, networks, sequence):
+def test_samples_depend_on_the_frame_and_their_number_alone(network_files, networks, sequence):
     network = networks["mc_dropout"]
     frames = [sequence[i] for i in range(3)]
     requested = [(2, 1), (0, 0), (1, 2), (0, 1), (2, 0), (2, 1), (0, 0)]
     first = {key: network.one(frames[key[0]], key[1]).maps.depth for key in requested}
-    other = base_network(texts["mc_dropout"], samples=3)
+    other = base_network(network_files["mc_dropout"], samples=3)
     for key in reversed(requested):
         assert torch.equal(other.one(frames[key[0]], key[1]).maps.depth, first[key])
     assert not torch.equal(first[0, 0], first[0, 1])
-    of_run = network_source("trained", [texts["mc_dropout"].partition(":")[2]], mode="full", samples=3)
+    of_run = network_source("trained", [network_files["mc_dropout"].partition(":")[2]], mode="full", samples=3)
     assert torch.equal(of_run.one(frames[2], 1).maps.depth, first[2, 1]), "ufmstar run draws the same"
     same_image = replace(frames[0], index=1)
     assert not torch.equal(network.one(same_image, 0).maps.depth, first[0, 0]), "each frame has its own draw"
 
 
-def test_mc_dropout_equals_seeded_passes_by_hand(texts, networks, sequence):
+def test_mc_dropout_equals_seeded_passes_by_hand(network_files, networks, sequence):
     result = evaluate(sequence, [row("UfM*-MCD"), row("MC-Dropout"), row("UfM*-FullMCD")], networks)
-    [member] = members_of(texts["mc_dropout"])
+    [member] = members_of(network_files["mc_dropout"])
     generator = torch.Generator()
     set_sampling(member, True, generator)
 
@@ -207,13 +202,6 @@ def test_mc_dropout_equals_seeded_passes_by_hand(texts, networks, sequence):
     assert agrees(result["UfMstar-MCD"].figures, judged(sequence, by_hand(1, UfMStar(SKIP))))
     assert agrees(result["MC-Dropout"].figures, judged(sequence, by_hand(3, None)))
     assert agrees(result["UfMstar-FullMCD"].figures, judged(sequence, by_hand(3, UfMStar(SKIP))))
-
-
-def test_a_network_that_samples_stops_doing_so_for_other_bases(texts, sequence):
-    text = texts["mc_dropout"].replace("mc_dropout", "aleatoric", 1)
-    network = base_network(text)
-    assert not isinstance(network.networks[0], MonteCarloDropout)
-    assert torch.equal(network.one(sequence[0], 0).maps.depth, network.one(sequence[0], 0).maps.depth)
 
 
 # ---- one pass ----
@@ -257,8 +245,8 @@ def test_every_inference_is_made_once(networks, sequence, monkeypatch):
     assert sorted(calls) == sorted(expected)
 
 
-def test_skip_and_limit_choose_frames_and_turns(texts, networks, sequence):
-    members = members_of(texts["ensemble"])
+def test_skip_and_limit_choose_frames_and_turns(network_files, networks, sequence):
+    members = members_of(network_files["ensemble"])
     one, two = row("UfM*-Ensemble", skip=1), row("UfM*-Ensemble")
     result = evaluate(sequence, [one, two], networks, limit=slice(1, None))
     assert (result[one.slug].frames["done"], result[two.slug].frames["done"]) == (2, 4)
@@ -299,13 +287,6 @@ def test_the_nll_by_error_is_over_the_pixels_where_the_reference_is_confident(ne
     for slug in ("UfMstar-Aleatoric", "UfM-Aleatoric"):
         assert torch.equal(actual[slug].sums[key]["count"], actual["Aleatoric"].sums[key]["count"])
     assert actual["UfMstar-Aleatoric"].curves["nll_by_error:Aleatoric"] != curves["nll_by_error:Aleatoric"]
-
-
-def test_a_row_is_compared_with_references_on_its_own_frames(networks, sequence):
-    rows = [row("Ensemble"), row("UfM*-Ensemble", skip=1), row("UfM-Ensemble-100K", skip=1), row("UfM*-FullEnsemble")]
-    result = evaluate(sequence, rows, networks)
-    assert set(result[rows[1].slug].sums) == {"metrics", *binned("UfM-Ensemble-100K")}
-    assert set(result[rows[3].slug].sums) == {"metrics", *binned("Ensemble")}
 
 
 # ---- what is left out ----

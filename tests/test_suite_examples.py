@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from layouts import truncate, write_generic
-from tiny_suite import base_network, evaluate, row, unbatched, write_networks
+from tiny_suite import base_network, evaluate, row, unbatched
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.sequences import open_sequence
@@ -17,9 +17,8 @@ ROWS = [row("UfM*-Aleatoric"), row("Aleatoric"), row("DepthOnly"), row("UfM-Alea
 
 
 @pytest.fixture(scope="module")
-def networks(tmp_path_factory):
-    texts = write_networks(tmp_path_factory.mktemp("networks"))
-    return {base: base_network(texts[base]) for base in ("aleatoric", "depth_only")}
+def networks(network_files):
+    return {base: base_network(network_files[base]) for base in ("aleatoric", "depth_only")}
 
 
 @pytest.fixture(scope="module")
@@ -111,11 +110,6 @@ def test_a_broken_frame_hands_its_place_to_the_next(networks, tmp_path):
     }
     rooms = {file.name for file in (tmp_path / "out" / "room").iterdir()}
     assert rooms == {f"UfMstar-Aleatoric_{sequence.names[i]}.npz" for i in (2, 4)}
-
-
-def test_without_ufm_star_there_are_no_mixtures(networks, sequence, tmp_path):
-    evaluate(sequence, ROWS[2:3], networks, sinks=[ExampleWriter(tmp_path, frames=1)])
-    assert [folder.name for folder in tmp_path.iterdir()] == ["examples"]
 
 
 def test_maps_of_another_camera_bring_their_own(networks, sequence, tmp_path):

@@ -9,6 +9,7 @@ import shutil
 import signal
 from dataclasses import replace
 
+import layouts
 import numpy as np
 import pytest
 import torch
@@ -19,6 +20,7 @@ from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.run.folder import FolderError
+from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.suite.cache import CacheError
 from ufmstar_torch.eval.suite.evaluate import with_references
 from ufmstar_torch.eval.suite.folder import EvalFolder
@@ -150,7 +152,6 @@ def test_images_without_poses_are_for_networks_alone(tmp_path):
 
 
 def test_poses_of_another_program(tmp_path):
-    """A trajectory in each sequence's folder, its own format: judged as if the poses were the sequence's own."""
     root = write_rooms(tmp_path / "own", ["ash", "birch"], frames=3)
     for name in ("ash", "birch"):
         shutil.copy(root / name / "poses.txt", root / name / "slam.txt")
@@ -236,3 +237,16 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, mon
     assert [(name, len(rows)) for name, rows in stub.asked] == [("birch", 2), ("cedar", 4)]
     go(job_on(rooms, tmp_path / "whole"))
     assert kept(job.out) == kept(tmp_path / "whole")
+
+
+def test_seven_scenes_with_its_own_calibration(tmp_path):
+    path, _, of_depth = layouts.write_seven_scenes(tmp_path)
+    np.savetxt(tmp_path / "T.txt", np.eye(4))
+    K = [of_depth.K[0, 0], of_depth.K[1, 1], of_depth.K[0, 2], of_depth.K[1, 2]]
+    words = ["--suite", "depth-only", "--network", "depth_only=ground-truth", "--root", path, "--out", "out"]
+    words += ["--T-color-depth", tmp_path / "T.txt", "--intrinsics", *K, "--depth-intrinsics", *K]
+    (item,) = job_from(read([str(word) for word in words])).items
+    expected = open_sequence(path, T_color_depth=np.eye(4), intrinsics=K, depth_intrinsics=K)
+    np.testing.assert_array_equal(item.open()[2].depth, expected[2].depth)
+    np.testing.assert_allclose(item.open()[2].depth, of_depth.depths[2], atol=1e-3)
+    np.testing.assert_array_equal(item.open()[2].T_world_cam, expected[2].T_world_cam)

@@ -18,9 +18,9 @@ from tiny_suite import NAMES, go, job_on, write_rooms
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
-from ufmstar_torch.eval.run.folder import FolderError, differences, hold
+from ufmstar_torch.eval.run.folder import FolderError, hold
 from ufmstar_torch.eval.suite.folder import EvalFolder
-from ufmstar_torch.eval.suite.work_items import Shard, WorkItem, content_digest, find_work, read_names
+from ufmstar_torch.eval.suite.work_items import Shard, WorkItem, find_work, read_names
 
 # ---- work list ----
 
@@ -31,12 +31,6 @@ def test_shards_take_every_sequence_exactly_once_and_equally_many(count, parts):
     shares = [Shard(index, parts).of(items) for index in range(1, parts + 1)]
     assert sorted(item for share in shares for item in share) == items
     assert max(map(len, shares)) - min(map(len, shares)) <= 1
-
-
-@pytest.mark.parametrize("text", ["0/2", "3/2", "1", "1/0", "a/b", "1/2/3", "-1/2"])
-def test_impossible_shards(text):
-    with pytest.raises(ValueError, match="--shard must be"):
-        Shard.parse(text)
 
 
 @given(st.lists(st.text(min_size=1, max_size=30), min_size=1, unique=True))
@@ -90,16 +84,6 @@ def test_mistaken_roots(tmp_path):
         find_work([str(tmp_path / "empty")])
     with pytest.raises(FileNotFoundError, match="nowhere"):
         find_work([str(tmp_path / "nowhere")])
-
-
-def test_the_digest_tells_other_poses(tmp_path):
-    folder = write_rooms(tmp_path, ["ash"], frames=2) / "ash"
-    item = WorkItem("d", "ash", str(folder), "auto")
-    before = content_digest(item.open())
-    assert content_digest(item.open()) == before
-    lines = (folder / "poses.txt").read_text().splitlines()
-    (folder / "poses.txt").write_text("\n".join(lines[::-1]))
-    assert content_digest(item.open()) != before
 
 
 # ---- the folder ----
@@ -208,17 +192,6 @@ def test_a_row_without_its_sums_or_with_half_a_record_is_missing(tmp_path):
 # ---- small parts ----
 
 
-def test_a_lock_is_held_by_one_and_keeps_the_content(tmp_path):
-    (tmp_path / "lock").write_text("kept")
-    first = hold(tmp_path / "lock")
-    assert hold(tmp_path / "lock", wait=0.05) is None
-    first.release()
-    second = hold(tmp_path / "lock")
-    assert second is not None
-    second.release()
-    assert (tmp_path / "lock").read_text() == "kept"
-
-
 @pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOSYS])
 def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch, code):
     def refuse(*_):
@@ -227,12 +200,6 @@ def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch, code):
     monkeypatch.setattr(fcntl, "flock", refuse)
     with pytest.raises(OSError, match="the file system does not support locks"):
         hold(tmp_path / "lock")
-
-
-def test_differences_name_five():
-    assert differences({"a": {"b": 1}}, {"a": {"b": 1}}) == ""
-    assert differences({"a": {"b": 1}}, {"a": {"b": 2}, "c": 0}) == "a.b was 1, now 2; c was null, now 0"
-    assert differences({}, {str(n): n for n in range(1, 8)}).endswith("and 2 more")
 
 
 @given(st.integers(1, 90), st.sampled_from([torch.int64, torch.float64]), st.integers(0, 2**31))

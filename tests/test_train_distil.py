@@ -123,7 +123,6 @@ def trained(source, monkeypatch, seed, steps=40):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_fastdepth_comes_to_state_it_too(tmp_path, seed):
-    """A tiny one, from nothing, on two tours that it is trained on."""
     size, lengths = (64, 96), {"tours": 2, "validation_tours": 1, "tour_frames": 8}
     spec = replace(SPEC, widths=0.1, size=size)
     recipe = Recipe(spec, clip_frames=CLIP, max_steps=200, batch_size=2 * CLIP, learning_rate=0.01, clip=10.0)

@@ -18,7 +18,7 @@ import torch
 from trainings import RECIPE, logged, tiny_job, with_network
 
 from ufmstar_torch.models.checkpoints import read_safetensors
-from ufmstar_torch.train.fit import fit, share_of_time
+from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.member import WEIGHTS, make_data
 
 # Sums depend on how many threads share them, and the processes that are compared have one.
@@ -159,12 +159,3 @@ def test_the_processes_above_had_unequal_numbers_of_valid_pixels(frames, tmp_pat
 def test_a_batch_that_cannot_be_divided_is_refused(frames, tmp_path):
     with pytest.raises(ValueError, match="batch_size 4 must be a multiple of the 3 processes"):
         make_data(tiny_job(frames, tmp_path, PLAIN), 0, 3)
-
-
-def test_time_is_divided_evenly():
-    import time
-
-    now = time.monotonic()
-    assert share_of_time(None, 3) is None
-    assert share_of_time(now + 30, 3) == pytest.approx(now + 10, abs=1)
-    assert share_of_time(now - 5, 3) == pytest.approx(now, abs=1)

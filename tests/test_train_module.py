@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import re
+
 import pytest
 import torch
 from depth_anything_files import write_depth_anything, write_other
 from torch import nn
 from torch.nn.functional import interpolate
-from trainings import tiny_job, write_frames
+from trainings import tiny_job
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.models import (
     AleatoricHead,
+    DepthAnything,
     EvidentialHead,
     MonteCarloDropout,
     Preprocess,
@@ -45,11 +49,6 @@ class Own(nn.Module):
         return features if self.returns == "features" else 2 + self.last(features).tanh()
 
 
-@pytest.fixture(scope="module")
-def frames(tmp_path_factory):
-    return write_frames(tmp_path_factory.mktemp("frames") / "walk")
-
-
 def data_of(frames):
     return tiny_job(frames, frames, augment=False).data
 
@@ -65,7 +64,6 @@ def image(seed=0):
 
 @pytest.mark.parametrize(("head", "channels"), [(AleatoricHead, 1), (EvidentialHead, 3)])
 def test_a_head_on_any_feature_map(head, channels):
-    """As a module of one's own: features of another resolution, a loss, and gradients of all its weights."""
     one = head(5)
     depth = torch.full((2, 8, 12), 2.0, requires_grad=True)
     distribution = one(torch.rand(2, 5, 4, 6), depth)
@@ -171,6 +169,34 @@ def test_a_checkpoint_from_the_command_line(frames, tmp_path, kind, capsys):
     else:
         assert declared.alignment.kind == "inverse"
         assert 0.5 < prediction.depth[prediction.depth > 0].median() < 5
+
+
+def test_a_checkpoint_without_its_image_processor(frames, tmp_path, capsys):
+    """That of Depth Anything is known; the error for another names the file and the declaration."""
+    for folder in (write_depth_anything(tmp_path / "known", "metric"), write_other(tmp_path / "dpt", "dpt")):
+        (folder / "preprocessor_config.json").unlink()
+    known = load_network("huggingface", tmp_path / "known")
+    assert known.preprocess == DepthAnything.from_pretrained(tmp_path / "known", keep_aspect=True).preprocess
+    (tmp_path / "spec.json").write_text('{"kind": "metric", "size": [64, 64]}')
+    words = [
+        "train",
+        "--backbone",
+        tmp_path / "dpt",
+        "--data",
+        "sequences",
+        "--root",
+        frames,
+        "--out",
+        tmp_path / "out",
+    ]
+    assert cli.main([*map(str, words), "--spec", str(tmp_path / "spec.json")]) == 2
+    error = capsys.readouterr().err
+    assert "dpt has no preprocessor_config.json" in error
+    spec = {"kind": "metric", **json.loads(re.search(r"spec: (\{.*\}\}),", error)[1].replace("...", "0.5, 0.5, 0.5"))}
+    spec["preprocess"]["size"] = [64, 64]
+    (tmp_path / "spec.json").write_text(json.dumps(spec))
+    network = load_network("huggingface", tmp_path / "dpt", spec=tmp_path / "spec.json")
+    assert network.preprocess == Preprocess(size=(64, 64), mean=(0.5,) * 3, std=(0.5,) * 3)
 
 
 @pytest.mark.parametrize("head", ["mc-dropout", "batch-ensemble"])

@@ -5,13 +5,10 @@ from __future__ import annotations
 import h5py
 import numpy as np
 import pytest
-import torch
 from scipy.io import savemat
 from training_data import PLAIN, nyu_frame, truncated, write_h5, write_nyu
 
-from ufmstar_torch.models import Preprocess
 from ufmstar_torch.train import NyuFrames, SampleDataset, SampleError, convert_labelled
-from ufmstar_torch.train.nyu import INTRINSICS
 
 
 def test_nyu_frames_are_what_the_files_hold(tmp_path):
@@ -25,26 +22,6 @@ def test_nyu_frames_are_what_the_files_hold(tmp_path):
         np.testing.assert_array_equal(raw.image, rgb)
         np.testing.assert_array_equal(raw.depth, depth)
     assert len(NyuFrames(tmp_path, "val")) == 3
-
-
-def test_nyu_validation_is_the_fields(tmp_path):
-    """480 x 640 by Preprocess.nyu(): 224 x 224, fx' = fx (333/640)(224/304), fy' = fy (250/480)(224/228)."""
-    rng = np.random.default_rng(0)
-    depth = rng.uniform(1, 9, (480, 640)).astype(np.float32)
-    write_h5(tmp_path / "val" / "official" / "00001.h5", rng.integers(0, 256, (3, 480, 640), np.uint8), depth)
-    frames = NyuFrames(tmp_path, "val")
-    K = frames.load(0).intrinsics
-    assert (K[0, 0], K[1, 1], K[0, 2], K[1, 2]) == INTRINSICS
-    sample = SampleDataset(frames, Preprocess.nyu())[0]
-    assert sample["image"].shape == (3, 224, 224)
-    fx, fy, cx, cy = INTRINSICS
-    expected = [fx * 333 / 640 * 224 / 304, fy * 250 / 480 * 224 / 228]
-    torch.testing.assert_close(sample["intrinsics"].diagonal()[:2], torch.tensor(expected, dtype=torch.float64))
-    # The depth of the network's pixel nearest to the optical axis is the one that the camera sees there.
-    v, u = (round(float(sample["intrinsics"][i, 2])) for i in (1, 0))
-    x = (u - float(sample["intrinsics"][0, 2])) / float(sample["intrinsics"][0, 0])
-    y = (v - float(sample["intrinsics"][1, 2])) / float(sample["intrinsics"][1, 1])
-    assert sample["depth"][v, u] == depth[round(fy * y + cy), round(fx * x + cx)]
 
 
 RGB, DEPTH = nyu_frame(0)
@@ -79,7 +56,6 @@ def test_a_broken_h5_is_named_or_skipped(how, tmp_path):
 
 
 def test_damage_anywhere_is_an_error_of_the_file_or_none_at_all(tmp_path):
-    """Cut and overwritten at many places: nothing but SampleError comes out."""
     path = tmp_path / "train" / "a" / "1.h5"
     write_h5(path, *nyu_frame(0))
     whole, frames = path.read_bytes(), NyuFrames(tmp_path, "train")

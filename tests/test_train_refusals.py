@@ -1,4 +1,4 @@
-"""What the settings of a training refuse: the call, and the field that the message names."""
+"""Settings that a training refuses: the call, and the field that the message names."""
 
 from __future__ import annotations
 

@@ -60,7 +60,6 @@ def walk():
 
 
 def test_figures_over_sequences_are_of_all_their_pixels(walk):
-    """The network's row against the definition, of one sequence and of the same one twice; and its modes are kept."""
     network = Own()
     network.features.eval()
     judged = judge_network(network, [walk], rows=("network",))["network"].compute()

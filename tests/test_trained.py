@@ -14,6 +14,7 @@ import torch
 from layouts import truncate, write_generic
 from runs import read_summary
 from safetensors.torch import load_file, save_file
+from tiny_suite import SPECS, make_networks, spec_of
 from torch import nn
 
 from ufmstar_torch import UncertainDepth, cli
@@ -24,8 +25,6 @@ from ufmstar_torch.models import (
     Ensemble,
     LazyMember,
     MonteCarloDropout,
-    NetworkSpec,
-    build_network,
     load_network,
     load_trained,
     read_info,
@@ -35,32 +34,6 @@ from ufmstar_torch.models import (
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.trained import load_for_training
 from ufmstar_torch.networks_in_turn import combine
-
-SPECS = {
-    "depth": {},
-    "aleatoric": {},
-    "evidential": {},
-    "mc_dropout": {"dropout": 0.2},
-    "batch_ensemble": {"members": 3},
-}
-
-
-def spec_of(method="aleatoric"):
-    return NetworkSpec(
-        method=method, widths=0.1, positive="softplus", size=(32, 64), preprocess="resize", **SPECS[method]
-    )
-
-
-def trained(spec, count=2, seed=0):
-    """Networks in eval mode whose weights and statistics have moved from where they began."""
-    torch.manual_seed(seed)
-    networks = [build_network(spec) for _ in range(count)]
-    with torch.no_grad():
-        for network in networks:
-            network.distribution(torch.rand(4, 3, *spec.size))
-            for parameter in network.parameters():
-                parameter += 0.05 * torch.randn_like(parameter)
-    return [network.eval() for network in networks]
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +65,7 @@ def predict(network, image):
 @pytest.mark.parametrize("lazy", [False, True])
 def test_what_was_saved_is_loaded_bit_for_bit(tmp_path, image, method, lazy):
     spec = spec_of(method)
-    networks = trained(spec)
+    networks = make_networks(spec)
     save_trained(tmp_path / "n.safetensors", networks, spec, info={"command": "ufmstar train", "nll": 0.25})
     loaded = load_trained(tmp_path / "n.safetensors", lazy=lazy)
     expected = members_of(networks)
@@ -108,7 +81,7 @@ def test_what_was_saved_is_loaded_bit_for_bit(tmp_path, image, method, lazy):
 
 def test_training_goes_on_from_a_file(tmp_path, image):
     spec = spec_of("batch_ensemble")
-    networks = trained(spec)
+    networks = make_networks(spec)
     save_trained(tmp_path / "n.safetensors", networks, spec)
     again = load_for_training(tmp_path / "n.safetensors")
     assert [type(network) for network in again] == [BatchEnsemble, BatchEnsemble]
@@ -119,7 +92,7 @@ def test_training_goes_on_from_a_file(tmp_path, image):
 
 
 def test_lazy_members_read_their_own_weights_only(tmp_path, image):
-    networks = trained(spec_of(), 3)
+    networks = make_networks(spec_of(), 3)
     file = tmp_path / "n.safetensors"
     save_trained(file, networks, spec_of())
     loaded = load_trained(file, lazy=True)
@@ -135,7 +108,7 @@ def test_lazy_members_read_their_own_weights_only(tmp_path, image):
 @pytest.mark.parametrize("offload", [False, True])
 def test_lazy_members_of_a_batch_ensemble_share_their_weights(tmp_path, image, offload):
     spec = spec_of("batch_ensemble")
-    networks = trained(spec)
+    networks = make_networks(spec)
     save_trained(tmp_path / "n.safetensors", networks, spec)
     for loaded in (lazies := load_trained(tmp_path / "n.safetensors", lazy=True, offload=offload), None):
         loaded = loaded or list(copy.deepcopy(nn.ModuleList(lazies)))
@@ -148,7 +121,7 @@ def test_lazy_members_of_a_batch_ensemble_share_their_weights(tmp_path, image, o
 @pytest.mark.parametrize("method", SPECS)
 def test_half_precision_is_half_the_file_and_nearly_the_network(tmp_path, image, method):
     spec = spec_of(method)
-    networks = trained(spec)
+    networks = make_networks(spec)
     save_trained(tmp_path / "full.safetensors", networks, spec)
     save_trained(tmp_path / "half.safetensors", networks, spec, half=True)
     sizes = [(tmp_path / name).stat().st_size for name in ("full.safetensors", "half.safetensors")]
@@ -164,7 +137,7 @@ def test_half_precision_is_half_the_file_and_nearly_the_network(tmp_path, image,
 
 
 def test_statistics_that_half_precision_cannot_hold_stay(tmp_path):
-    (network,) = trained(spec_of(), 1)
+    (network,) = make_networks(spec_of(), 1)
     norms = [m for m in network.modules() if isinstance(m, nn.BatchNorm2d)]
     with torch.no_grad():
         norms[0].running_var[0] = 1e5  # would be infinite
@@ -186,7 +159,7 @@ def test_statistics_that_half_precision_cannot_hold_stay(tmp_path):
 
 
 def test_networks_that_do_not_fit_their_spec(tmp_path):
-    networks = trained(spec_of())
+    networks = make_networks(spec_of())
     file = tmp_path / "n.safetensors"
     for wrong in (replace(spec_of(), method="evidential"), replace(spec_of(), widths=0.2)):
         with pytest.raises(ValueError, match=r"network 0 \(AleatoricNetwork\) is not what its spec describes"):
@@ -207,7 +180,7 @@ def test_networks_that_do_not_fit_their_spec(tmp_path):
 @pytest.fixture
 def file(tmp_path):
     path = tmp_path / "bad.safetensors"
-    save_trained(path, trained(spec_of()), spec_of(), info={"a": 1})
+    save_trained(path, make_networks(spec_of()), spec_of(), info={"a": 1})
     return path
 
 
@@ -257,7 +230,6 @@ def test_a_file_that_is_cut_off_or_missing(file, share):
 
 
 def test_damaged_weights_name_file_and_member(file, image):
-    """Whatever does not fit (test_checkpoints.py)."""
     rewritten(file, lambda tensors, metadata: tensors.pop("member.1.head.bias"))
     message = r"bad\.safetensors, member 1, does not fit .*1 missing: head.bias"
     with pytest.raises(CheckpointError, match=message):
@@ -269,7 +241,7 @@ def test_damaged_weights_name_file_and_member(file, image):
 
 
 def test_a_file_as_one_network(tmp_path, image):
-    networks = trained(spec_of())
+    networks = make_networks(spec_of())
     save_trained(tmp_path / "two.safetensors", networks, spec_of())
     save_trained(tmp_path / "one.safetensors", networks[0], spec_of())
     ensemble = load_network("trained", tmp_path / "two.safetensors")
@@ -325,7 +297,7 @@ def by_hand(scene, members, mode="alternate"):
 @pytest.mark.parametrize("method", ["aleatoric", "batch_ensemble"])
 def test_a_run_with_all_members_of_two_files(ufmstar, scene, tmp_path, mode, method):
     spec = spec_of(method)
-    networks = trained(spec, 3)
+    networks = make_networks(spec, 3)
     save_trained(tmp_path / "a.safetensors", networks[:2], spec)
     save_trained(tmp_path / "b.safetensors", networks[2], spec)
     files = (tmp_path / "a.safetensors", tmp_path / "b.safetensors")
@@ -353,7 +325,7 @@ MISTAKES = {
 def test_a_mistake_is_reported_in_one_line(ufmstar, tmp_path, name):
     words, message = MISTAKES[name]
     weights = tmp_path / "a.safetensors"
-    save_trained(weights, trained(spec_of(), 1), spec_of())
+    save_trained(weights, make_networks(spec_of(), 1), spec_of())
     code, _, err = ufmstar("--weights", weights, *[word.format(weights=weights) for word in words])
     assert (code, err.count("\n")) == (2, 1)
     assert message in err

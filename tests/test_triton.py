@@ -1,4 +1,4 @@
-"""What the GPU kernels have besides the steps' parts (``conftest.backend``): late growth, bits of matches, capture.
+"""GPU kernels beyond the steps' parts of ``conftest.backend``: late growth, bits of matches, capture.
 
 In Triton's interpreter, on CPU tensors, with ``TRITON_INTERPRET=1``; on a GPU as they are (``pytest -m gpu``).
 """

@@ -1,4 +1,4 @@
-"""What a type checker and an installation without extras say of a user's own script."""
+"""A user's script under a type checker, and in an installation without extras."""
 
 from __future__ import annotations
 
@@ -70,7 +70,6 @@ for call in (choosing, metrics, ranking, own_network, trajectory, hugging_face, 
 
 
 def test_every_package_of_an_extra_is_known():
-    """The table of packages and extras is pyproject's."""
     with (ROOT / "pyproject.toml").open("rb") as file:
         extras = tomllib.load(file)["project"]["optional-dependencies"]
     imported = {"opencv-python-headless": "cv2", "pillow": "PIL"}

@@ -41,11 +41,15 @@ SPECS = {
 }
 
 
-def write_network(path, method="aleatoric", count=1, seed=0):
-    """A file of FastDepths of a twentieth of the width, 32 x 64, moved from where they began; the file."""
-    spec = NetworkSpec(
+def spec_of(method="aleatoric"):
+    """FastDepth of a twentieth of the width, 32 x 64."""
+    return NetworkSpec(
         method=method, widths=0.05, positive="softplus", size=(32, 64), preprocess="resize", **SPECS[method]
     )
+
+
+def make_networks(spec, count=2, seed=0):
+    """Networks in eval mode whose weights and statistics have moved from where they began."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         networks = [build_network(spec) for _ in range(count)]
@@ -54,8 +58,13 @@ def write_network(path, method="aleatoric", count=1, seed=0):
                 network.distribution(torch.rand(4, 3, *spec.size))
                 for parameter in network.parameters():
                     parameter += 0.05 * torch.randn_like(parameter)
+    return [network.eval() for network in networks]
+
+
+def write_network(path, method="aleatoric", count=1, seed=0):
+    """A file of such networks; the file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_trained(path, [network.eval() for network in networks], spec)
+    save_trained(path, make_networks(spec_of(method), count, seed), spec_of(method))
     return path
 
 
@@ -74,7 +83,7 @@ def write_networks(folder):
 
 
 def base_network(text, **options):
-    """What a user typed, loaded."""
+    """Load the network that a user typed."""
     return NetworkChoice.parse(text).load(CPU, **options)
 
 
@@ -105,7 +114,7 @@ def unbatched(source, frame, n=0):
 
 
 def same(one, other):
-    """Whether two results agree to the last bit, times left aside."""
+    """Return True if two results agree to the last bit, times left aside."""
     return (
         one.frames == other.frames
         and repr(one.figures) == repr(other.figures)
@@ -202,7 +211,7 @@ def go(job, evaluate=None, **how):
 
 
 def kept(out):
-    """What does not depend on who computed it, or when: figures, curves and sums by file."""
+    """Return the figures, curves and sums by file, which depend on no process and no clock."""
     result = {}
     for path in sorted((out / "records").rglob("*.json")):
         values = json.loads(path.read_text())

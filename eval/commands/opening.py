@@ -20,7 +20,7 @@ class SequenceOptions:
     Attributes:
         layout: as docs/data.md names it; auto: by its files
         intrinsics: of the images: a file, or fx fy cx cy [px]
-        distortion: to undo: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or own (TUM RGB-D's)
+        distortion: to undo: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or none (default: TUM's own)
         depth_intrinsics: of the sequence's own depth maps: a file, or fx fy cx cy [px]
         truth_scale: metres per unit of the sequence's own depth
         max_truth: largest ground truth [m]

@@ -20,7 +20,7 @@ from ufmstar_torch.eval.sequences.images import depth_size
 from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.options import Options
 
-FISHEYE, OWN = "fisheye", "own"
+FISHEYE, NONE = "fisheye", "none"
 # The undistorted camera's focal lengths over the lens's: a fisheye of over 120 degrees is cut, so that its middle keeps
 # its resolution; beyond the upper end the coefficients are not those of a lens.
 _ZOOM = (0.5, 2.0)
@@ -81,15 +81,17 @@ class Lens:
 
 
 def parse_distortion(words: str | Sequence[str | float]) -> tuple[tuple[float, ...], bool]:
-    """Coefficients and whether they are a fisheye's, of numbers, or the word ``fisheye`` and numbers. Raises
+    """Coefficients and whether they are a fisheye's, of ``none``, of numbers, or of ``fisheye`` and numbers. Raises
     ValueError: another form."""
     listed = [words] if isinstance(words, str) else list(words)
+    if listed == [NONE]:
+        return (), False
     fisheye = listed[:1] == [FISHEYE]
     try:
         return tuple(float(word) for word in listed[fisheye:]), fisheye
     except ValueError:
         raise ValueError(
-            f"distortion must be k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or own (TUM RGB-D), got {words!r}"
+            f"distortion must be k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or none, got {words!r}"
         ) from None
 
 

@@ -7,11 +7,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.sequences import tum
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.images import within
 from ufmstar_torch.eval.sequences.layout import layout_of, readers
-from ufmstar_torch.eval.sequences.lens import OWN, parse_distortion, undistort
+from ufmstar_torch.eval.sequences.lens import parse_distortion, undistort
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
@@ -80,10 +79,7 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
         chosen.reject(layout, "fps")
     sequence = readers(chosen.plugin)[layout].read(path, chosen)
     if chosen.distortion is not None:
-        own = chosen.distortion in (OWN, (OWN,), [OWN])
-        if own and layout != "tum":
-            raise ValueError(f"distortion {OWN!r} is known for layout 'tum' only; give its coefficients")
-        coefficients = tum.distortion(path) if own else parse_distortion(chosen.distortion)
+        coefficients = parse_distortion(chosen.distortion)
         sequence = undistort(sequence, *coefficients, depth_too=chosen.depth_intrinsics is None)
     sequence = convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), poses)
     if chosen.max_truth is not None:

@@ -36,7 +36,7 @@ class Options:
     time_offset: float = 0.0  # added to the images' times [s]
     register: bool = True  # warp 7-Scenes' depth into the colour camera
     T_color_depth: np.ndarray | str | Path | None = None  # [4, 4] depth to colour camera [m], or its file (7-Scenes)
-    # Of the images' lens: k1 k2 p1 p2 [k3 [k4 k5 k6]], "fisheye" k1 k2 k3 k4, or "own": TUM's published one.
+    # Of the images' lens: k1 k2 p1 p2 [k3 [k4 k5 k6]], "fisheye" k1 k2 k3 k4, or "none". None: TUM's published one.
     distortion: str | Sequence[str | float] | None = None
     pose_scale: float | None = None  # metres per unit of the poses, and of a file of landmarks
     plugin: Sequence[str] = ()  # files with readers of one's own (``plugins``)

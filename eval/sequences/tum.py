@@ -16,14 +16,14 @@ from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, read_color
 from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.lens import undistort
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import associate, numbered_lines, read_trajectory
 
 LOOKED_FOR = "rgb.txt and groundtruth.txt"
 SCALE = 1 / 5000
 _NATIVE_SIZE = (480, 640)
-# The colour cameras' published calibration, by robot; their distortion (k1 k2 p1 p2 k3) is left in the images unless it
-# is asked for, and depth is registered to the distorted image.
+# The colour cameras' published calibration, by robot. Depth is registered to the distorted image (k1 k2 p1 p2 k3).
 _DISTORTION = {
     "1": (0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
     "2": (0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
@@ -42,7 +42,8 @@ def read(path: Path, options: Options) -> FrameSequence:
 
     A colour image is skipped where it is missing on disk or no pose is known at its time (the samples
     around it lie more than ``max_pose_gap`` apart, or it is outside the trajectory). One without a depth
-    map within ``max_time_difference`` stays, with ``depth`` None.
+    map within ``max_time_difference`` stays, with ``depth`` None. The lens's published distortion is undone, in
+    images and depth, unless ``distortion`` or ``intrinsics`` is given.
 
     Raises:
         ValueError: no usable frame; the camera is not named by the folder or the files (``freiburgN``) and
@@ -62,7 +63,10 @@ def read(path: Path, options: Options) -> FrameSequence:
     frames = attach(frames, color_times + options.time_offset, trajectory, options)
     size = first_image_size(path / file for file in color_files)
     K = _default_intrinsics(path, size) if options.intrinsics is None else read_intrinsics(options.intrinsics)
-    return make_sequence(path.resolve().name, "tum", frames, K, image_size=size, depth_size=depth_size(frames))
+    sequence = make_sequence(path.resolve().name, "tum", frames, K, image_size=size, depth_size=depth_size(frames))
+    if options.distortion is not None or options.intrinsics is not None or size is None:
+        return sequence
+    return undistort(sequence, _DISTORTION[_robot(path)], fisheye=False, depth_too=True)
 
 
 def read_file_list(path: Path) -> tuple[np.ndarray, list[str]]:
@@ -89,12 +93,6 @@ def _paired_depth(path: Path, color_times: np.ndarray, max_difference: float) ->
     pairs = associate(color_times, depth_times, max_difference)
     files = {i: path / depth_files[j] for i, j in pairs.items()}
     return {i: file for i, file in files.items() if file.is_file()}
-
-
-def distortion(path: Path) -> tuple[tuple[float, ...], bool]:
-    """The published coefficients of the sequence's camera, as ``parse_distortion`` returns them. Raises ValueError: the
-    camera is not named."""
-    return _DISTORTION[_robot(path)], False
 
 
 def _default_intrinsics(path: Path, size: Size | None) -> np.ndarray:
