@@ -80,13 +80,10 @@ def judge(maps: Maps, references: Mapping[str, Tensor]) -> tuple[Record, dict[st
     curves: dict[str, Any] = metrics.curves()
     sums = {"metrics": dict(metrics.state_dict())}
     for name, confident in references.items() if variance is not None else ():
-        by_error, of_all = NLLByError(), NLLByError(one_threshold=True)
+        by_error = NLLByError()
         by_error.update(depth, variance, truth, confident)
-        of_all.add_levels(depth, variance, truth, variance)
         curves[f"nll_by_error:{name}"] = by_error.compute()["nll_by_error"].tolist()
-        sums |= {
-            f"nll_by_error{kind}:{name}": dict(m.state_dict()) for kind, m in (("", by_error), ("_of_all", of_all))
-        }
+        sums[f"nll_by_error:{name}"] = dict(by_error.state_dict())
     return Record("", "", "", "", "", figures=metrics.compute(), curves=curves), sums
 
 

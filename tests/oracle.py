@@ -278,7 +278,7 @@ class Oracle:
         self.matches = []
 
     def share(self):
-        """Of the last frame, :func:`compared_share` [H, W]."""
+        """Return :func:`compared_share` [H, W] of the last frame."""
         return compared_share(*self.seen, **self.prior)
 
     def step(self, depth, T_world_cam, K, aleatoric=None, epistemic=None, features=None):

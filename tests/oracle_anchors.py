@@ -1,4 +1,4 @@
-"""What anchors add to UfM*, in NumPy float64 loops from docs/anchors.md; imports neither torch nor the package."""
+"""The terms of anchors in UfM*, in NumPy float64 loops from docs/anchors.md; imports neither torch nor the package."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ NEIGHBOURS, SUPPORT, SIGMAS, QUARTILE, LEAST, CLAIM = 8, 3, 2.5, 0.4506, 0.02, 4
 
 
 def believed(anchors):
-    """Which (u, v, depth, variance, predicted) enough of their nearest neighbours in the image support."""
+    """Mark each (u, v, depth, variance, predicted) that enough of its nearest neighbours in the image support."""
     if len(anchors) <= SUPPORT:
         return [True] * len(anchors)
     ratio = [np.log(g / d) for _, _, g, _, d in anchors]
@@ -30,7 +30,7 @@ def believed(anchors):
 
 
 def weight(claim, others):
-    """How much an anchor with the relative variance ``claim`` counts beside others with the errors ``others``."""
+    """Weight of an anchor with the relative variance ``claim`` beside others with the errors ``others``."""
     limit = min(CLAIM, len(others)) * max(LEAST**2, np.mean(np.square(others))) if others else 1.0
     return min(1.0, limit / claim) ** 2 if claim > 0 else 1.0
 

@@ -8,7 +8,7 @@ SIDE, FIRST = 8, -3.5
 
 
 def project(pixel, rho, H, b):
-    """Where a pixel (u, v) at an inverse depth rho [1/m] lies in the view."""
+    """Pixel of the view that shows a pixel (u, v) at an inverse depth rho [1/m]."""
     x = H @ np.array([*pixel, 1.0]) + rho * b
     return x[:2] / x[2]
 
@@ -63,7 +63,7 @@ def along_line(image, view, pixel, H, b, low, high):
 
 
 def displaced(pixel, rho, H, b, K, error):
-    """Where a pixel lies in a view whose pose and camera are wrong by ``error`` [10]: w, s, f, cx, cy, k."""
+    """Pixel in a view whose pose and camera are wrong by ``error`` [10]: w, s, f, cx, cy, k."""
     w, s, (focal, cu, cv, k) = error[:3], error[3:6], error[6:]
     R, t = np.linalg.inv(K) @ H @ K, np.linalg.inv(K) @ b
     fu, fv, u0, v0 = K[0, 0] * (1 + focal), K[1, 1] * (1 + focal), K[0, 2] + cu, K[1, 2] + cv

@@ -64,7 +64,7 @@ def density(x, g):
 
 
 def mean_shares(g, components, prior_weight):
-    """Of every component, its share in explaining the points of g, on average."""
+    """Mean share of every component in explaining the points of g."""
     table = []
     for x in points(g):
         each = np.array([h["weight"] * density(x, h) for h in components])

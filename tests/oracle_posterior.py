@@ -181,7 +181,7 @@ def update(state, depth, claimed, pixel, g, variance):
 
 
 def y_variance(shape, node, y, noise, used, centre):
-    """Of the used anchors around every node, each cell and certain anchor counted alike, weighted by a Gaussian of
+    """Variance over the used anchors around each node, each cell and certain anchor alike, weighted by a Gaussian of
     ``RADIUS`` of the image, and of one of variance .25 about ``centre``."""
     out, count = np.empty(shape), np.bincount(node, minlength=shape[0] * shape[1])
     for r in range(shape[0]):

@@ -20,14 +20,12 @@ from ufmstar_torch.eval.commands.poses import read as read_poses
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.setting import setting_from
 from ufmstar_torch.eval.methods.suite import Suite, suite_named
-from ufmstar_torch.eval.methods.ufm import UfMConfig
+from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics.recalibration import fit
-from ufmstar_torch.eval.report.write import write_report
 from ufmstar_torch.eval.run.colours import DEPTH_MAP, ColourScale
 from ufmstar_torch.eval.run.panels import FramePanel, contact_sheet
-from ufmstar_torch.eval.run.video import write_video
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.suite.shards import Slurm, rank_of
+from ufmstar_torch.eval.suite.shards import rank_of
 from ufmstar_torch.eval.suite.work_items import Shard
 from ufmstar_torch.eval.tour import make_tour, render, tour_path
 from ufmstar_torch.eval.tour.view import intrinsics
@@ -51,12 +49,6 @@ def tracked(**values: object) -> object:
 
 def poses(*words: str) -> object:
     return read_poses(["walk", "--out", "out", *words])
-
-
-def video(name: str, *shapes: tuple[int, ...], fps: float = 5) -> None:
-    with write_video(Path(name), fps) as add:
-        for shape in shapes:
-            add(np.zeros(shape, np.uint8))
 
 
 REFUSALS: list[tuple[Callable[[], object], str]] = [
@@ -90,15 +82,11 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
         for value in (-1.0, INF, NAN)
     ],
     (lambda: measure([row("UfM*-DepthOnly", rotation_drift=0.1)], {"depth_only": object()}, None), "no matter of"),
-    (lambda: UfMConfig(max_points=0), "UfMConfig.max_points"),
-    (lambda: UfMConfig(max_points=True), "UfMConfig.max_points"),
-    (lambda: UfMConfig(max_points=1e5), "UfMConfig.max_points"),
-    (lambda: UfMConfig(on_bad_frame="ignore"), "UfMConfig.on_bad_frame"),
+    (lambda: UfM(0), "max_points must be None or at least 1"),
     # suites
     (lambda: Suite("x", "", rows_of("Ensemble") * 2), "has a row twice: Ensemble"),
     (lambda: Suite("x", "", ()), "at least one row"),
     (lambda: Suite("../x", "", rows_of("Ensemble")), "small letters"),
-    (lambda: Suite("x", "", rows_of("Ensemble"), sweep=("etta",)), "no setting is called 'etta'"),
     (lambda: suite_named("paper-table-1", preset="papers"), "ufm_preset must be"),
     (lambda: suite_named("paper-table-1").with_bases(["depth_only"]), "there are networks of depth_only only"),
     (lambda: suite_named("paper-table-1", "depth_only"), "--base goes with figures"),
@@ -114,10 +102,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: network("depth_only=ground-truth:48"), "HxW"),
     # shards
     *[(partial(Shard.parse, text), "--shard must be") for text in ("0/2", "3/2", "1", "1/0", "a/b", "1/2/3", "-1/2")],
-    *[
-        (partial(Slurm.parse, words), "--slurm")
-        for words in (["gpu"], ["a=1", "a=2"], ["jobs=0"], ["jobs=many"], ["cluster=moon"], ["nodes=2"])
-    ],
     (lambda: rank_of({**TORCHRUN, "RANK": "first"}), "must be numbers"),
     (lambda: rank_of({**TORCHRUN, "RANK": "4"}), "RANK 4 must be in"),
     # recalibration
@@ -151,11 +135,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: contact_sheet([], "x.png"), "at least one frame"),
     (lambda: FramePanel("a", PICTURE.astype(float), MAPS), "image must be uint8"),
     (lambda: FramePanel("a", PICTURE, MAPS | {"sigma": np.ones((3, 3))}), "sigma must have"),
-    (lambda: video("v.avi"), "path must end in"),
-    (lambda: video("v.mp4", fps=0), "fps"),
-    (lambda: video("v.mp4", (3, 4, 3)), "even size"),
-    (lambda: video("v.mp4", (32, 32, 3), (32, 34, 3)), "size of the first"),
-    (lambda: write_report(Path("out"), pictures="jpg"), "figures must be svg or png"),
     # tours
     *[(partial(tour, name), "tour:SEED") for name in ("tour:", "tour:-1", "tour:a")],
     (lambda: tour("tour:1?colour=red"), "unknown option 'colour'"),

@@ -10,6 +10,7 @@ from dataclasses import replace
 import layouts
 import numpy as np
 import pytest
+from rerun_stand_in import Made, stand_in
 from runs import own_depth_job
 
 from ufmstar_torch import cli
@@ -18,6 +19,8 @@ from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence, read_trajectory
 from ufmstar_torch.eval.sequences.bag import Bag
 from ufmstar_torch.eval.sequences.images import read_depth
+
+__all__ = ["stand_in"]
 
 
 @pytest.fixture(scope="module")
@@ -46,15 +49,16 @@ def read_ply(path):
 def test_depth_is_gated(finished):
     out, _, truth = finished
     assert cli.main(["export", str(out), "--to", "depth", "--max-sigma", "0.05"]) == 0
-    depth = np.load(out / "export" / "depth" / "9.npy")
-    assert depth.dtype == np.float32
-    assert np.isnan(depth[:20]).all()
+    depth, sigma = (read_depth(out / "export" / kind / "9.png") for kind in ("depth", "sigma"))
+    assert (depth[:20] == 0).all()
+    np.testing.assert_array_equal(sigma > 0, depth > 0)
+    np.testing.assert_allclose(sigma, 0.02 * depth, atol=1e-4)
     kept = 0.02 * truth.depths[2][20:] <= 0.0499
     assert 0 < kept.sum() < kept.size
     np.testing.assert_allclose(depth[20:][kept], truth.depths[2][20:][kept], atol=1e-3)
-    assert np.isnan(depth[20:][0.02 * truth.depths[2][20:] > 0.0501]).all()
+    assert (depth[20:][0.02 * truth.depths[2][20:] > 0.0501] == 0).all()
     assert cli.main(["export", str(out), "--to", "depth", "--max-relative-sigma", "0.01"]) == 0
-    assert np.isnan(np.load(out / "export" / "depth" / "9.npy")).all()
+    assert (read_depth(out / "export" / "depth" / "9.png") == 0).all()
 
 
 def test_the_trajectory(finished):
@@ -192,13 +196,56 @@ def test_a_rerun_recording(finished):
     out, _, _ = finished
     assert cli.main(["export", str(out), "--to", "rrd", "--max-sigma", "0.9"]) == 0
     file = out / "export" / "run.rrd"
-    words = [sys.executable, "-m", "rerun", "rrd", "print", "-v", str(file)]
-    text = subprocess.run(words, check=True, capture_output=True, text=True, timeout=100).stdout
+    text = printed(file)
     for entity in ("camera/image/rgb", "camera/maps/depth", "camera/maps/sigma", "camera/points", "gaussians"):
         assert f"/world/{entity}" in text
     assert "/plots/mean_disagreement" in text
     assert "Blueprint" in text
     assert file.stat().st_size < 2e6
+    assert [path.name for path in file.parent.iterdir() if path.name.startswith(".")] == []
+
+
+def printed(file):
+    words = [sys.executable, "-m", "rerun", "rrd", "print", "-v", str(file)]
+    return subprocess.run(words, check=True, capture_output=True, text=True, timeout=100).stdout
+
+
+def test_anchors_have_a_line_to_the_depth_of_their_pixel(stand_in, tmp_path):
+    """The run keeps the anchors of every frame; in the world of a recording, a line is as long as depth and anchor
+    differ."""
+    path, out = "tour:1?frames=8&size=96x128", tmp_path / "out"
+    assert cli.main(["run", path, "--depth", "self", "--anchors", "--no-video", "--no-sheet", "--out", str(out)]) == 0
+    assert cli.main(["export", str(out), "--to", "rrd"]) == 0
+    found = [read_frame(file) for file in sorted((out / "frames").iterdir())]
+    points, lines = stand_in.logged("world/camera/anchors"), stand_in.logged("world/camera/residuals")
+    assert len(points) == len(lines) == 8
+    assert sum(len(maps["anchors"]) for maps in found) > 20
+    for maps, point, line in zip(found, points, lines, strict=True):
+        u, v, depth, sigma = maps["anchors"].T
+        assert (sigma > 0).all()
+        np.testing.assert_allclose(point.words[0][:, 2], depth, rtol=1e-6)
+        at = maps["depth"][np.rint(v).astype(int).clip(0, 95), np.rint(u).astype(int).clip(0, 127)]
+        ends = line.words[0]
+        np.testing.assert_allclose(ends[:, 0, 2] - ends[:, 1, 2], (depth - at)[at > 0], atol=1e-6)
+        np.testing.assert_allclose(ends[:, 0, :2] / ends[:, 0, 2:], ends[:, 1, :2] / ends[:, 1, 2:], atol=1e-6)
+
+
+def test_a_recording_that_fails_leaves_the_one_before(stand_in, finished, monkeypatch):
+    out, _, _ = finished
+    export = out / "export"
+    export.mkdir(exist_ok=True)
+    (export / "run.rrd").write_bytes(b"before")
+    monkeypatch.setattr(Made, "flush", lambda _: (_ for _ in ()).throw(RuntimeError("the writer ended")))
+    assert cli.main(["export", str(out), "--to", "rrd"]) == 1
+    assert (export / "run.rrd").read_bytes() == b"before"
+    assert not list(export.glob(".rrd*"))
+
+
+def test_a_run_without_a_frame_is_not_exported(finished, tmp_path, capfd):
+    line = {"name": "a", "state": "skipped", "reason": "no pose"}
+    (tmp_path / "frames.jsonl").write_text(json.dumps(line) + "\n")
+    assert cli.main(["export", str(tmp_path), "--to", "depth"]) == 2
+    assert "has no finished frame" in capfd.readouterr().err
 
 
 def test_rerun_is_named_where_it_is_missing(finished, monkeypatch, capfd):

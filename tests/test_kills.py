@@ -4,7 +4,6 @@ completes as if nothing had happened. (``ufmstar run``: tests/test_run.py.)
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import shutil
@@ -13,11 +12,9 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 import torch
-from demo_networks import write_members
 from tiny_suite import TRUTH, kept, write_rooms
 from trainings import write_frames
 
@@ -169,14 +166,3 @@ def test_train(training, tmp_path, seed):
     for member in ("member_0", "member_1"):
         mine, theirs = (read_safetensors(folder / member / WEIGHTS)[0] for folder in (out, whole))
         assert [name for name in theirs if not torch.equal(mine[name], theirs[name])] == []
-
-
-def test_demo(tmp_path):
-    weights = write_members(tmp_path / "three.safetensors")
-    words = ["demo", "--weights", weights, "--frames", 5, "--seed", 5, "--threads", 1, "--out"]
-    whole, out = tmp_path / "whole", tmp_path / "out"
-    finish([*words, whole])
-    killed_and_finished([*words, out], [*words, out, "--overwrite"], out, whole, 4, dict)
-    assert content(out, "*.ply", "*.png") == content(whole, "*.ply", "*.png")
-    mine, theirs = (json.loads(Path(folder / "summary.json").read_text()) for folder in (out, whole))
-    assert without_clock(mine) == without_clock(theirs)

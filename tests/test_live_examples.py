@@ -138,7 +138,7 @@ def test_low_aleatoric_and_high_disagreement():
     usable = np.ones((4, 4), bool)
     contrast = onboard.Contrast(np.zeros((4, 4, 3), np.uint8), own, M, error, usable)
     assert onboard.contrast_figures([contrast]) == pytest.approx(
-        {"share": 2 / 16, "rmse_high": 3, "rmse_low": 1, "own_sigma_high": np.sqrt(0.5), "disagreement_high": 3}
+        {"share": 2 / 16, "rmse_high": 3, "rmse_low": 1, "aleatoric_sigma_high": np.sqrt(0.5), "disagreement_high": 3}
     )
     nothing = onboard.Contrast(contrast.image, own, M, error, ~usable)
     assert np.isnan(onboard.contrast_figures([nothing])["rmse_high"])

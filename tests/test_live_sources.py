@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import io
 import json
+import re
+import subprocess
 import sys
 import threading
 import time
@@ -17,10 +19,14 @@ import torch
 from demo_networks import write_members
 from layouts import quaternion_line
 from PIL import Image
+from rerun_stand_in import stand_in
 
 from ufmstar_torch import cli
+from ufmstar_torch.eval.run import rerun_log
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
+
+__all__ = ["stand_in"]
 
 TOUR = "tour:3?frames=5&size=64x96"
 POSE = [1, 2, 3, 0, 0, 0, 1]
@@ -229,3 +235,40 @@ def test_a_folder_that_grows_live(ufmstar, tmp_path):
     writer.join()
     assert code == 0, err
     assert "UfM*'s share" in out
+
+
+_VIEWER = """
+import socket, sys
+host, port = (sys.argv[sys.argv.index(option) + 1] for option in ("--bind", "--port"))
+with socket.create_server((host, int(port))) as server:
+    server.accept()
+    server.accept()
+"""
+
+
+@pytest.mark.parametrize("display", [True, False])
+def test_a_viewer_shows_the_results_on_this_computer_alone(ufmstar, stand_in, monkeypatch, display):
+    started, start = [], subprocess.Popen
+
+    def viewer(words, **how):
+        assert words[words.index("--bind") + 1] == "127.0.0.1"
+        assert words[1:3] == ["-m", "rerun_cli"]
+        started.append(start([sys.executable, "-c", _VIEWER if display else "", *words[3:]], **how))
+        return started[0]
+
+    monkeypatch.setattr(rerun_log.subprocess, "Popen", viewer)
+    code, out, err = ufmstar(TOUR, "--view", "--speed", "0.2")
+    started[0].terminate()
+    started[0].wait(10)
+    if not display:
+        assert code == 2
+        assert "rerun's viewer does not start: is there a display?" in err
+        return
+    assert code == 0, err
+    (address,) = [words[0] for name, words, _ in stand_in.calls if name == "connect_grpc"]
+    assert address.startswith("rerun+http://127.0.0.1:")
+    (count,) = re.findall(r"(\d) of 5 images", out)
+    depths, images = stand_in.logged("world/camera/maps/depth"), stand_in.logged("world/camera/image/rgb")
+    assert len(depths) == len(images) == len(stand_in.logged("plots/latency_ms")) == int(count)
+    assert images[0].words[0].shape == (64, 96, 3)
+    assert depths[0].words[0].dtype == np.uint16

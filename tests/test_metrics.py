@@ -379,18 +379,3 @@ class TestRanking:
         sure = v.sqrt() <= 0.2
         got = figures(NLLByError(), d, v, g, sure)["nll_by_error"]
         np.testing.assert_array_equal(got, figures(NLLByError(), d[sure], v[sure], g[sure])["nll_by_error"])
-
-    def test_one_threshold_over_all_sequences(self) -> None:
-        """Confident pixels of two sequences together, the second of which is the surer one."""
-        parts = [maps(200, 200), maps(150, 150)]
-        parts[1] = (parts[1][0], parts[1][1] / 20, parts[1][2])
-        metric = NLLByError(one_threshold=True)
-        for d, v, g in parts:
-            metric.add_levels(d, v, g, torch.where(d > 2, v, torch.nan))
-        d, v, g = (torch.cat([part[k].flatten() for part in parts]) for k in range(3))
-        threshold = v[d > 2].median()
-        expected = figures(NLLByError(), d, v, g, (d > 2) & (v <= threshold))["nll_by_error"]
-        each = figures(NLLByError(), d, v, g, d > 2)["nll_by_error"]
-        # Variances within 60 % of each other, and errors within 11 %, are one.
-        np.testing.assert_allclose(metric.compute()["nll_by_error"], expected, atol=0.2 * float(expected[-1]))
-        assert not np.allclose(each, expected, atol=0.2 * float(expected[-1]))

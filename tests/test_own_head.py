@@ -1,4 +1,4 @@
-"""The example of a head on a network of one's own, with a few frames; and the types of its calls."""
+"""The example of a head on a network of one's own, with a few frames."""
 
 from __future__ import annotations
 

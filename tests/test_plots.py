@@ -68,6 +68,12 @@ class TestContactSheet:
             expected = {tuple(c) for c in scales["depth"].rgb(one.maps["depth"]).reshape(-1, 3).tolist()}
             assert len(expected & shown) > 0.95 * len(expected)
 
+    def test_sigma_and_error_share_a_scale(self) -> None:
+        one = panel()  # the error is twice sigma
+        length = fit_scales([one])["length"]
+        assert length.high == pytest.approx(np.percentile(2 * one.maps["sigma"][4:], 99))
+        assert [column.scale for column in map_columns([one])[1:]] == [length, length]
+
     def test_a_small_sigma_of_the_posterior_is_not_black_beside_the_networks_errors(self) -> None:
         one = panel()
         small = {name: one.maps[of] / 10 for name, of in (("posterior_sigma", "sigma"), ("posterior_error", "error"))}
@@ -102,7 +108,7 @@ class TestPreview:
         assert frame.dtype == np.uint8
         assert all(n % 2 == 0 for n in frame.shape[:2])
         step = 240 // size[0]
-        left = step * size[1] + 4  # behind the image and a gap
+        left = step * size[1]
         cell = frame[22 : 22 + 240 : step, left : left + step * size[1] : step]
         np.testing.assert_array_equal(cell, fit_scales([one])["depth"].rgb(one.maps["depth"]))
 

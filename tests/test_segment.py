@@ -255,25 +255,6 @@ def test_no_value_is_read_on_other_devices(prune):
     assert mixture.features.shape == (b, mixture.capacity, 4)
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_cuda_agrees_and_never_waits():
-    scenes = [clutter(seed, 20, 26) for seed in (3, 4, 5)]
-    depth, K = (torch.cat(parts) for parts in zip(*scenes, strict=True))
-    config = SPGFConfig(sparse=2, min_pixels=12, min_rows=3, scale_with_image=False)
-    expected, labels = segment.spgf(depth, K, config, features=depth.nan_to_num()[:, None])
-    depth, K = depth.cuda(), K.cuda()
-    features = depth.nan_to_num()[:, None]
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        mixture, actual = segment.spgf(depth, K, config, features=features)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert torch.equal(actual.cpu(), labels)
-    for name, value in expected.padded(mixture.capacity).tensors().items():
-        torch.testing.assert_close(mixture.tensors()[name].cpu(), value, rtol=1e-10, atol=1e-12)
-
-
 def test_presets_are_upstreams():
     """../shared/spec's table, column by column."""
     tum, inside, outside = (SPGFConfig.preset(n) for n in ("tum", "tartanair_indoor", "tartanair_outdoor"))

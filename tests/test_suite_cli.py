@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+import logging
 import signal
 
 import pytest
-from tiny_suite import TRUTH, Stub, rows_of
+from tiny_suite import TRUTH, Stub
 
 from ufmstar_torch.eval.bench import measure as measurement
-from ufmstar_torch.eval.commands import dry_run as dry
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.methods.suite import names
 from ufmstar_torch.eval.suite import shards
@@ -42,7 +42,6 @@ MISTAKES = {
     "base twice": (["{}", "--network", "depth_only=ground-truth"], "time and energy, got depth_only, depth_only"),
     "no root": (["{}", "--root", "/nowhere"], "no such file or folder: /nowhere"),
     "frames": (["{}", "--frames", "5"], "--frames must be START:STOP"),
-    "shard and slurm": (["{}", "--shard", "1/2", "--slurm", "jobs=2"], "--shard and --slurm contradict each other"),
     "shard and overwrite": (["{}", "--shard", "1/2", "--overwrite"], "--overwrite goes without shards"),
     "both": (["{}", "--resume", "--overwrite"], "--resume and --overwrite contradict"),
     "processes": (["{}", "--processes", "0"], "--processes must be at least 1"),
@@ -112,28 +111,8 @@ def test_a_dry_run_counts_and_writes_nothing(ufmstar, rooms, tmp_path):
     code, text, _ = ufmstar(*words)
     assert code == 0
     assert "5 rows:" in text
-    assert "2 of 3:\n  rooms/ash: 3 frames\n  rooms/cedar: 3 frames\n6 frames, 10 records" in text
-    assert "cache of predictions: up to 0.0 MB" in text  # ground truth is not kept
+    assert "2 of 3 sequences:\n  rooms/ash: 3 frames\n  rooms/cedar: 3 frames\n6 frames, 10 records" in text
     assert not (tmp_path / "out").exists()
-
-
-class Members:
-    """Three members that take turns."""
-
-    passes = 3
-
-    def turn(self, position):
-        return position % 3
-
-
-def test_predictions_are_counted_once_however_many_rows_share_them():
-    rows = rows_of("Ensemble", "UfM*-FullEnsemble", "UfM-Ensemble", "UfM*-Ensemble")
-    assert dry.predictions(rows[:1], Members(), 10) == 10
-    assert dry.predictions(rows, Members(), 10) == 20
-    # Every second frame: images 0, 2, 4, 6, 8 are member 0, 1, 2, 0, 1's; of the default row 0, 2, 1, 0, 2's.
-    skipping = rows_of("UfM*-Ensemble", skip=1)
-    assert dry.predictions(skipping, Members(), 10) == 5
-    assert dry.predictions([*rows[3:], *skipping], Members(), 10) == 10 + 3
 
 
 def test_several_roots_and_networks_and_a_file_of_options(rooms, tmp_path):
@@ -174,3 +153,12 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
     assert ufmstar(*words, "--resume", "--network", "depth_only=ground-truth:8x8")[0] == 0
     written = json.loads((tmp_path / "out" / "efficiency.json").read_text())
     assert (written["count"], [one["count"] for one in written["further"]]) == (5.0, [8.0]), "a second architecture"
+
+
+def test_a_warning_of_many_streams_is_logged_once(caplog):
+    logger = logging.getLogger("ufmstar_torch")
+    for _ in range(2):
+        with shards.warned_once():
+            for stream, text in ((0, "a frame has no segment"), (1, "a frame has no segment"), (1, "other")):
+                logger.warning("stream %d: %s", stream, text)
+    assert caplog.messages == 2 * ["stream 0: a frame has no segment", "stream 1: other"]

@@ -14,7 +14,7 @@ from tiny_suite import CPU, base_network, evaluate, row, same, unbatched
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.eval.engine.judge import SequenceError
 from ufmstar_torch.eval.engine.load import network_source
-from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
+from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
@@ -95,12 +95,12 @@ def test_a_row_equals_a_loop_by_hand(base, network_files, networks, sequence):
     name = behind.get(base, base.capitalize())
     rows = [row(f"UfM*-{name}"), row(f"UfM-{name}"), row(f"UfM-{name}-1K")]
     result = evaluate(sequence, rows, networks)
-    hands = [UfMStar(SKIP), UfM(UfMConfig(max_points=None)), UfM(UfMConfig(max_points=1000))]
+    hands = [UfMStar(SKIP), UfM(None), UfM(1000)]
     for one, estimator in zip(rows, hands, strict=True):
         by_hand = judged(sequence, through(estimator, members, sequence))
         assert agrees(result[one.slug].figures, by_hand)
     ufm, components = hands[2], int(hands[0].mixture.components)
-    assert result[rows[2].slug].state["bytes_end"] == 40 * len(ufm.clouds[0].count) == 40_000
+    assert result[rows[2].slug].state["bytes_end"] == 40 * len(ufm.cloud.count) == 40_000
     assert result[rows[0].slug].state["count_end"] == components
     assert result[rows[0].slug].state["bytes_end"] == 64 * components
     assert result[rows[0].slug].state["smoothing_bytes"] == 4 * 32 * 64
@@ -261,7 +261,7 @@ def test_skip_and_limit_choose_frames_and_turns(network_files, networks, sequenc
 
 def binned(*references):
     """The names of the sums of NLL by error."""
-    return {f"nll_by_error{kind}:{name}" for kind in ("", "_of_all") for name in references}
+    return {f"nll_by_error:{name}" for name in references}
 
 
 def test_the_nll_by_error_is_over_the_pixels_where_the_reference_is_confident(networks, sequence):

@@ -89,7 +89,7 @@ def test_mistaken_roots(tmp_path):
 # ---- the folder ----
 
 ABOUT = {
-    "suite": "x", "title": "", "sweep": [], "networks": {"aleatoric": {"sha256": "a" * 64}}, "rows": [{"method": "A"}],
+    "suite": "x", "title": "", "networks": {"aleatoric": {"sha256": "a" * 64}}, "rows": [{"method": "A"}],
     "datasets": ["d"], "sequences": [{"dataset": "d", "sequence": "s"}], "missing_bases": ["ensemble"],
     "settings": {"frames": [None, None, 2]},
 }  # fmt: skip

@@ -100,7 +100,6 @@ def test_figures_vary_what_the_paper_varies():
     assert [row.method.name for row in noise.rows] == ["Ensemble"] + ["UfM*-Ensemble"] * 22
     assert [r.setting.rotation_noise for r in noise.rows[1:13]] == [0.0, 0.5, 1.0, 2.0, 5.0, 10.0] * 2
     assert [r.setting.translation_noise for r in noise.rows[13:]] == [0.01, 0.02, 0.05, 0.1, 0.2] * 2
-    assert noise.sweep == ("rotation_noise", "translation_noise")
     overlap = suite_named("paper-figure-overlap")
     # Both are judged on the same frames: the figure shows their difference.
     assert [(r.setting.skip, r.method.name) for r in overlap.rows] == [
@@ -121,7 +120,6 @@ def test_figures_vary_what_the_paper_varies():
 def test_an_ablation_tries_the_default_and_others_against_the_base_alone(name, field):
     suite = suite_named(f"ablation-{name}", "depth_only")
     assert suite.rows[:2] == rows_of("DepthOnly", "UfM*-DepthOnly")
-    assert field in suite.sweep
     tried = {value_of(row, field) for row in suite.rows[1:]}
     assert len(tried) > 1
     assert getattr(UfMStarConfig(), field) in tried
@@ -137,7 +135,6 @@ def test_rows_without_a_network_are_left_out():
 
 TOML = """
 title = "Smoothing"
-sweep = ["ema_alpha"]
 [[rows]]
 methods = ["Ensemble", "UfM*-Ensemble"]
 [[rows]]
@@ -177,7 +174,7 @@ methods = ["Ensemble"]
 def test_a_suite_from_a_file(tmp_path):
     (tmp_path / "my-own.toml").write_text(TOML)
     suite = suite_named(str(tmp_path / "my-own.toml"))
-    assert (suite.name, suite.title, suite.sweep) == ("my-own", "Smoothing", ("ema_alpha",))
+    assert (suite.name, suite.title) == ("my-own", "Smoothing")
     assert suite.rows[:2] == rows_of("Ensemble", "UfM*-Ensemble")
     assert [row.setting.to_dict() for row in suite.rows[2:]] == [
         {"ema_alpha": alpha, "segment.min_pixels": 2000, **({"skip": skip} if skip else {})}
@@ -186,23 +183,21 @@ def test_a_suite_from_a_file(tmp_path):
     ]
 
 
-def test_a_file_names_bases_multiples_and_other_suites(tmp_path):
+def test_a_file_names_bases_and_other_suites(tmp_path):
     (tmp_path / "mine.toml").write_text("""
 base = "ensemble"
 include = ["ablation-eta", "ablation-no-alternating"]
-sweep = ["segment.line_thresh"]
 [[rows]]
 bases = ["aleatoric"]
 methods = ["{alone}", "UfM*-{behind}"]
 [[rows]]
 methods = ["UfM*-{behind}", "UfM*-{behind}"]
-multiples = { "segment.line_thresh" = [1.0, 2.0] }
+each = { "segment.line_thresh" = [0.3, 0.6] }
 """)
     suite = suite_named(str(tmp_path / "mine.toml"), "aleatoric")
     twice = {"segment.line_thresh": 2 * UfMStarConfig().segment.line_thresh}
     assert suite.rows[:3] == (*rows_of("Aleatoric", "UfM*-Aleatoric"), *rows_of("UfM*-Aleatoric", overrides=twice))
     assert set(suite.rows[3:]) == set(suite_named("ablation-eta", "aleatoric").rows[2:])
-    assert suite.sweep == ("segment.line_thresh", "eta")
     own = suite_named(str(tmp_path / "mine.toml"))
     assert [row.method.name for row in own.rows[:2]] == ["UfM*-Ensemble"] * 2
     assert "UfM*-FullEnsemble" in {row.method.name for row in own.rows}

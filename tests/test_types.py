@@ -73,7 +73,7 @@ def test_every_package_of_an_extra_is_known():
     with (ROOT / "pyproject.toml").open("rb") as file:
         extras = tomllib.load(file)["project"]["optional-dependencies"]
     imported = {"opencv-python-headless": "cv2", "pillow": "PIL"}
-    for extra in ("models", "eval", "viz", "train", "energy", "cluster", "litert"):
+    for extra in ("models", "eval", "viz", "train", "energy", "litert"):
         for line in extras[extra]:
             package = line.partition(">")[0].partition("[")[0]
             name = imported.get(package, package.replace("-", "_"))

@@ -8,7 +8,6 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Sequence
-from io import BytesIO
 from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -50,10 +49,9 @@ def read_npz(path: str | Path, names: Sequence[str], *, or_single: bool = False)
         return list(_arrays(file, path, names, or_single=or_single).values())
 
 
-def read_npz_whole(path: str | Path, content: bytes | None = None) -> dict[str, NDArray[Any]]:
-    """All arrays of a .npz file by name, or of its ``content``, which a message calls ``path``; together at most
-    ``LARGEST`` bytes. Errors as :func:`read_npy`."""
-    with Path(path).open("rb") if content is None else BytesIO(content) as file:
+def read_npz_whole(path: str | Path) -> dict[str, NDArray[Any]]:
+    """All arrays of a .npz file by name; together at most ``LARGEST`` bytes. Errors as :func:`read_npy`."""
+    with Path(path).open("rb") as file:
         return _arrays(file, path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -41,11 +42,14 @@ def write_together(files: Mapping[Path, Callable[[BinaryIO], object]], *, durabl
     temporary = {p: p.with_name(f".{p.name}.{uuid4().hex[:12]}.tmp") for p in targets if p not in special}
     try:
         for path, write in targets.items():
-            with open(temporary.get(path, path), "wb") as file:
-                write(file)
-                if durable and path not in special:
-                    file.flush()
-                    os.fsync(file.fileno())
+            try:
+                with open(temporary.get(path, path), "wb") as file:
+                    write(file)
+                    if durable and path not in special:
+                        file.flush()
+                        os.fsync(file.fileno())
+            except OSError as error:  # of a full disk neither Python nor NumPy names the file
+                raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
         for path, written in temporary.items():
             os.replace(written, path)
     finally:

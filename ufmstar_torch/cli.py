@@ -109,7 +109,7 @@ def _set_up(options: Any) -> None:
         import torch
 
         torch.set_num_threads(threads)  # and with them those of the compiled kernels
-    if device is not None and not getattr(options, "slurm", ()):  # the computers of a cluster have devices of their own
+    if device is not None:
         from ufmstar_torch.eval.run.machine import require_device
 
         require_device(device)

@@ -15,7 +15,6 @@ EXTRAS = {
     "lightning": "train",
     "tensorboard": "train",
     "zeus": "energy",
-    "submitit": "cluster",
 }
 
 

@@ -37,7 +37,7 @@ Energies = Mapping[Part, Energy]
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is measured."""
+    """The amount of measurements."""
 
     frames: int = 40  # of the sequence that are timed, after ``warm_up``
     warm_up: int = 5  # frames before them, which are run but not counted

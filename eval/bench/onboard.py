@@ -48,26 +48,25 @@ Report = Callable[[Progress], None]
 
 @dataclass(frozen=True, eq=False)
 class Contrast:
-    """A frame's maps [h, w]: sigma of the network, sqrt(M), |error| [m], and where M is among its upper quarter while A
-    is in its lower half."""
+    """The maps [h, w] of a frame: the network's sigma, sqrt(M) and |error| [m], and the pixels that can be judged."""
 
     image: NDArray[np.uint8]
-    own: NDArray[np.float32]
+    aleatoric_sigma: NDArray[np.float32]
     disagreement: NDArray[np.float32]
     error: NDArray[np.float32]
     usable: NDArray[np.bool_]
 
     @property
-    def high(self) -> NDArray[np.bool_]:
-        """Where disagreement is in the frame's upper quarter."""
-        limit = np.quantile(self.disagreement[self.usable], 0.75) if self.usable.any() else math.inf
-        return self.usable & (self.disagreement > limit)
+    def confident(self) -> NDArray[np.bool_]:
+        """True where the network's own variance is in the lower half of the frame's."""
+        limit = np.quantile(self.aleatoric_sigma[self.usable], 0.5) if self.usable.any() else -math.inf
+        return self.usable & (self.aleatoric_sigma <= limit)
 
     @property
-    def sure(self) -> NDArray[np.bool_]:
-        """Where the network's own variance is in the frame's lower half."""
-        limit = np.quantile(self.own[self.usable], 0.5) if self.usable.any() else -math.inf
-        return self.usable & (self.own <= limit)
+    def contradicted(self) -> NDArray[np.bool_]:
+        """True where the network is confident and the disagreement is in the upper quarter of the frame's."""
+        limit = np.quantile(self.disagreement[self.usable], 0.75) if self.usable.any() else math.inf
+        return self.confident & (self.disagreement > limit)
 
 
 def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: Report) -> dict[str, Any]:
@@ -123,7 +122,7 @@ def _input(network: DepthNetwork, frame: Frame) -> torch.Tensor:
 
 
 def _live(model: UncertainDepth, sequence: FrameSequence, seconds: float, progress: Report) -> dict[str, Any]:
-    """Walk to and fro at 30 images/s; the figures of :class:`RealTime`."""
+    """Feed the walk, forwards and backwards, at 30 images/s; the figures of :class:`RealTime`."""
     frames, times, total = list(sequence), RealTime(model), round(seconds * FPS)
     there_and_back = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
 
@@ -147,12 +146,12 @@ def _live(model: UncertainDepth, sequence: FrameSequence, seconds: float, progre
 
 
 def _contrasts(model: UncertainDepth, sequence: FrameSequence) -> list[Contrast]:
-    """Every fifth frame's maps, from a pass over all frames; none where the network states no variance."""
+    """The maps of every fifth frame after the 30th; [] if the network predicts no variance."""
     found = []
     for n, frame in enumerate(sequence):
         out = model(image_tensor(frame), frame.T_world_cam, frame.intrinsics)
-        own = out.prediction.aleatoric_variance
-        if own is None:
+        aleatoric = out.prediction.aleatoric_variance
+        if aleatoric is None:
             return []
         if n % 5 or n < 30:
             continue
@@ -161,48 +160,48 @@ def _contrasts(model: UncertainDepth, sequence: FrameSequence) -> list[Contrast]
         assert truth is not None
         usable = (truth > 0) & (out.ufm.measured[0].numpy() > 0.5) & np.isfinite(out.variance[0].numpy())
         image = image_tensor(frame)[0].permute(1, 2, 0).numpy()
-        roots = (own[0].sqrt().numpy(), np.nan_to_num(out.disagreement[0].sqrt().numpy()))
+        roots = (aleatoric[0].sqrt().numpy(), np.nan_to_num(out.disagreement[0].sqrt().numpy()))
         found.append(Contrast(image, *roots, np.abs(depth - truth), usable))
     return found
 
 
 def contrast_figures(contrasts: list[Contrast]) -> dict[str, float]:
-    """RMSE [m] where A is in the lower half of its frame, with M in the upper quarter and without; the network's own
-    sigma [m] there; and the share of pixels with both."""
-    both = np.concatenate([c.error[c.sure & c.high] for c in contrasts])
-    other = np.concatenate([c.error[c.sure & ~c.high] for c in contrasts])
-    own = np.concatenate([c.own[c.sure & c.high] for c in contrasts])
-    M = np.concatenate([c.disagreement[c.sure & c.high] for c in contrasts])
+    """RMSE [m] where the network is confident, at high disagreement and elsewhere; its sigma and sqrt(M) [m] at high
+    disagreement; and the share of these pixels."""
+    contradicted = np.concatenate([c.error[c.contradicted] for c in contrasts])
+    agreed = np.concatenate([c.error[c.confident & ~c.contradicted] for c in contrasts])
+    sigma = np.concatenate([c.aleatoric_sigma[c.contradicted] for c in contrasts])
+    disagreement = np.concatenate([c.disagreement[c.contradicted] for c in contrasts])
     pixels = sum(int(c.usable.sum()) for c in contrasts)
 
     def rms(values: NDArray[np.float32]) -> float:
         return float(np.sqrt(np.square(values, dtype=np.float64).mean())) if values.size else math.nan
 
     return {
-        "share": both.size / max(pixels, 1),
-        "rmse_high": rms(both),
-        "rmse_low": rms(other),
-        "own_sigma_high": rms(own),
-        "disagreement_high": rms(M),
+        "share": contradicted.size / max(pixels, 1),
+        "rmse_high": rms(contradicted),
+        "rmse_low": rms(agreed),
+        "aleatoric_sigma_high": rms(sigma),
+        "disagreement_high": rms(disagreement),
     }
 
 
 def draw_contrasts(path: Path, contrasts: list[Contrast]) -> None:
-    """One frame from each quarter of the walk: that with the most pixels of low A and high M."""
+    """Draw one frame from each quarter of the walk: the one with the most contradicted pixels."""
     parts = [part for part in np.array_split(np.arange(len(contrasts)), _ROWS) if part.size]
-    chosen = [max((contrasts[n] for n in part), key=lambda c: int((c.sure & c.high).sum())) for part in parts]
-    maps = [value for c in chosen for value in (c.own, c.disagreement, c.error)]
+    chosen = [max((contrasts[n] for n in part), key=lambda c: int(c.contradicted.sum())) for part in parts]
+    maps = [value for c in chosen for value in (c.aleatoric_sigma, c.disagreement, c.error)]
     high = robust_range(maps, from_zero=True)[1]
     scale = ColourScale(high / 10**DECADES, high, ERROR_MAP, logarithmic=True)  # M would be black beside the error
     rows = []
     for number, c in enumerate(chosen):
         marked = c.image.copy()
-        if marked.shape[:2] == c.own.shape:
-            where = c.sure & c.high
-            marked[where] = (0.4 * marked[where] + 0.6 * _MARKED).astype(np.uint8)
-        panels = [Panel(c.image), *(Panel(scale.rgb(v)) for v in (c.own, c.disagreement, c.error)), Panel(marked)]
+        if marked.shape[:2] == c.error.shape:
+            marked[c.contradicted] = (0.4 * marked[c.contradicted] + 0.6 * _MARKED).astype(np.uint8)
+        shown = (c.aleatoric_sigma, c.disagreement, c.error)
+        panels = [Panel(c.image), *(Panel(scale.rgb(values)) for values in shown), Panel(marked)]
         rows.append(GridRow(f"{number + 1}", [], panels))
     rows[0] = rows[0].captioned(["image", "σ, aleatoric", "√M, disagreement", "|error|", "A low and M high"])
-    height, width = chosen[0].own.shape
+    height, width = chosen[0].error.shape
     title = "Disagreement is high where the aleatoric variance is low"
     draw_grid(path, rows, [Bar("σ, √M and |error| [m]", scale, 1, 3)], aspect=height / width, title=title, words=0.4)

@@ -1,4 +1,4 @@
-"""Do a sequence's depth, poses and images fit together? Checked by warping depth between its frames, and by corners
+"""Checks a sequence's depth, poses and images against each other, by warping depth between its frames and by corners
 tracked in its images.
 
 Wrong conventions are silent: inverted poses or millimetres read as metres give a variance map that is
@@ -53,7 +53,7 @@ class SequenceCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether no problem was detected (something may still be undecided)."""
+        """True if no problem was detected (something may still be undecided)."""
         return not self.problems
 
 

@@ -53,12 +53,12 @@ class DataReport:
 
     @property
     def ok(self) -> bool:
-        """Whether no problem was detected."""
+        """True if no problem was detected."""
         return not self.problems
 
     @property
     def compared(self) -> bool:
-        """Whether depth was compared with other frames, or its edges with the images'."""
+        """True if depth was compared with other frames, or its edges with the images'."""
         decided = self.checked.get("registration") and not any(_REGISTERED in text for text in self.undecided)
         return bool(self.checked.get("pairs") or decided)
 
@@ -193,7 +193,7 @@ def _metres_per_unit(sequence: FrameSequence, path: str | Path, options: Mapping
 
 
 def _read_frames(sequence: FrameSequence) -> tuple[int, list[str]]:
-    """How many frames were read, and the errors of those that cannot be; a rendered frame always can."""
+    """Read frames; the number of them and the errors of the unreadable ones. Rendered frames are not read."""
     if sequence.layout == "tour":
         return 0, []
     chosen = np.unique(np.linspace(0, len(sequence) - 1, min(_DECODED, len(sequence))).astype(int))

@@ -1,4 +1,4 @@
-"""Does a depth map lie on its image? Depth edges are compared with image edges, as they are and displaced."""
+"""Checks that depth maps lie on their images: compares depth edges with image edges, as they are and displaced."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SHIFT, _SHIFT_STEP = 0.0375, 0.0047
 
 @dataclass(frozen=True)
 class DepthImageFit:
-    """How well depth edges meet image edges, and the best displacement of the depth map."""
+    """The agreement of depth edges with image edges, and the best displacement of the depth map."""
 
     quality: float  # 1 where no displacement is better than none, 0 where none is as bad as a random one, NaN: no edges
     # Mean gradient rank (0 to 1) at the best displacement less that at a random one; small where image edges are

@@ -1,4 +1,4 @@
-"""Do poses, intrinsics and depth fit the images? Corners are tracked over a few frames and compared with them.
+"""Checks poses, intrinsics and depth against the images: corners are tracked over a few frames and compared with them.
 
 A corner x of one image lies, in another one, on the half line from its point at infinity, K R K^-1 x, towards the
 epipole: every positive depth is there. Its distance from where the corner was tracked to is noise, or a mistake in
@@ -54,7 +54,7 @@ class FollowedCorners(NamedTuple):
 
 @dataclass(frozen=True)
 class Reading:
-    """How poses and intrinsics may be meant: by name of a convention, late by frames, intrinsics times a factor."""
+    """A reading of poses and intrinsics: another convention, late by some frames, intrinsics times a factor."""
 
     poses: str = OURS
     late: int = 0
@@ -74,7 +74,7 @@ GIVEN = Reading()
 
 @dataclass(frozen=True)
 class ImageFit:
-    """How far tracked corners lie from where poses and intrinsics allow them to be."""
+    """The distance of tracked corners from where poses and intrinsics allow them to be."""
 
     pairs: int  # of frames
     motion: float  # median motion of a corner between them [px]

@@ -101,15 +101,14 @@ class EvalOptions:
     """The rows of a table or figure of the paper, on sequences of your own.
 
     A sequence's rows are written when its last frame is done: whatever ends the program, --resume computes what is
-    missing. The work can be divided: --processes on one computer, --shard by hand, torchrun, or --slurm.
+    missing. The work can be divided: --processes on one computer, --shard in a cluster's job array, or torchrun.
 
     Attributes:
         device: cpu or cuda; of several --processes, each takes the next GPU in turn
         threads: number of CPU threads of each process; default: all cores, divided among --processes
         processes: number of processes on this computer
         shard: i/n, only the i-th of n parts of the sequences, 1/n to n/n; torchrun's processes are shards as well
-        slurm: KEY=VALUE for submitit, as partition=gpu; jobs=N: a job array of N shards; repeatable
-        dry_run: show rows, sequences and the size of the cache, and stop
+        dry_run: show rows and sequences, and stop
         debug: show tracebacks
     """
 
@@ -121,7 +120,6 @@ class EvalOptions:
     threads: int | None = None
     processes: int = 1
     shard: str | None = None
-    slurm: tuple[str, ...] = option((), repeat=True)
     dry_run: bool = False
     debug: bool = False
     what: SuiteOptions
@@ -143,8 +141,6 @@ class EvalOptions:
                 raise ValueError(f"--{name} must be at least {least}, got {values[name]}")
         if self.output.resume and self.output.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
-        if self.shard and self.slurm:
-            raise ValueError("--shard and --slurm contradict each other")
 
 
 read = reader(EvalOptions, "ufmstar eval")
@@ -214,22 +210,19 @@ def _evaluate(options: EvalOptions) -> int:
 
     from ufmstar_torch import UfMStarConfig
     from ufmstar_torch.anchors.landmarks import DENSE
-    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals, warned_once
+    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
     from ufmstar_torch.eval.engine.warm_up import warm_up_command
     from ufmstar_torch.eval.methods.method import UFM_STAR
-    from ufmstar_torch.eval.suite.shards import Slurm, evaluate_on_slurm, evaluate_suite
+    from ufmstar_torch.eval.suite.shards import evaluate_suite
     from ufmstar_torch.eval.suite.work_items import Shard
 
-    shard = Shard.parse(options.shard) if options.shard else None
-    slurm = Slurm.parse(options.slurm) if options.slurm else None
     how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}
     how |= {"processes": options.processes, "threads": options.threads}
-    with Bars() as bars, stop_signals(bars.say) as stop, warned_once():
+    with Bars() as bars, stop_signals(bars.say) as stop:
         job = job_from(options)
         for base in job.unused:
             bars.say(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
-        rows = [row for row in job.suite.rows if row.method.fusion == UFM_STAR]
-        if rows and slurm is None:
+        if rows := [row for row in job.suite.rows if row.method.fusion == UFM_STAR]:
             anchors = {row.setting.anchors for row in rows}
             config = UfMStarConfig(
                 anchors=AnchorConfig() if anchors != {""} else None,
@@ -237,10 +230,8 @@ def _evaluate(options: EvalOptions) -> int:
             )
             shown = partial(bars.frames, "kernels, compiled on the first run")
             warm_up_command(config, torch.device("cpu"), shown, dense=DENSE in anchors)
-        if slurm is None:
-            outcome = evaluate_suite(job, shard=shard, **how, stop=stop, report=bars.say, progress=bars.frames)
-        else:
-            outcome = evaluate_on_slurm(job, slurm, **how, stop=stop, report=bars.say)
+        shard = Shard.parse(options.shard) if options.shard else None
+        outcome = evaluate_suite(job, shard=shard, **how, stop=stop, report=bars.say, progress=bars.frames)
     return _report(job, outcome, options)
 
 
@@ -291,14 +282,29 @@ def _measure(job: EvalJob, threads: int | None) -> None:
 
 
 def _dry_run(options: EvalOptions) -> int:
-    """Print what would be evaluated."""
+    """Print the rows with their networks, and the sequences with their number of frames."""
     import torch
 
-    from ufmstar_torch.eval.commands.dry_run import dry_run
     from ufmstar_torch.eval.suite.work_items import Shard
 
     job = job_from(options)
     for base in job.unused:
         print(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
-    print(dry_run(job, job.load(torch.device("cpu")), Shard.parse(options.shard or "1/1")))
+    networks, items = job.load(torch.device("cpu")), Shard.parse(options.shard or "1/1").of(job.items)
+    print(f"{job.suite.name}: {job.suite.title}\n{len(job.suite.rows)} rows:")
+    for row in job.suite.rows:
+        print(f"  {row.label}  [{networks[row.method.base].label}]")
+    if job.missing_bases:
+        print(f"left out, without a --network: the rows of {', '.join(job.missing_bases)}")
+    print(f"{len(items)} of {len(job.items)} sequences:")
+    total = 0
+    for item in items:
+        try:
+            frames = len(range(len(item.open()))[job.frames])
+        except (OSError, ValueError) as error:
+            print(f"  {item.label}: cannot be opened: {' '.join(str(error).split())}")
+            continue
+        print(f"  {item.label}: {frames} frames")
+        total += frames
+    print(f"{total} frames, {len(items) * len(job.suite.rows)} records")
     return 0

@@ -23,8 +23,9 @@ class ExportOptions:
 
     Attributes:
         out: folder of `ufmstar run`
-        to: depth: maps [m] as .npy, NaN where left out; cloud: cloud.ply with sigma and colour; tum: trajectory.txt;
-            transforms: images, depth, sigma and poses for nerfstudio; mcap: a ROS 2 bag; rrd: a rerun recording
+        to: depth: depth and sigma as 16-bit PNGs, 0 = left out; cloud: cloud.ply with sigma and colour; tum:
+            trajectory.txt; transforms: images, depth, sigma and poses for nerfstudio; mcap: a ROS 2 bag; rrd: a rerun
+            recording
         max_sigma: largest standard deviation of a pixel [m]
         max_relative_sigma: largest standard deviation of a pixel, as a share of its depth
         voxel: side of the cloud's voxels [m], each of which has one point

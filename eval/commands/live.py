@@ -20,10 +20,14 @@ from ufmstar_torch.eval.commands.run import NetworkOptions, UfMOptions, read_ufm
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ufmstar_torch.eval.engine.realtime import RealTime
     from ufmstar_torch.eval.sequences.live import LiveEvent
     from ufmstar_torch.live import LiveDepth, LiveResult
     from ufmstar_torch.pipeline import UncertainDepth
+
+    _View = Callable[[LiveResult, dict[str, float]], None]
 
 _STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
 # Options for opening that also go with a source that is no recording.
@@ -50,6 +54,7 @@ class LiveOptions:
         save_every: of the state [s]
         out: folder for realtime.json and a .npz with depth, variance, disagreement, pose and intrinsics per image
         overwrite: replace the results in --out
+        view: show the images, depth and plots in rerun, on this computer alone
         json: print a line of JSON per image instead of the status
         device: cpu, cuda or cuda:N
         threads: number of CPU threads of network and step; default: all cores but one
@@ -68,6 +73,7 @@ class LiveOptions:
     save_every: float = 10.0
     out: Path | None = None
     overwrite: bool = False
+    view: bool = False
     json: bool = False
     device: str = "cpu"
     threads: int | None = None
@@ -126,12 +132,13 @@ def main(options: LiveOptions) -> int:
                 kind.earlier(options.out, resume=False, overwrite=options.overwrite)
             events = _events(options)
             model = _model(options)
+            view = _view() if options.view else None
             if options.out is not None:
                 held.enter_context(OutputFolder.open(options.out, kind, started, overwrite=options.overwrite))
-        except (ImportError, OSError, ValueError) as error:
+        except (ImportError, OSError, RuntimeError, ValueError) as error:
             raise UsageError(error) from error
         times = RealTime(model)
-        live = _run(options, model, events, times)
+        live = _run(options, model, events, times, view)
         summary = times.summary(live.statistics)
         if options.out is not None:
             write_json_atomic(options.out / _SUMMARY, {"program": kind.program, "state": "finished", **summary})
@@ -139,7 +146,9 @@ def main(options: LiveOptions) -> int:
     return 0 if summary["results"] else 1
 
 
-def _run(options: LiveOptions, model: UncertainDepth, events: Iterator[LiveEvent], times: RealTime) -> LiveDepth:
+def _run(
+    options: LiveOptions, model: UncertainDepth, events: Iterator[LiveEvent], times: RealTime, view: _View | None
+) -> LiveDepth:
     """Push the events until they end, the time is over, or a signal comes."""
     from ufmstar_torch.live import LiveDepth
 
@@ -150,7 +159,13 @@ def _run(options: LiveOptions, model: UncertainDepth, events: Iterator[LiveEvent
         times.take(result)
         if options.out is not None:
             _write(options.out, result)
-        _say(result, live, times, as_json=options.json)
+        about = _figures(result, live)
+        if view is not None:
+            view(result, about)
+        if options.json:
+            print(json.dumps(about), flush=True)
+        elif len(times.latency) % 30 == 1:
+            print("  ".join(f"{name} {value}" for name, value in about.items()), file=sys.stderr, flush=True)
 
     how: dict[str, Any] = {"max_wait": options.max_wait, "max_gap": options.opening.max_pose_gap}
     with (
@@ -256,12 +271,35 @@ def _write(out: Path, result: LiveResult) -> None:
     write_atomic(out / f"{result.stamp:.6f}.npz", lambda file: np.savez(file, allow_pickle=False, **arrays, **camera))
 
 
-def _say(result: LiveResult, live: LiveDepth, times: RealTime, *, as_json: bool) -> None:
-    """A line of JSON for every image, or a status every 30 images."""
-    if not as_json and len(times.latency) % 30 != 1:
-        return
+def _view() -> _View:
+    """A function that shows results in a new viewer. Raises ModuleNotFoundError, RuntimeError: as ``open_viewer``."""
+    from itertools import count
+
+    import numpy as np
+    import torch
+
+    from ufmstar_torch.eval.run.export import Gated
+    from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
+
+    log, numbers = RerunLog(open_viewer()[0]), count()
+
+    def show(result: LiveResult, about: dict[str, float]) -> None:
+        out, valid = result.out, result.out.ufm.valid[0]
+        depth, sigma = (
+            torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std)
+        )
+        camera = (result.T_world_cam, out.intrinsics[0].cpu().double().numpy())
+        frame = Gated(f"{result.stamp:.6f}", next(numbers), result.stamp, *camera, depth, sigma)
+        plots = {name: value for name, value in about.items() if name != "stamp"}
+        log.add(frame, np.asarray(result.image), None, plots)
+
+    return show
+
+
+def _figures(result: LiveResult, live: LiveDepth) -> dict[str, float]:
+    """The figures of an image, and the counts so far."""
     depth, std, counts = result.out.depth, result.out.std, live.statistics
-    about = {
+    return {
         "stamp": round(result.stamp, 6),
         "latency_ms": round(1000 * result.latency, 2),
         "depth_m": round(float(depth.median()), 3),
@@ -270,10 +308,6 @@ def _say(result: LiveResult, live: LiveDepth, times: RealTime, *, as_json: bool)
         "dropped": sum(counts.dropped.values()),
         "skipped": sum(counts.skipped.values()),
     }
-    if as_json:
-        print(json.dumps(about), flush=True)
-    else:
-        print("  ".join(f"{name} {value}" for name, value in about.items()), file=sys.stderr, flush=True)
 
 
 @contextmanager

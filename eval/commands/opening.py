@@ -15,29 +15,30 @@ _TRUTH = {"truth": "depth", "truth_scale": "depth_scale"}
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceOptions:
-    """How sequences are opened.
+    """Opening of sequences.
 
     Attributes:
-        layout: as docs/data.md names it; auto: by its files
-        intrinsics: of the images: a file, or fx fy cx cy [px]
-        distortion: to undo: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or none (default: TUM's own)
-        depth_intrinsics: of the sequence's own depth maps: a file, or fx fy cx cy [px]
+        layout: name of the layout (docs/data.md); auto: detect it from the files
+        intrinsics: camera of the images: a file, or fx fy cx cy [px]
+        distortion: lens distortion to undo: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or none (default:
+            TUM RGB-D's own)
+        depth_intrinsics: camera of the sequence's own depth maps: a file, or fx fy cx cy [px]
         truth_scale: metres per unit of the sequence's own depth
-        max_truth: largest ground truth [m]
-        trajectory: poses (TUM or KITTI) for the layout's own
-        poses: ned: x forward, z down; opengl: y up, z back
-        pose_scale: metres per unit of poses, landmarks
+        max_truth: ground truth beyond this depth is ignored [m]
+        trajectory: file with poses (TUM or KITTI), used instead of the layout's own
+        poses: axes of the poses; ned: x forward, z down; opengl: y up, z back
+        pose_scale: metres per unit of poses and landmarks
         fps: frames per second of images without timestamps
-        time_offset: added to image times [s]
-        max_pose_gap: poses are interpolated over at most so long [s]
-        max_time_difference: largest, between a colour image and its depth map [s]
-        images: of a generic sequence: folder, or video file
-        truth: folder of the ground-truth depth maps of a generic sequence
+        time_offset: seconds added to the times of the images [s]
+        max_pose_gap: longest gap over which poses are interpolated [s]
+        max_time_difference: longest time between a colour image and its depth map [s]
+        images: folder or video file with the images of a generic sequence
+        truth: folder with the ground-truth depth maps of a generic sequence
         register: leave 7-Scenes' depth in its own camera
-        T_color_depth: 7-Scenes: file, 4x4 from depth to colour camera [m]
-        topics: of a ROS bag; a pose's with =FRAME, the frame that it moves
+        T_color_depth: 7-Scenes: file with the 4x4 transform from the depth to the colour camera [m]
+        topics: topics of a ROS bag; write a pose's as TOPIC=FRAME with the frame that it moves
         drive: KITTI-360: name or number of a drive below the root
-        scans: KITTI-360: also scans of so many frames around
+        scans: KITTI-360: also use the laser scans of this many neighbouring frames
         plugin: Python files with READERS (eval: also METHODS, METRICS)
     """
 

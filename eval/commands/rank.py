@@ -20,18 +20,18 @@ _SHOWN = 10  # lines of the printed table
 
 @dataclass(frozen=True, kw_only=True)
 class RankOptions:
-    """Which images are worth a label: every image's uncertainty, and the order in which to label them.
+    """Rank the images of sequences by their uncertainty: the most uncertain ones are to be labelled first.
 
-    Writes scores.csv, the images to label first, and a contact sheet of the least and the most certain images.
-    Sequences are streamed one after another, with a fresh state each.
+    Writes scores.csv, a line per image, and a contact sheet of the least and the most certain images. Each sequence
+    starts with an empty state.
 
     Attributes:
-        sequences: as of `ufmstar run`
+        sequences: folders of sequences, video files, or tour:SEED, as for `ufmstar run`
         out: folder for everything that is written
         by: rank by the mean of V, M, A, E or B (docs/active_learning.md)
-        diverse: of images that look at the same place from nearly the same side, take one
+        diverse: rank only one of several images that show the same place from nearly the same side
         count: number of images to rank; default: all
-        measured: images with a smaller share of pixels seen in two views get no rank by total or disagreement
+        measured: smallest share of pixels seen in two views; images below it get no rank by total or disagreement
         frames: START:STOP:STEP, which frames of each sequence
         overwrite: replace the ranking in --out
         device: cpu, cuda or cuda:N
@@ -128,7 +128,6 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     """Write scores.csv, the contact sheet and rank.json, and print the first images; the exit code."""
     import pandas as pd
 
-    from ufmstar_torch.eval.report.table import csv_text
     from ufmstar_torch.eval.report.text import aligned
     from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
     from ufmstar_torch.eval.run.panels import contact_sheet
@@ -138,13 +137,13 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     rest = sorted(set(range(len(scores.images))) - set(chosen))
     lines = [{"rank": n, **scores.images[i].line} for n, i in enumerate(chosen, start=1)]
     lines += [{"rank": None, **scores.images[i].line} for i in rest]
-    table = pd.DataFrame(lines, dtype=object).map(csv_text).to_csv(index=False, lineterminator="\n")
+    table = pd.DataFrame(lines, dtype=object).to_csv(index=False, lineterminator="\n")
     write_atomic(out / SCORES, lambda file: file.write(table.encode()))
-    write_json_atomic(out / SETTINGS, {"program": "ufmstar rank", "settings": as_dict(options), "images": len(lines)})
     files = [SCORES]
     if panels := scores.panels():
         contact_sheet(panels, out / SHEET, title=f"the least and the most certain of {len(lines)} images")
         files.append(SHEET)
+    write_json_atomic(out / SETTINGS, {"program": "ufmstar rank", "settings": as_dict(options), "images": len(lines)})
     shown = [["rank", "sequence", "frame", f"{options.by} [m²]", "measured"]]
     mean, names = f"{options.by}_mean_m2", [Path(path).name for path in options.sequences]
     for line in lines[: min(len(chosen), _SHOWN)]:

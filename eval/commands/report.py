@@ -5,26 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ufmstar_torch.eval.commands.options import UsageError, option, positional, reader
+from ufmstar_torch.eval.commands.options import UsageError, positional, reader
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportOptions:
     """Tables, figures and a page from the results of an evaluation.
 
-    Draws tables (Markdown, LaTeX and CSV), figures, one page (report.html) and tidy results (JSON and CSV) from what
+    Draws tables (Markdown and LaTeX), figures, one page (report.html) and tidy results (CSV) from what
     `ufmstar eval` has left in a folder, finished or not, and prints the main table.
 
     Attributes:
         out: folder of `ufmstar eval`
         no_figures: tables and results alone (needs no matplotlib)
-        format: file format of the figures
         debug: show tracebacks
     """
 
     out: Path = positional()
     no_figures: bool = False
-    format: str = option("svg", choices=("svg", "png"))
     debug: bool = False
 
 
@@ -39,7 +37,7 @@ def main(options: ReportOptions) -> int:
 
     try:
         print(summary(load_results(options.out, with_sums=False)))
-        report = write_report(options.out, figures=not options.no_figures, pictures=options.format)
+        report = write_report(options.out, figures=not options.no_figures)
     except ResultsError as error:
         raise UsageError(error) from error
     print(written(options.out, report))

@@ -257,7 +257,7 @@ def _report(summary: Mapping[str, Any], out: str) -> int:
     for name, reason in summary["outputs"].items():
         if reason is not None:
             print(f"no {name}: {reason}")
-    print(f"{out}: {', '.join(['summary.json', 'frames.jsonl', 'frames/', 'depth/', 'sigma/', *made])}")
+    print(f"{out}: {', '.join(['summary.json', 'frames.jsonl', 'frames/', *made])}")
     state = f"ufmstar run: {summary['state']}: {summary['reason']}"
     if summary["state"] == FINISHED:
         print(state)
@@ -267,8 +267,7 @@ def _report(summary: Mapping[str, Any], out: str) -> int:
 
 
 def _check_depth(options: Mapping[str, Any]) -> None:
-    """Whether the options name one source of depth, and nothing that belongs to another one. Raises ValueError: they do
-    not."""
+    """Check that the options name one source of depth, and nothing that belongs to another one. Raises ValueError."""
     model, depth = options["model"], options["depth"]
     if (model is None) == (depth is None):
         expected = "--model NAME --weights FILE for a network, or --depth DIR for maps that are already predicted"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -96,22 +94,3 @@ def stop_signals(say: Callable[[str], None], what: str = "frame") -> Iterator[Ca
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-@contextmanager
-def warned_once() -> Iterator[None]:
-    """Within the context, a warning of the package is logged once, whichever stream and numbers it names: the rows of a
-    suite are many streams."""
-    logger, logged = logging.getLogger("ufmstar_torch"), set[str]()
-
-    def first(record: logging.LogRecord) -> bool:
-        text = re.sub(r"\d+", "", record.getMessage())
-        known = text in logged
-        logged.add(text)
-        return not known
-
-    logger.addFilter(first)
-    try:
-        yield
-    finally:
-        logger.removeFilter(first)

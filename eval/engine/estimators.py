@@ -1,4 +1,4 @@
-"""How a row gets its variance: from the network alone, from UfM or from UfM*."""
+"""Estimators of a row's variance: the network alone, UfM, and UfM*."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured
-from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
+from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.pipeline import UncertainDepth
 from ufmstar_torch.prediction import DepthPrediction
@@ -88,8 +88,7 @@ def make_estimator(
     if method.fusion == ALONE:
         return Alone(uses_variances=method.uses_aleatoric)
     if method.fusion == UFM:
-        points = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
-        return Pointwise(points, uses_variances=method.uses_aleatoric)
+        return Pointwise(method.max_points, uses_variances=method.uses_aleatoric)
     if method.fusion != UFM_STAR:
         if method.fusion not in own:
             raise ValueError(f"row {method.name}: no method is called {method.fusion!r}: --plugin FILE.py adds yours")
@@ -133,8 +132,8 @@ class Alone(Estimator):
 class Pointwise(Estimator):
     """UfM. Without ``uses_variances``, A and E are left aside."""
 
-    def __init__(self, config: UfMConfig, *, uses_variances: bool = True) -> None:
-        self.ufm = UfM(config)
+    def __init__(self, max_points: int | None, *, uses_variances: bool = True) -> None:
+        self.ufm = UfM(max_points)
         self._uses_variances = uses_variances
 
     def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
@@ -149,8 +148,8 @@ class Pointwise(Estimator):
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points."""
-        points = [(len(cloud.count), len(cloud.count) * cloud.bytes_per_point) for cloud in self.ufm.clouds]
-        count, size = points[0] if points else (0, 0)
+        cloud = self.ufm.cloud
+        count, size = (0, 0) if cloud is None else (len(cloud.count), len(cloud.count) * cloud.bytes_per_point)
         return {"bytes": size, "count": count, "smoothing_bytes": 0}
 
 
@@ -183,7 +182,7 @@ class Gaussians(Estimator):
         out = self.model.update(used, T_world_cam, predicted.intrinsics, anchors=anchors)
         anchors_used = out.statistics.anchors_used
         self._anchors = 0 if anchors_used is None else int(anchors_used[0])
-        answer = {name: getattr(out, name) for name in _OF_OUTPUT} | {"confidence": used.confidence}
+        answer = {name: getattr(out, name) for name in _OF_OUTPUT}
         if self._setting.posterior:
             answer["depth"], answer["variance"] = out.posterior()
         elif self._setting.corrected:

@@ -1,8 +1,8 @@
-"""Many rows on a sequence in one stream: every network sees a frame once, and every row sees the same frames.
+"""Evaluates many rows on a sequence in one stream: every network sees a frame once, every row the same frames.
 
-A frame that one row cannot use (its file is broken, its pose is no pose, a network has nothing to predict from) is
-left out by all rows, whose tables could not be compared otherwise. Pixels are each row's own: those with ground truth
-where it predicts something. How many it leaves out is among its figures (``left_out_share``).
+A frame that one row cannot use (its file is broken, its pose is not rigid, a network has nothing to predict from) is
+left out for all rows; otherwise their tables could not be compared. Each row is judged on the pixels that have ground
+truth and a prediction of that row; ``left_out_share`` is the share of pixels without a prediction.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """How sequences are judged."""
+    """The networks and metrics with which sequences are judged."""
 
     networks: Mapping[str, DepthSource]  # by base
     device: torch.device  # where UfM and UfM* run

@@ -2,8 +2,7 @@
 
 For the figure of NLL by error, the paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is
 confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, the half of the
-reference's pixels with the smallest variance, of every frame, and of all sequences with one threshold. All rows on the
-same frames are judged on the same pixels.
+reference's pixels with the smallest variance in every frame. All rows on the same frames are judged on the same pixels.
 """
 
 from __future__ import annotations
@@ -31,8 +30,7 @@ if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence with
 # Names of a run's figures: UfM*, beside it the network alone, and the posterior if there is one.
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Names of a row's sums.
-METRICS, BY_ERROR, BY_ERROR_OF_ALL, CONFIDENCE = "metrics", "nll_by_error", "nll_by_error_of_all", "confidence"
-EACH = 512  # pixels of a frame, evenly, for ``ufmstar recalibrate --kind confidence``
+METRICS, BY_ERROR = "metrics", "nll_by_error"
 # Metrics of one's own by name (``sequences.plugins``).
 Own = Mapping[str, Any]
 NONE: Own = MappingProxyType({})
@@ -63,7 +61,7 @@ class RunMetrics(FrameSink):
             metrics_of(self._metrics, name, own=own).load_state_dict(dict(state))
 
     def sums(self) -> dict[str, dict[str, Tensor]]:
-        """By name. They are exchanged by updates, never changed in place."""
+        """The sums by name. Updates exchange them and never change them in place."""
         return {name: metrics.sums() for name, metrics in self._metrics.items()}
 
     def figures(self) -> dict[str, dict[str, float]]:
@@ -101,9 +99,8 @@ class RowFigures:
     curves: dict[str, Any]
     state: dict[str, float]
     ms: dict[str, float]
-    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``), "nll_by_error:REFERENCE"
-    # and "nll_by_error_of_all:REFERENCE" (``NLLByError``), to be added up over sequences; and "confidence", samples of
-    # pixels (``_samples``).
+    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and "nll_by_error:REFERENCE"
+    # (``NLLByError``), to be added up over sequences.
     sums: dict[str, dict[str, Tensor]]
 
 
@@ -115,25 +112,17 @@ class RowJudge:
         self.row, self.named, self._bins, self._own = row, named, bins, own
         self._metrics: dict[str, SequenceMetrics] = {}
         self._by_error: dict[str, NLLByError] = {}
-        self._samples: list[Tensor] = []
         self._judged, self.reasons, self._idle = 0, Counter[str](), Counter[str]()
         self._ms: list[Mapping[str, float]] = []
         self._memory: list[Mapping[str, float]] = []
 
-    def add(
-        self,
-        result: RowResult,
-        memory: Mapping[str, float],
-        masks: Mapping[str, Tensor],
-        rows: Mapping[str, RowResult],
-    ) -> None:
+    def add(self, result: RowResult, memory: Mapping[str, float], masks: Mapping[str, Tensor]) -> None:
         """Add a frame. Pixels that the row leaves out are NaN, not masked, so that the metrics count them.
 
         Args:
             result: of this row.
-            memory: of its estimator after the frame.
+            memory: of the row after the frame.
             masks: confident pixels by reference.
-            rows: results of all rows by key.
         """
         if result.statistics is not None:
             segments, matched = (int(count[0]) for count in (result.statistics.segments, result.statistics.matched))
@@ -153,16 +142,9 @@ class RowJudge:
         metrics_of(self._metrics, METRICS, **how).update(depth, variance, target)
         if variance is None:
             return
-        if result.confidence is not None:
-            self._samples.append(_samples(result.confidence, depth, variance, target))
         for other, name in self.named.items():
             by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
             by_error.update(depth, variance, target, masks[other])
-            of_all = NLLByError(one_threshold=True, sync_on_compute=False)
-            of_all = self._by_error.setdefault(f"{BY_ERROR_OF_ALL}:{name}", of_all)
-            reference = rows[other]
-            assert reference.variance is not None
-            of_all.add_levels(depth, variance, target, torch.where(reference.valid, reference.variance, torch.nan))
 
     def figures(self) -> RowFigures:
         """The figures after the last frame. Raises SequenceError: no frame was judged."""
@@ -175,11 +157,8 @@ class RowJudge:
         curves: dict[str, Any] = metrics.curves()
         sums = {METRICS: metrics.state_dict()}
         for name, by_error in self._by_error.items():
-            if name.startswith(f"{BY_ERROR}:"):
-                curves[name] = by_error.compute()["nll_by_error"].tolist()
+            curves[name] = by_error.compute()["nll_by_error"].tolist()
             sums[name] = by_error.state_dict()
-        if self._samples:
-            sums[CONFIDENCE] = {"samples": torch.cat(self._samples)}
         stages = ("network", "anchors", "uncertainty")
         times = {stage: [ms[stage] for ms in self._ms if stage in ms] for stage in stages}
         return RowFigures(
@@ -212,7 +191,7 @@ class RowJudges(FrameSink):
         self._judges = judges
 
     def begin(self, stream: FrameStream) -> None:
-        self._estimators = {row.key: row.estimator for row in stream.rows}
+        self._rows = {row.key: row for row in stream.rows}
 
     def take(self, result: FrameResult) -> None:
         """Add a frame."""
@@ -222,19 +201,14 @@ class RowJudges(FrameSink):
         expected = {other for key in judged for other in self._judges[key].named}
         masks = {other: confident_pixels(result.rows[other]) for other in expected}
         for key, row in result.rows.items():
-            self._judges[key].add(row, self._estimators[key].memory(), masks, result.rows)
-
-
-def _samples(confidence: Tensor, depth: Tensor, variance: Tensor, target: Tensor) -> Tensor:
-    """[n, 3] float64 confidence, variance [m^2] and squared error [m^2] at ``EACH`` of the pixels with all of them."""
-    maps = torch.stack([confidence, variance, (target - depth).square()], -1).double()
-    known = maps[(target > 0) & maps.isfinite().all(-1) & (variance > 0)]
-    return known[:: max(1, -(-len(known) // EACH))]
+            self._judges[key].add(row, self._rows[key].memory(), masks)
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:
-    """Whose confidence a row is judged by: its base alone, and behind UfM with the fewest points that are among
-    ``rows`` and see the same frames; of several settings the row's own, or else the default."""
+    """The rows by whose confidence a row is judged: its base alone, and behind UfM with the fewest points.
+
+    They are among ``rows`` and see the same frames. Of several settings, the row's own is preferred, then the default.
+    """
 
     def seen(other: Row) -> tuple[str, int, str]:  # from which frames, and which part of them
         return other.method.base, other.setting.skip, other.setting.preprocess

@@ -67,7 +67,7 @@ class NetworkChoice:
 
     @classmethod
     def parse(cls, text: str, label: str = "") -> NetworkChoice:
-        """From ``BASE=MODEL:FILE[,FILE...]``. Raises ValueError: another form."""
+        """Parse ``BASE=MODEL:FILE[,FILE...]``. Raises ValueError: another form."""
         base, equals, rest = text.partition("=")
         model, _, files = rest.partition(":")
         if not (base and equals and model):

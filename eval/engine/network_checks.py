@@ -1,4 +1,4 @@
-"""Whether networks say what their base is about, asked before the first frame."""
+"""Checks that networks predict the variances that their base needs, before the first frame."""
 
 from __future__ import annotations
 

@@ -33,12 +33,12 @@ class Predicted(NamedTuple):
         return self.maps.depth.shape[1], self.maps.depth.shape[2]
 
     def to(self, to: torch.device | torch.dtype) -> Predicted:
-        """With its maps on a device, or of a type."""
+        """Return the prediction with its maps on a device, or of a type."""
         return self._replace(maps=self.maps.mapped(lambda value: value.to(to)))
 
 
 class DepthSource(ABC):
-    """Where depth comes from: networks, or maps that exist already.
+    """A source of depth: networks, or maps that exist already.
 
     Attributes:
         identity: plain values that distinguish this source from another one.
@@ -62,7 +62,7 @@ class DepthSource(ABC):
 
     @property
     def cacheable(self) -> bool:
-        """Whether a store may keep its predictions. They are then of single precision, read or computed."""
+        """True if a store may keep its predictions. They are then of single precision, read or computed."""
         return self.needs_image and bool(self.digest)
 
     @property
@@ -120,7 +120,7 @@ class FramePredictions:
         if key in self._cached:
             return self._cached[key]
         store = self._store if source.cacheable else None
-        path = Path(source.digest[:_SHOWN], self._sequence[:_SHOWN], f"{self.frame.name}@{member}.maps")
+        path = Path(source.digest[:_SHOWN], self._sequence[:_SHOWN], f"{self.frame.name}@{member}.npz")
         found = None if store is None else store.load(path, self._content, self._device)
         if found is None:
             members = range(source.passes) if combined else [int(member)]

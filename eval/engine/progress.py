@@ -1,4 +1,4 @@
-"""How far a command is, for a terminal."""
+"""The progress of a command, for a terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a command is."""
+    """The progress of a command."""
 
     stage: str  # "kernels" (compiled on a machine's first run), "rooms", "frames" or "pictures"
     done: int  # of this stage, skipped frames included

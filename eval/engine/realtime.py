@@ -1,4 +1,4 @@
-"""How a model keeps up with a camera: latencies, drops, the network's share, and the memory of the process."""
+"""Real-time figures of a live model: latencies, drops, the network's share, and the memory of the process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class RealTime:
     """Times of the results of one ``LiveDepth``.
 
     Args:
-        model: of the ``LiveDepth``; what follows its networks' last inference of an image counts as ours.
+        model: the model of the ``LiveDepth``. The time after its last inference on an image counts as UfM*'s.
     """
 
     def __init__(self, model: UncertainDepth) -> None:
@@ -49,8 +49,8 @@ class RealTime:
             self._memory = resident_bytes()
 
     def summary(self, statistics: LiveStatistics) -> dict[str, Any]:
-        """Plain values: counts, results per second, latencies and times [ms], and memory [bytes]; None where there is
-        nothing to measure."""
+        """Summarise as plain values: counts, results per second, latencies and times [ms], and memory [bytes]. A value
+        without a measurement is None."""
         compute, network = np.array(self.compute), np.array(self.network)
         now, seconds = resident_bytes(), self._last - self._first
         lost = sum(statistics.dropped.values()) + sum(statistics.skipped.values())
@@ -73,7 +73,7 @@ class RealTime:
 
 
 def _quantiles(seconds: np.ndarray) -> dict[str, float] | None:
-    """p50, p99 and the largest [ms]."""
+    """The median, the 99th percentile and the maximum [ms]; None without a time."""
     if not seconds.size:
         return None
     values = np.quantile(1000 * seconds, [0.5, 0.99, 1])
@@ -81,7 +81,7 @@ def _quantiles(seconds: np.ndarray) -> dict[str, float] | None:
 
 
 def resident_bytes() -> int | None:
-    """Memory of this process that is in RAM; None where the system does not say (it is Linux's)."""
+    """The resident memory of this process [bytes]; None on systems without /proc (other than Linux)."""
     import resource
 
     return int(_STATM.read_text().split()[1]) * resource.getpagesize() if _STATM.exists() else None

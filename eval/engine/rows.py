@@ -44,7 +44,6 @@ class RowResult:
     posterior_depth: Tensor | None = None  # of UfM* with anchors and a posterior [m], or None
     posterior_variance: Tensor | None = None  # likewise [m^2]
     statistics: FrameStatistics | None = None  # of UfM*, [1] per count, or None
-    confidence: Tensor | None = None  # of the prediction, in its own unit, where UfM* had it; or None
     network_variance: Tensor | None  # A + E of the prediction, whatever the row uses [m^2]; None if it states neither
     intrinsics: NDArray[np.float64]  # [3, 3] of the maps [px]
     # [h, w] ground truth at the maps' pixels [m], 0 = none; None without a depth map.
@@ -129,6 +128,13 @@ class RowRunner:
             landmarks=landmarks,
             ms={stage: time for stage, time in times.items() if time is not None},
         )
+
+    def memory(self) -> dict[str, float]:
+        """Size of the state as ``Estimator.memory`` has it, with the bytes behind the anchors: tracks or evidence."""
+        memory = self.estimator.memory()
+        if self._tracks is not None:
+            memory["bytes"] += sum(value.nbytes for value in self._tracks.state().values())
+        return memory
 
     def state(self) -> dict[str, Tensor]:
         """All tensors on which the next frame depends, networks left aside: they remember nothing."""

@@ -1,7 +1,6 @@
 """The loop over frames: predict, update every row, hand the result to the sinks.
 
-``ufmstar run`` is one row with writers, ``ufmstar demo`` four rows on a rendered tour, ``ufmstar eval`` the rows of a
-suite with metrics.
+``ufmstar run`` is one row with writers, ``ufmstar eval`` the rows of a suite with metrics.
 """
 
 from __future__ import annotations

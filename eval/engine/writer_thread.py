@@ -67,7 +67,7 @@ class WriterThread(FrameSink):
             sink.end()
 
     def _wait(self, most: int) -> None:
-        """Until at most so many frames wait, and for those that are done."""
+        """Wait until at most ``most`` frames are queued; frames that are done leave the queue and raise their error."""
         while self._waiting and (len(self._waiting) > most or self._waiting[0].done()):
             self._waiting.popleft().result()
 

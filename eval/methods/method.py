@@ -61,7 +61,7 @@ class Method:
 
     @property
     def name(self) -> str:
-        """As the paper prints it."""
+        """The name as the paper prints it."""
         alone, behind = BASES[self.base]
         if self.fusion == ALONE:
             return alone
@@ -71,12 +71,12 @@ class Method:
 
     @property
     def every_member(self) -> bool:
-        """Whether all members (or samples) are run on every image, not one in turn."""
+        """True if all members (or samples) are run on every image, not one in turn."""
         return self.base in MANY and (self.full or self.fusion == ALONE)
 
     @property
     def uses_aleatoric(self) -> bool:
-        """Whether the network's own variance is used; "DepthOnly" ignores it."""
+        """True if the network's own variance is used; "DepthOnly" ignores it."""
         return self.base != "depth_only"
 
     @classmethod

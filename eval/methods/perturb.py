@@ -21,7 +21,7 @@ _KEPT = ("index", "T_world_cam", "drifted")
 
 
 def selects(setting: Setting, number: int) -> bool:
-    """Whether image ``number`` (0, 1, ... of those to be judged) is used: ``skip`` are left out after each one."""
+    """Return whether image ``number`` (0, 1, ... of those to be judged) is used: ``skip`` are left out after each."""
     return number % (setting.skip + 1) == 0
 
 

@@ -110,7 +110,7 @@ class Setting(Checked):
 
     @property
     def plain(self) -> bool:
-        """Whether no ablation varies anything."""
+        """True if no ablation varies anything."""
         return self == self.chosen
 
     @property
@@ -121,7 +121,7 @@ class Setting(Checked):
 
     @property
     def draws(self) -> bool:
-        """Whether anything is drawn at random, so that the seed matters."""
+        """True if anything is drawn at random, so that the seed matters."""
         noisy = bool(self.pose_noise or self.track_noise)
         return noisy or self.anchors == TRUTH or self.anchor_count is not None
 

@@ -5,8 +5,7 @@ title = "Smoothing"                        # name: the file's, unless given
 base = "ensemble"                          # the network it is about, unless --base names another one; or
 bases = ["ensemble", "aleatoric"]          # several: the rows of each in turn
 efficiency = true                          # time, energy and memory are measured as well
-sweep = ["ema_alpha"]                      # settings that vary, for a figure
-include = ["ablation-eta"]                 # rows and sweeps of other suites as well
+include = ["ablation-eta"]                 # rows of other suites as well
 
 [[rows]]
 methods = ["{alone}", "UfM*-{behind}"]     # as the paper names them: "Ensemble", "UfM*-Ensemble", or by the base
@@ -16,7 +15,6 @@ bases = ["ensemble"]                       # of no other base
 methods = ["UfM*-{behind}"]
 setting = { "segment.min_pixels" = 2000 }  # of UfM*, or of ``Setting``: ufm_preset, preprocess, rotation_noise ...
 each = { ema_alpha = [0.1, 0.25, 1.0] }    # one row for every value
-multiples = { eta = [0.5, 2.0] }           # likewise, of UfM*'s own value
 ```
 
 A row that occurs several times is taken once.
@@ -36,15 +34,14 @@ from typing import Any
 
 from ufmstar_torch.eval.methods.method import BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULTS, default_of, setting_from
+from ufmstar_torch.eval.methods.setting import setting_from
 
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
 _KEYS = {
-    "name": str, "title": str, "base": str, "bases": list, "include": list, "sweep": list, "rows": list,
-    "efficiency": bool,
+    "name": str, "title": str, "base": str, "bases": list, "include": list, "rows": list, "efficiency": bool,
 }  # fmt: skip
-_ROW_KEYS = {"methods": list, "bases": list, "setting": dict, "each": dict, "multiples": dict, "label": str}
+_ROW_KEYS = {"methods": list, "bases": list, "setting": dict, "each": dict, "label": str}
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,6 @@ class Suite:
     name: str  # small letters, digits and single dashes
     title: str  # one line for people
     rows: tuple[Row, ...]  # each of them once
-    sweep: tuple[str, ...] = ()  # settings that vary, by the names of ``Setting.to_dict``; () = a table of methods
     efficiency: bool = False  # whether time, energy and memory are what it is about
 
     def __post_init__(self) -> None:
@@ -70,8 +66,6 @@ class Suite:
         twice = sorted({slug for slug in slugs if slugs.count(slug) > 1})
         if twice:
             raise ValueError(f"suite {self.name} has a row twice: {', '.join(twice)}")
-        for name in self.sweep:
-            default_of(name)
 
     @property
     def bases(self) -> tuple[str, ...]:
@@ -129,8 +123,7 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
         stem = Path(name).stem
         if base is not None and not rows:
             raise ValueError(f"the suite has no rows of {base}")
-        sweep = tuple(dict.fromkeys(_sweep(values)))
-        return Suite(values.get("name", stem), values.get("title", stem), rows, sweep, values.get("efficiency", False))
+        return Suite(values.get("name", stem), values.get("title", stem), rows, values.get("efficiency", False))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{name}: {error}") from error
 
@@ -148,7 +141,7 @@ def _read(name: str) -> dict[str, Any]:
     """The content of a suite's file, its keys and bases checked."""
     values = tomllib.loads(_file(name).read_text(encoding="utf-8"))
     _check(values, _KEYS, "the suite")
-    for key in ("bases", "include", "sweep"):
+    for key in ("bases", "include"):
         _words(values, key)
     for base in (*values.get("bases", []), values.get("base", "ensemble")):
         _require_base(base)
@@ -168,12 +161,6 @@ def _rows_of(values: Mapping[str, Any], base: str | None, preset: str | None) ->
         yield from _rows_of(_read(name), base, preset)
 
 
-def _sweep(values: Mapping[str, Any]) -> Iterator[str]:
-    yield from values.get("sweep", [])
-    for name in values.get("include", []):
-        yield from _sweep(_read(name))
-
-
 def _expanded(part: Any, base: str | None, preset: str | None) -> Iterator[Row]:
     """The rows of one [[rows]]: every method at every point."""
     methods = _words(part, "methods")
@@ -183,12 +170,10 @@ def _expanded(part: Any, base: str | None, preset: str | None) -> Iterator[Row]:
         alone, behind = BASES[base]
         methods = tuple(name.replace("{alone}", alone).replace("{behind}", behind) for name in methods)
     ranges: dict[str, list[Any]] = {}
-    for kind in ("each", "multiples"):
-        for name, points in part.get(kind, {}).items():
-            if not isinstance(points, list) or not points:
-                raise ValueError(f"{kind}.{name} must be a list of values, got {points!r}")
-            start = preset or part.get("setting", {}).get("ufm_preset", DEFAULTS)
-            ranges[name] = points if kind == "each" else [factor * default_of(name, start) for factor in points]
+    for name, points in part.get("each", {}).items():
+        if not isinstance(points, list) or not points:
+            raise ValueError(f"each.{name} must be a list of values, got {points!r}")
+        ranges[name] = points
     if base is not None and base not in _words(part, "bases", (base,)):
         return
     label = part.get("label", "")

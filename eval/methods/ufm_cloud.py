@@ -66,19 +66,9 @@ class View:
     t_first_cam: Tensor  # [3] float64 this camera's position in the first one [m]
 
 
-@dataclass(frozen=True)
-class Taken:
-    """A frame taken in."""
-
-    cloud: Cloud  # afterwards
-    variance: Tensor  # [H, W] [m^2], NaN where not valid
-    fused: int  # points that met a valid pixel
-    new: int  # pixels appended
-    dropped: int  # points pruned
-
-
-def take_in(cloud: Cloud, view: View, max_points: int | None) -> Taken:
-    """Steps 1 to 5 of a frame: correspond, fuse, read out, append, prune.
+def take_in(cloud: Cloud, view: View, max_points: int | None) -> tuple[Cloud, Tensor]:
+    """Steps 1 to 5 of a frame: correspond, fuse, read out, append, prune. Returns the points after the frame, and the
+    variance [H, W] [m^2], NaN where not valid.
 
     A point corresponds to the pixel that it is projected into, whatever lies in between: there is no test of
     occlusion or depth. Points that land on an invalid pixel are left as they are.
@@ -103,7 +93,7 @@ def take_in(cloud: Cloud, view: View, max_points: int | None) -> Taken:
     keep = _kept(torch.cat([seen, torch.ones_like(fresh, dtype=torch.bool)]), max_points)
     if keep is not None:
         cloud = Cloud(cloud.moments.index_select(0, keep), cloud.count.index_select(0, keep))
-    return Taken(cloud, variance, len(met), len(fresh), len(seen) + len(fresh) - len(cloud.count))
+    return cloud, variance
 
 
 def _landing(cloud: Cloud, view: View) -> tuple[Tensor, Tensor]:

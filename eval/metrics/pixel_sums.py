@@ -90,7 +90,7 @@ def add_entropy(
 def add_ece_delta(
     depth: Any, variance: Any, target: Any, use: Any, delta: float, confidence: Any, accurate: Any, pixels: Any
 ) -> None:  # fmt: skip
-    """By bin [B] of the confidence: its sum, the pixels with |g - d| <= delta |d|, and all pixels. Bin b is
+    """Count by bin [B] of the confidence: its sum, the pixels with |g - d| <= delta |d|, and all pixels. Bin b is
     [b/B, (b+1)/B); a confidence of exactly 1 belongs to the last."""
     for i in range(len(depth)):
         d, v, g = depth[i], variance[i], target[i]
@@ -126,7 +126,7 @@ def add_sparsification(
     depth: Any, variance: Any, target: Any, use: Any, count: Any, count_squared: Any, count_relative: Any,
     squared: Any, relative: Any, sum_squared: Any, sum_relative: Any,
 ) -> None:  # fmt: skip
-    """By bin [bins + 2] of v: pixels, (d - g)^2 [m^2], |d - g| / g; pixels and sums by bin of these errors, too."""
+    """Add by bin [bins + 2] of v: pixels, (d - g)^2 [m^2], |d - g| / g; pixels and sums by bin of these errors, too."""
     bins = len(count) - 2
     for i in range(len(depth)):
         d, v, g = depth[i], variance[i], target[i]
@@ -159,14 +159,13 @@ def add_joint(depth: Any, variance: Any, target: Any, use: Any, joint: Any) -> N
 def add_nll_by_error(
     depth: Any, variance: Any, target: Any, use: Any, count: Any, nll: Any
 ) -> None:  # fmt: skip
-    """By level and bin [levels, bins + 2] of (d - g)^2, over v > 0: pixels, and NLL. ``use`` is the pixel's
-    level, counted from 1; 0 (False) = unused."""
+    """Add the pixels and their NLL by bin [bins + 2] of (d - g)^2, over v > 0."""
     for i in range(len(depth)):
         d, v, g = depth[i], variance[i], target[i]
         if use[i] and _is_truth(g) and _is_prediction(d, v) and v > 0:
-            level, b = use[i] - 1, log_bin((d - g) * (d - g), count.shape[1] - 2)
-            count[level, b] += 1
-            nll[level, b] += gaussian_nll(d, v, g)
+            b = log_bin((d - g) * (d - g), len(count) - 2)
+            count[b] += 1
+            nll[b] += gaussian_nll(d, v, g)
 
 
 @part

@@ -1,4 +1,4 @@
-"""Does a larger variance mean a larger error? AUSE, AURG, Spearman, and the NLL by size of the error.
+"""Metrics of the order of variances and errors: AUSE, AURG, Spearman, and the NLL by size of the error.
 
 Ranks need all pixels at once; a stream has none of the earlier ones. So the pixels go into bins of equal
 width in the logarithm of the variance and of the error, finer than anyone reads a variance, and pixels
@@ -7,18 +7,16 @@ of one bin count as ties. Each class states a bound on the error that this makes
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric, flat_pixels
-from ufmstar_torch.eval.metrics.pixel_sums import HIGH, LOW, add_joint, add_nll_by_error, add_sparsification
+from ufmstar_torch.eval.metrics.base import SumMetric
+from ufmstar_torch.eval.metrics.pixel_sums import add_joint, add_nll_by_error, add_sparsification
 
 # In the logarithm of the variance or of the error; of both together: 5.5 % in variance, 2 MB of counts.
 BINS, JOINT_BINS = 4096, 512
-LEVELS = 60  # of the variance of another method (``NLLByError``)
 
 
 def mean_of_share(count: Tensor, total: Tensor, shares: Tensor) -> Tensor:
@@ -110,37 +108,18 @@ class NLLByError(SumMetric):
     The paper looks at pixels where another method is confident: pass these as ``valid``, and the same
     ones for every method that is compared.
     ``compute()``: curve [10] ``nll_by_error``, mean NLL over v > 0 of the pixels between one decile and the next, NaN
-    without a pixel. Errors that agree within a bin count as equal: 4096 bins of squared error, .35 % of the error; with
-    ``one_threshold`` 128, 11 %.
-
-    Args:
-        one_threshold: choose the pixels after all sequences: :meth:`add_levels` counts them by the other method's
-            variance in ``LEVELS`` levels (60 % of it), and ``compute()`` takes the half with the lowest, of the level
-            at the threshold a part, as if its pixels were in random order.
+    without a pixel. Errors that agree within a bin count as equal: 4096 bins of squared error, .35 % of the error.
     """
 
     OF_VARIANCE = "NLL by error"
     ADD = add_nll_by_error
 
-    def __init__(self, *, one_threshold: bool = False, **kwargs: Any) -> None:
-        super().__init__({"one_threshold": one_threshold}, **kwargs)
-        self.one_threshold = one_threshold
-        shape = (LEVELS, 128 + 2) if one_threshold else (1, BINS + 2)
-        self.add_counts("count", shape=shape)
-        self.add_sums("nll", shape=shape)
-
-    def add_levels(self, depth: Tensor, variance: Tensor, target: Tensor, reference: Tensor) -> None:
-        """Add frames [...]; ``reference`` [...] is the other method's variance [m^2], NaN where it is not to count."""
-        used = reference >= 0
-        level = (torch.where(used, reference, LOW).clamp(LOW, HIGH) / LOW).log() * (LEVELS / math.log(HIGH / LOW))
-        level = torch.where(used, level.long().clamp(max=LEVELS - 1) + 1, 0)
-        self.add(flat_pixels(depth, variance, target)._replace(use=level.cpu().flatten().numpy()))
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_counts("count", shape=(BINS + 2,))
+        self.add_sums("nll", shape=(BINS + 2,))
 
     def compute(self) -> dict[str, Tensor]:
         kept = torch.arange(1, 11, dtype=torch.float64, device=self.count.device) / 10
-        pixels = self.count.double().sum(1)
-        upto = pixels.cumsum(0)
-        confident = upto[-1] * (0.5 if self.one_threshold else 1.0)
-        part = ((confident - upto + pixels) / pixels.clamp(min=1)).clamp(0, 1)
-        mean = mean_of_share(part @ self.count.double(), part @ self.nll, kept) * kept
+        mean = mean_of_share(self.count, self.nll, kept) * kept
         return {"nll_by_error": torch.diff(mean, prepend=mean.new_zeros(1)) * 10}

@@ -68,7 +68,7 @@ class _Motion:
         self._count = 0
 
     def is_keyframe(self, image: np.ndarray, required: bool) -> bool:
-        """Whether the next image [H, W, 3] is a keyframe: ``required``, or far enough from the last one."""
+        """Return whether the next image [H, W, 3] is a keyframe: ``required``, or far enough from the last one."""
         import cv2
 
         scale = min(1.0, _WIDTH / image.shape[1])

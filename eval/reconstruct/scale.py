@@ -67,6 +67,6 @@ def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarra
 
 
 def _is(file: str, name: str) -> bool:
-    """Whether an image's file has this name, or both are the same number."""
+    """Return whether an image's file has this name, or both are the same number."""
     stem = file.rpartition(".")[0]
     return stem == name or (stem.isdecimal() and name.isdecimal() and int(stem) == int(name))

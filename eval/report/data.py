@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.judge import BY_ERROR_OF_ALL, CONFIDENCE, METRICS
+from ufmstar_torch.eval.engine.judge import METRICS
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.methods.setting import Setting
@@ -54,7 +54,7 @@ class Merged(NamedTuple):
     """Several sequences evaluated as one, every pixel with the same weight."""
 
     figures: Mapping[str, float]  # SequenceMetrics.compute()
-    curves: Mapping[str, list[float]]  # its curves(), "nll_by_error:REFERENCE" and "nll_by_error_of_all:REFERENCE"
+    curves: Mapping[str, list[float]]  # its curves(), and "nll_by_error:REFERENCE"
 
 
 @dataclass(frozen=True)
@@ -269,8 +269,6 @@ def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Merge
         total: Sums = {}  # added in the order of the files, which decides the last bits
         for path in files:
             for name, states in read_sums(path).items():
-                if name == CONFIDENCE:  # samples, no sums
-                    continue
                 mine = total.setdefault(name, {key: torch.zeros_like(value) for key, value in states.items()})
                 if {key: value.shape for key, value in mine.items()} != {k: v.shape for k, v in states.items()}:
                     raise ResultsError(f"{path} holds sums of other metrics than the sequences before it ({name})")
@@ -299,7 +297,7 @@ def _compute(total: Sums, file: Path) -> Merged:
     many = "NLL" in kinds and states["metrics.ECEDelta.pixels"].numel() == 100
     bins = "authors" if many else "ours"
     metrics = SequenceMetrics(with_variance="NLL" in kinds, bins=bins)
-    by_error = {name: NLLByError(one_threshold=name.startswith(BY_ERROR_OF_ALL)) for name in total if name != METRICS}
+    by_error = {name: NLLByError() for name in total if name != METRICS}
     try:
         metrics.load_state_dict({key: value for key, value in states.items() if not key.startswith("metrics.own_")})
         for name, metric in by_error.items():

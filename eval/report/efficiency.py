@@ -113,7 +113,7 @@ def _cells(row: Mapping[str, Any], units: Mapping[str, str]) -> tuple[Cell, ...]
 
 
 def _counts(row: Mapping[str, Any], part: str) -> bool:
-    """Whether a row has such a part at all."""
+    """Return whether a row has this part."""
     return part in row["latency"] and "none" not in row["latency"][part]
 
 
@@ -154,7 +154,7 @@ def megabytes(count: float) -> str:
 
 
 def _percent(value: float) -> str:
-    """As the paper prints it: 90.0, 0.2, 0.03, <0.01."""
+    """Format a percentage as the paper prints it: 90.0, 0.2, 0.03, <0.01."""
     if 0 < value < _SMALLEST:
         return "<0.01"
     return f"{value:.{1 if value >= 0.095 or value == 0 else 2}f}"

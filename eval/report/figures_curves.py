@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.engine.judge import BY_ERROR, BY_ERROR_OF_ALL
+from ufmstar_torch.eval.engine.judge import BY_ERROR
 from ufmstar_torch.eval.methods.method import ALONE, BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report import style
@@ -131,7 +131,7 @@ def _confidence(values: Curves) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def _has_curves(curves: Mapping[str, Any]) -> bool:
-    """Whether a variance was judged, on any pixel at all (a curve without one is NaN, None in a record)."""
+    """Return whether a variance was judged on at least one pixel (a curve without one is NaN, None in a record)."""
     levels = curves.get("ece_q_observed") or ()
     return len(levels) > 0 and all(value is not None and value == value for value in levels)
 
@@ -169,15 +169,10 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
 
 # ---- NLL by size of the error ----
 
-# Entropy [nats] of a Gaussian with a standard deviation of 1 m.
-ONE_METRE = 0.5 * math.log(2 * math.pi * math.e)
-_SIGMAS = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)  # [m]
-
 
 def draw_error(results: Results, dataset: str) -> Any | None:
     """The mean NLL of each tenth of the pixels, from a row's smallest errors to its largest: a line of panels per
-    network, two panels per reference (its confident pixels of each frame, and of all sequences with one threshold);
-    None where no row was judged so."""
+    network, a panel per reference (its confident pixels of each frame); None where no row was judged so."""
     panels = {base: of_base for base in results.bases if (of_base := _error_curves(results, dataset, base))}
     if not panels:
         return None
@@ -186,7 +181,7 @@ def draw_error(results: Results, dataset: str) -> Any | None:
     for line, (base, by_reference) in zip(
         style.hidden_panels(figure, len(panels), columns), panels.items(), strict=True
     ):
-        for axes, ((reference, kind), curves) in zip(line, by_reference.items(), strict=False):
+        for axes, (reference, curves) in zip(line, by_reference.items(), strict=False):
             axes.set_visible(True)
             for row, values in sorted(curves.items(), key=lambda item: item[0].method.fusion == UFM_STAR):
                 x = (np.arange(len(values)) + 0.5) * 100 / len(values)
@@ -194,24 +189,22 @@ def draw_error(results: Results, dataset: str) -> Any | None:
             axes.set(xlim=(0, 100), xticks=[0, 25, 50, 75, 100])
             method = Method.parse(reference)
             judge = "it" if method.fusion == ALONE else style.look_of(method).name
-            title = f"{BASES[base][0]}: where {judge} is confident"
-            title += ", one threshold" if kind == BY_ERROR_OF_ALL else " in each frame"
+            title = f"{BASES[base][0]}: where {judge} is confident in each frame"
             style.finish(axes, title=title, x="percentile of the row's error", y="mean NLL [nats]")
             style.name_lines(axes)
     return figure
 
 
-def _error_curves(results: Results, dataset: str, base: str) -> dict[tuple[str, str], dict[Row, Sequence[float]]]:
-    """Curves by row, by reference and kind of threshold: the base alone first, then UfM."""
-    curves: dict[tuple[str, str], dict[Row, Sequence[float]]] = {}
+def _error_curves(results: Results, dataset: str, base: str) -> dict[str, dict[Row, Sequence[float]]]:
+    """Curves by row, by reference: the base alone first, then UfM."""
+    curves: dict[str, dict[Row, Sequence[float]]] = {}
     for row in results.default_rows(base):
         merged = results.merged.get((dataset, row))
         for name, values in (merged.curves if merged else {}).items():
             kind, _, reference = name.partition(":")
-            known = kind in (BY_ERROR, BY_ERROR_OF_ALL) and np.isfinite(values).any()
-            if known and Method.parse(reference).base == base:
-                curves.setdefault((reference, kind), {})[row] = values
-    return dict(sorted(curves.items(), key=lambda item: (item[0][0].startswith("UfM"), item[0])))
+            if kind == BY_ERROR and np.isfinite(values).any() and Method.parse(reference).base == base:
+                curves.setdefault(reference, {})[row] = values
+    return dict(sorted(curves.items(), key=lambda item: (item[0].startswith("UfM"), item[0])))
 
 
 # ---- the paper's figure of predictive entropy ----
@@ -263,12 +256,11 @@ def draw_entropy(results: Results, base: str) -> Any | None:
         _draw_histograms(panel, rows)
         style.finish(panel, title=environment, y="share of pixels per nat")
     axes[-1].set_xlabel("entropy ½ ln(2πeV) [nats]", size=style.LABEL, color=INK)
-    _sigma_axis(axes[0], low, high)
     return figure
 
 
 def entropy_range(histograms: Sequence[Histogram]) -> tuple[float, float]:
-    """Between the first and the last bin with more than a thousandth of some row's pixels, and half a nat around."""
+    """The range from the first to the last bin with more than 0.1 % of some row's pixels, and half a nat around."""
     edges = histograms[0].edges
     shares = np.array([histogram.counts / histogram.counts.sum() for histogram in histograms])
     filled = np.flatnonzero(shares[:, 1:-1].max(0) > 0.001)
@@ -293,12 +285,3 @@ def _draw_histograms(axes: Any, rows: Mapping[Row, Histogram]) -> None:
             1.02, 0.95 - 0.13 * number, words, color=look.colour, size=style.TICK, va="top", transform=axes.transAxes
         )
     axes.set_ylim(bottom=0)
-
-
-def _sigma_axis(axes: Any, low: float, high: float) -> None:
-    """The same axis in metres of a standard deviation, above."""
-    twin = axes.secondary_xaxis("top", functions=(lambda h: h - ONE_METRE, lambda s: s + ONE_METRE))
-    shown = [sigma for sigma in _SIGMAS if low <= math.log(sigma) + ONE_METRE <= high]
-    twin.set_xticks([math.log(sigma) for sigma in shown], [f"{sigma:g} m" for sigma in shown])
-    twin.tick_params(labelsize=style.TICK - 1, color=FAINT, labelcolor=INK)
-    twin.spines["top"].set_visible(False)

@@ -25,7 +25,7 @@ class Mean(NamedTuple):
     sequences: int = 0  # that have the figure
 
     def better(self, quantity: Quantity) -> bool | None:
-        """Whether a difference beyond its interval is an improvement; None within the interval, without one, or where
+        """True if a difference beyond its interval is an improvement; None within the interval, without one, or where
         neither direction is better."""
         if not abs(self.value) > self.half or quantity.better is None:
             return None
@@ -100,5 +100,5 @@ def references(results: Results, row: Row) -> list[Row]:
 
 
 def has_variance(records: Sequence[Record]) -> bool:
-    """Whether a row has a variance: a network of depth alone has none."""
+    """Return whether a row has a variance: a network of depth alone has none."""
     return any(not math.isnan(value_of(record, "ece_delta")) for record in records)

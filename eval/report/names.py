@@ -164,7 +164,7 @@ def row_labels(rows: Iterable[Row]) -> dict[Row, str]:
 
 
 def shared_words(rows: Iterable[Row]) -> str:
-    """How images were prepared for all rows, "" where their networks' weights decide or rows differ."""
+    """The preparation of images that all rows share, "" where their networks' weights decide or rows differ."""
     prepared = {row.setting.preprocess for row in rows}
     return _WORDS.get(("preprocess", prepared.pop()), "") if len(prepared) == 1 else ""
 

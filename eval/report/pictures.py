@@ -9,10 +9,9 @@ from functools import partial
 from hashlib import sha256
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
@@ -21,7 +20,7 @@ from ufmstar_torch.eval.report.examples import Example, find_examples
 from ufmstar_torch.eval.report.names import row_labels
 from ufmstar_torch.eval.report.rooms import Snapshot, choose_times, draw_room, find_rooms
 from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
-from ufmstar_torch.eval.run.panels import Bar, Box, GridRow, Panel, draw_grid
+from ufmstar_torch.eval.run.panels import Bar, GridRow, Panel, draw_grid
 from ufmstar_torch.eval.suite.work_items import WorkItem
 
 STRIP, BREAKDOWN, COMPARE, ROOM = "strip", "breakdown", "compare", "room"
@@ -33,8 +32,6 @@ _BREAKDOWN_BASES = ("ensemble", "aleatoric")
 # depth's nor that of lengths, and has no grey.
 NLL_SCALE = ColourScale(-2.0, 6.0, "plasma")
 DIFFERENCE_MAP = "RdBu_r"
-# Side of the enlarged part of a comparison by that of the map.
-ZOOM = 1 / 3
 
 
 class Picture(NamedTuple):
@@ -216,11 +213,10 @@ def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Pictu
 
 
 def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: str) -> Picture:
-    """Image, error, sigma by UfM and by UfM*, and UfM* minus UfM; below, the part where they differ most."""
+    """Image, error, sigma by UfM and by UfM*, and UfM* minus UfM."""
     scales, (ufm, ufm_star) = fit_strip_scales(example, pair), pair
     old, new = example.rows[ufm].sigma, example.rows[ufm_star].sigma
     difference = new - old
-    box = largest_difference(difference, ZOOM)
     reach = robust_range([np.abs(difference)], from_zero=True)[1]
     signed = ColourScale(-reach, reach, DIFFERENCE_MAP)
     maps = {
@@ -230,44 +226,15 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
         f"σ, {example.label(ufm_star)}": example.rows[ufm_star].striped(scales.length.rgb(new)),
         "difference of σ": signed.rgb(difference),
     }
-    boxes = [_scaled(box, old.shape, picture.shape) for picture in maps.values()]
-    whole = [Panel(picture, name, b) for (name, picture), b in zip(maps.items(), boxes, strict=True)]
-    enlarged = [Panel(p[top : top + h, x : x + w]) for p, (x, top, w, h) in zip(maps.values(), boxes, strict=True)]
     lines = [line for row in pair for line in (f"{example.label(row)}:", *figures_of(example, row))]
-    grid = [
-        GridRow(example.sequence, [f"frame {example.frame}"], whole),
-        GridRow("where they differ most", lines, enlarged),
-    ]
+    panels = [Panel(picture, name) for name, picture in maps.items()]
+    grid = [GridRow(example.sequence, [f"frame {example.frame}", *lines], panels)]
     bars = [Bar("|error| and σ [m]", scales.length, 1, span=3), Bar("UfM* minus UfM [m]", signed, 4)]
     title = f"{example.label(ufm_star)} against {example.label(ufm)}"
-    caption = (
-        "Red: UfM* has the larger standard deviation; blue: the smaller. The box marks where they differ most on "
-        "average, enlarged below."
-    )
+    caption = "Red: UfM* has the larger standard deviation; blue: the smaller."
     picture = _picture(example, pair, COMPARE, base, title, caption)
     draw_grid(folder / picture.file, grid, bars, aspect=example.aspect)
     return picture
-
-
-def largest_difference(difference: NDArray[Any], share: float) -> Box:
-    """The box, of a ``share`` of each side, with the largest mean |difference| [h, w], NaN counting as 0; the first
-    such box from the top left."""
-    h, w = difference.shape
-    height, width = max(1, round(share * h)), max(1, round(share * w))
-    size = np.where(np.isfinite(difference), np.abs(difference), 0).astype(np.float64)
-    sums = np.zeros((h + 1, w + 1))
-    sums[1:, 1:] = size.cumsum(0).cumsum(1)
-    boxes = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
-    # Sums of rounded sums differ in the last bits where the boxes' own do not.
-    top, left = np.unravel_index(int(np.argmax(boxes.round(9))), boxes.shape)
-    return int(left), int(top), width, height
-
-
-def _scaled(box: Box, shape: tuple[int, ...], picture: tuple[int, ...]) -> Box:
-    """A box of a map in a picture of another size."""
-    y, x = picture[0] / shape[0], picture[1] / shape[1]
-    left, top, width, height = box
-    return round(left * x), round(top * y), max(1, round(width * x)), max(1, round(height * y))
 
 
 def _judged(example: Example, row: str, scales: PanelScales) -> tuple[Panel, Panel, Panel]:

@@ -180,7 +180,7 @@ def project(view: Projection, covariance: Array) -> tuple[Array, Array]:
 
 
 def oblique_view(T_world_cam: Array) -> Projection:
-    """From behind the first of cameras [n, 4, 4], ``ELEVATION`` over the horizon.
+    """A view from behind the first of cameras [n, 4, 4], ``ELEVATION`` over the horizon.
 
     Data sets differ in which axis points up; a camera's own up (-y) is right on average.
     """

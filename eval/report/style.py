@@ -1,4 +1,4 @@
-"""How figures look: one colour and mark per kind of method, names right of the panels, no global state."""
+"""The look of figures: one colour and mark per kind of method, names right of the panels, no global state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Text for the terminal: what a run, an evaluation, a report and the demo print at their end."""
+"""Text for the terminal: results of a run, an evaluation, a report and the demo on board."""
 
 from __future__ import annotations
 
@@ -8,20 +8,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.demo import CURVES, ENSEMBLE, NETWORK, POSTERIOR
 from ufmstar_torch.eval.report.table import markdown
 from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.eval.report.write import Report
-from ufmstar_torch.eval.run.pictures import ELLIPSOIDS, PLY, SHEET
 from ufmstar_torch.eval.run.summary import NEAR_ZERO
 
 # [nats] A mean NLL above it is that of a few pixels: sigma = .25 d of a room makes about 1.
 NLL_OF_FEW = 100.0
-_CALIBRATION = {"nll": "NLL", "ece_delta": "ECE_delta", "ece_q": "ECE_q"}
-_DEMO_COLUMNS = {"delta1": "delta1", **_CALIBRATION, "ause_rmse": "AUSE [m]"}
-_RUN_COLUMNS = {"delta1": "delta1", "abs_rel": "AbsRel", "rmse": "RMSE [m]", **_CALIBRATION, "spearman": "Spearman"}
+_RUN_COLUMNS = {
+    "delta1": "delta1", "abs_rel": "AbsRel", "rmse": "RMSE [m]", "nll": "NLL", "ece_delta": "ECE_delta",
+    "ece_q": "ECE_q", "spearman": "Spearman",
+}  # fmt: skip
 _TARGET_MS, _TARGET_LOST = 50.0, 0.01  # of the demo on board
 _CALIBRATED = 4.0  # mean z^2 of held-out anchors, and its inverse: sigma is right to a factor of two
 _UNSUPPORTED = "mean sigma not shown: neither truth nor held-out anchors (--posterior) support it"
@@ -54,57 +52,6 @@ def written(out: Path, report: Report) -> str:
     names += [f"{folder.name}/ ({count} files)" for folder, count in folders.items()]
     undrawn = [f"figure not drawn: {name}: {reason}" for name, reason in report.undrawn.items()]
     return "\n".join([*undrawn, f"{out}: {', '.join(names)}"])
-
-
-def demo_names(members: int) -> dict[str, str]:
-    """The names of the demo's methods."""
-    alone = "network alone" if members == 1 else f"{members} members in turn, alone"
-    inferences = f"all {members} members per image"
-    return {NETWORK: alone, UFM: "  with UfM", UFM_STAR: "  with UfM*", POSTERIOR: "  posterior", ENSEMBLE: inferences}
-
-
-def demo_table(summary: Mapping[str, Any]) -> str:
-    """Methods by metrics, time and memory; below it, RMSE and root mean square sigma by kind of room.
-
-    Where these two are equal, sigma is right on average.
-    """
-    names, methods, kinds = demo_names(summary["network"]["members"]), summary["methods"], summary["surfaces"]
-    body = [
-        [
-            names[method],
-            *(number(row["figures"][key]) for key in _DEMO_COLUMNS),
-            f"{row['network_ms']:.1f}",
-            f"{row['uncertainty_ms']:.1f}" if row["uncertainty_ms"] is not None else "-",
-            f"{row['state_bytes'] / 1000:.1f}",
-        ]
-        for method, row in methods.items()
-    ]
-    rooms = [
-        [names[method], *(number(kinds[kind][method][key]) for kind in kinds for key in ("rmse", "rms_sigma"))]
-        for method in methods
-    ]
-    room_head = [f"{kind}: {figure}" for kind in kinds for figure in ("RMSE [m]", "sigma [m]")]
-    head = ["", *_DEMO_COLUMNS.values(), "network ms", "+ ms", "state kB"]
-    return "\n".join([*aligned([head, *body]), "", *aligned([["", *room_head], *rooms])])
-
-
-def demo_explanation(summary: Mapping[str, Any]) -> str:
-    """The demo's output files and how to read them, in a few lines."""
-    out, outputs = summary["out"], summary["outputs"]
-    seen, unseen = summary["surfaces"]
-    lines = [
-        f"The networks were trained on rooms like the {seen} ones, never on one like the {unseen} one.",
-        "Better: a high delta1, a low NLL, ECE and AUSE, and a sigma that equals the RMSE beside it.",
-    ]
-    hints = {
-        SHEET: f"sigma and error share a logarithmic scale, so that they can be compared; {unseen} rooms below",
-        CURVES: "nearer to the diagonal is better; on the left, a curve below it is over-confident",
-        PLY: f"the mixture, brighter = views disagree more; for splat viewers ({ELLIPSOIDS}: MeshLab, Blender)",
-    }
-    lines += [f"{out}/{name}: {hint}" for name, hint in hints.items() if outputs[name] is None]
-    lines += [f"no {name}: {reason}" for name, reason in outputs.items() if reason is not None]
-    lines.append(f"{out}/summary.json: every figure, per kind of room, with versions and settings")
-    return "\n".join(lines)
 
 
 def run_table(summary: Mapping[str, Any]) -> str:
@@ -157,7 +104,7 @@ def run_table(summary: Mapping[str, Any]) -> str:
 
 
 def supported(summary: Mapping[str, Any]) -> bool:
-    """Whether held-out anchors are off by as much as the posterior states, to a factor of two."""
+    """Return whether the errors at held-out anchors agree with the posterior's sigma to a factor of two."""
     calibration = summary.get("posterior", {}).get("calibration")
     return calibration is not None and 1 / _CALIBRATED < calibration < _CALIBRATED
 
@@ -200,7 +147,7 @@ def onboard_table(summary: Mapping[str, Any]) -> str:
         m = {name: number(value) for name, value in found.items()}
         lines.append(
             f"where the aleatoric variance is low: RMSE {m['rmse_high']} m at high disagreement "
-            f"({100 * found['share']:.0f} % of the pixels; aleatoric sigma {m['own_sigma_high']} m, sqrt(M) "
+            f"({100 * found['share']:.0f} % of the pixels; aleatoric sigma {m['aleatoric_sigma_high']} m, sqrt(M) "
             f"{m['disagreement_high']} m), {m['rmse_low']} m elsewhere"
         )
     return "\n".join([*lines, f"{summary['out']}: summary.json{', onboard.png' if found else ''}"])

@@ -16,7 +16,6 @@ from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.report.tables import write_tables, write_tidy
 from ufmstar_torch.eval.run.files import remove_temporaries
 
-KINDS = ("svg", "png")
 # Errors of drawing, after which a report goes on without the picture.
 _DRAWING_ERRORS = (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError)
 
@@ -28,19 +27,17 @@ class Report(NamedTuple):
     undrawn: Mapping[str, str]
 
 
-def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> Report:
+def write_report(out: Path, *, figures: bool = True) -> Report:
     """Write the report of an evaluation, finished or not, into its folder.
 
-    ``figures=False`` writes tables and results alone, without a page, and needs no matplotlib; ``pictures`` is the
-    format of figures, "svg" or "png". A figure that cannot be drawn is left out, and named on the page.
+    ``figures=False`` writes tables and results alone, without a page, and needs no matplotlib. A figure that cannot be
+    drawn is left out, and named on the page.
 
     Raises:
         ResultsError: the folder is no evaluation, or its records do not belong together.
-        ValueError: another kind of figures, or a file with an example that cannot be read.
+        ValueError: a file with an example cannot be read.
         ImportError: matplotlib, Pillow or Jinja2 is missing.
     """
-    if pictures not in KINDS:
-        raise ValueError(f"figures must be {' or '.join(KINDS)}, got {pictures!r}")
     results = load_results(out, with_sums=figures)
     # Remains of a killed report; eval.json and the records belong to `ufmstar eval`.
     for pattern in ("tables/.*.tmp", "figures/.*.tmp", ".results.*.tmp", ".table.*.tmp", ".report.*.tmp"):
@@ -48,7 +45,7 @@ def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> R
     files = [write_tidy(results), *write_tables(results)]
     undrawn: dict[str, str] = {}
     if figures:
-        files += _draw(results, pictures, undrawn)
+        files += _draw(results, undrawn)
     return Report(files, undrawn)
 
 
@@ -67,7 +64,7 @@ def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
     yield "latency stages", partial(figures_cost.draw_stages, results)
 
 
-def _draw(results: Results, kind: str, undrawn: dict[str, str]) -> list[Path]:
+def _draw(results: Results, undrawn: dict[str, str]) -> list[Path]:
     """Draw figures and pictures into ``figures/``, and write the page; their paths."""
     folder = results.out / "figures"
     folder.mkdir(exist_ok=True)
@@ -79,7 +76,7 @@ def _draw(results: Results, kind: str, undrawn: dict[str, str]) -> list[Path]:
             if isinstance(drawn, Picture):
                 pictures.append(drawn)
             elif drawn is not None:
-                path = folder / f"{re.sub(r'[^A-Za-z0-9.-]+', '-', name.replace('/', '_'))}.{kind}"
+                path = folder / f"{re.sub(r'[^A-Za-z0-9.-]+', '-', name.replace('/', '_'))}.svg"
                 save_figure(drawn, path)
                 figures.append(path)
         except _DRAWING_ERRORS as error:

@@ -1,4 +1,4 @@
-"""A run's result for other programs: gated depth, a cloud of points, the trajectory, or ``transforms.json``.
+"""A run's result for other programs: depth and sigma, a cloud of points, the trajectory, or ``transforms.json``.
 
 All of it is below OUT/export. Depth and sigma are the posterior's where the run has one; a pixel that is not valid, or
 whose sigma is beyond a limit, is left out.
@@ -9,16 +9,17 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.eval.run.colours import known_where
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
 from ufmstar_torch.eval.run.gaussians import vertex_table, write_ply
-from ufmstar_torch.eval.run.writers import encode_length_png, fitting_unit, read_frame
+from ufmstar_torch.eval.run.length_png import encode_length_png, fitting_unit
+from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
@@ -41,6 +42,7 @@ class Gated:
     intrinsics: NDArray[np.float64]  # [3, 3] [px]
     depth: NDArray[np.float32]
     sigma: NDArray[np.float32]
+    anchors: NDArray[np.float32] | None = None  # [N, 4] u, v [px], depth and its standard deviation [m]
 
 
 def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
@@ -52,18 +54,20 @@ def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iter
         max_relative_sigma: largest sigma as a share of the depth.
 
     Raises:
-        ValueError: no run's folder, or one of an earlier version, without poses.
+        ValueError: no run's folder, one without a finished frame, or one of an earlier version, without poses.
     """
     if not (out / RECORDS).is_file():
         raise ValueError(f"{out} is no output of `ufmstar run`: it has no {RECORDS}")
-    return _gated(out, max_sigma, max_relative_sigma)
+    records = read_records((out / RECORDS).read_bytes(), out / RECORDS)
+    done = [record for record in records if record["state"] == "done"]
+    if not done:
+        raise ValueError(f"{out} has no finished frame")
+    return _gated(out, done, max_sigma, max_relative_sigma)
 
 
-def _gated(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
-    for record in read_records((out / RECORDS).read_bytes(), out / RECORDS):
-        if record["state"] != "done":
-            continue
-        maps = read_frame(out / "frames" / f"{record['name']}.npz")
+def _gated(out: Path, done: list[dict], max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
+    for record in done:
+        maps = read_frame(frame_file(out, record["name"]))
         if "T_world_cam" not in maps:
             raise ValueError(f"{out}: the run is of an earlier version, whose frames have no poses; run it again")
         prefix = "posterior_" if "posterior_depth" in maps else ""
@@ -75,16 +79,19 @@ def _gated(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[G
         nothing = np.float32(np.nan)
         depth, sigma = np.where(kept, depth, nothing), np.where(kept, sigma, nothing)
         camera = (maps["T_world_cam"], maps["intrinsics"])
-        yield Gated(record["name"], record["index"], record.get("timestamp"), *camera, depth, sigma)
+        about = (record["name"], record["index"], record.get("timestamp"))
+        yield Gated(*about, *camera, depth, sigma, maps.get("anchors"))
 
 
 def export_depth(frames: Iterator[Gated], out: Path) -> str:
-    """NAME.npy [h, w] float32 [m], NaN where left out."""
-    folder, count = export_folder(out, "depth"), 0
+    """depth/NAME.png and sigma/NAME.png, 16 bits, 0 = left out."""
+    folders, unit, count = [export_folder(out, kind) for kind in ("depth", "sigma")], None, 0
     for frame in frames:
         count += 1
-        write_atomic(folder / f"{frame.name}.npy", partial(_save, frame.depth))
-    return f"{folder}: {count} maps"
+        unit = unit or fitting_unit(frame.depth)
+        for folder, values, metres in zip(folders, (frame.depth, frame.sigma), (unit, unit / 10), strict=True):
+            _write(folder / f"{frame.name}.png", encode_length_png(values, metres, folder.name))
+    return f"{folders[0]}, {folders[1]}: {count} maps each"
 
 
 def export_trajectory(frames: Iterator[Gated], out: Path) -> str:
@@ -127,7 +134,7 @@ def export_cloud(frames: Iterator[Gated], out: Path, voxel: float, sequence: Fra
         kinds |= dict.fromkeys(("red", "green", "blue"), "|u1")
         columns.append(np.rint(colour))
     file = export_folder(out) / "cloud.ply"
-    write_ply(file, {"vertex": vertex_table(kinds, *columns)}, ["x y z sigma [m], world of the poses"])
+    write_ply(file, vertex_table(kinds, *columns), "x y z sigma [m], world of the poses")
     return f"{file}: {len(keys)} points"
 
 
@@ -142,12 +149,12 @@ def export_transforms(frames: Iterator[Gated], out: Path, sequence: FrameSequenc
             continue
         K, size = image.intrinsics, (image.image.shape[0], image.image.shape[1])
         depth, sigma = (resample_nearest(values, frame.intrinsics, K, size) for values in (frame.depth, frame.sigma))
-        known = np.isfinite(depth) & (depth > 0)
-        unit = unit or fitting_unit(depth[known])
+        known = depth > 0  # the image may show more than the maps, where they are 0
+        depth, sigma = known_where(known, depth), known_where(known, sigma)
+        unit = unit or fitting_unit(depth)
         entry: dict[str, Any] = {"file_path": f"images/{frame.name}.png"}
         for kind, values in (("depth", depth), ("sigma", sigma)):
-            content, _ = encode_length_png(values, known, unit, quantity=kind)
-            _write(folder / kind / f"{frame.name}.png", content)
+            _write(folder / kind / f"{frame.name}.png", encode_length_png(values, unit, kind))
             entry[f"{kind}_file_path"] = f"{kind}/{frame.name}.png"
         _write(folder / entry["file_path"], _png(image.image))
         camera = {
@@ -175,9 +182,13 @@ def run_settings(out: Path) -> dict[str, Any]:
 def points_in_camera(frame: Gated) -> tuple[NDArray[np.float64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """[P, 3] the points of the pixels that are kept, in the camera's axes [m], and those pixels' rows and columns."""
     v, u = np.nonzero(np.isfinite(frame.depth))
-    z, K = frame.depth[v, u].astype(np.float64), frame.intrinsics
-    y = (v - K[1, 2]) / K[1, 1]
-    return np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1), (v, u)
+    return points_of(u, v, frame.depth[v, u], frame.intrinsics), (v, u)
+
+
+def points_of(u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any], K: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[P, 3] in the camera's axes [m] of pixels u, v [px] with a depth [m]."""
+    z, y = depth.astype(np.float64), (v - K[1, 2]) / K[1, 1]
+    return np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1)
 
 
 def _voxels(frame: Gated, voxel: float, image: Frame | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -228,7 +239,3 @@ def _png(image: NDArray[np.uint8]) -> bytes:
 
 def _write(path: Path, content: bytes) -> None:
     write_atomic(path, lambda file: file.write(content))
-
-
-def _save(depth: NDArray[np.float32], file: BinaryIO) -> None:
-    np.save(file, depth)

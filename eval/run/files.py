@@ -14,7 +14,6 @@ import torch
 
 from ufmstar_torch.atomic import remove_temporaries as remove_temporaries
 from ufmstar_torch.atomic import write_atomic as write_atomic
-from ufmstar_torch.atomic import write_together as write_together
 
 
 def write_json_atomic(path: Path, data: Mapping[str, Any]) -> None:

@@ -77,8 +77,11 @@ class FolderKind:
             raise FolderError(text) from error
 
     def earlier(self, out: Path, *, resume: bool, overwrite: bool) -> bool:
-        """Whether the folder contains earlier work of the program. Raises FolderError: it is a file, contains files of
-        other programs, or contains earlier work and neither option is set."""
+        """Return whether the folder contains earlier work of the program.
+
+        Raises FolderError: it is a file, contains files of other programs, or contains earlier work and neither option
+        is set.
+        """
         if out.exists() and not out.is_dir():
             raise FolderError(f"--out {out} is a file, expected a folder")
         known, state = (out / self.manifest).is_file(), ""

@@ -1,4 +1,4 @@
-"""The mixture as files: splat attributes and ellipsoids (binary PLY) for viewers, npz for programs.
+"""The mixture as files: splat attributes (binary PLY) for viewers, npz for programs.
 
 Positions are in the frame of the mixture (the first camera: x right, y down, z forward), or in the
 world where ``T_world_first`` is given. Lengths in metres. PLY stores float32, as its viewers expect:
@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -29,7 +28,7 @@ SIGMA_FLOOR = 1e-6
 # The constant spherical harmonic: viewers show the colour 1/2 + SH_DC f_dc.
 SH_DC = 0.5 / np.sqrt(np.pi)
 OPACITY = 0.8
-RADIUS, SUBDIVISIONS = 2.0, 2  # of the ellipsoids, of the icosahedron: 320 triangles each
+RADIUS = 2.0  # of the ellipsoids of a rerun recording
 _TYPES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
 
 
@@ -58,38 +57,8 @@ def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_fir
     names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
     kinds = dict.fromkeys((*names.split(), "weight", "disagreement"), "<f4") | {"count": "<i4"}
     table = vertex_table(kinds, *columns, quaternion, parts.weight, parts.disagreement, parts.count)
-    write_ply(Path(path), {"vertex": table}, [parts.legend])
+    write_ply(Path(path), table, parts.legend)
     return len(table)
-
-
-def write_ellipsoids_ply(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> int:
-    """Write the occupied components as a triangle mesh of ellipsoids of ``RADIUS`` standard deviations, atomically.
-
-    Opens in MeshLab, Blender and the like. Vertices carry x y z [m], outward normals, red green blue of
-    sqrt(disagreement), disagreement [m^2] and the component's number. Arguments, result and errors as
-    :func:`write_mixture_ply`.
-    """
-    parts = Components(mixture, T_world_first)
-    sphere, triangles = icosphere(SUBDIVISIONS)
-    k, n = len(parts.mean), len(sphere)
-    # Sigma^(1/2) u: symmetric with a positive determinant, so triangles keep facing outwards.
-    root = np.einsum("kij,kj,klj->kil", parts.axes, parts.sigma, parts.axes)
-    inverse = np.einsum("kij,kj,klj->kil", parts.axes, 1 / parts.sigma, parts.axes)
-    normal = np.einsum("kij,nj->kni", inverse, sphere)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    position = (parts.mean[:, None] + RADIUS * np.einsum("kij,nj->kni", root, sphere)).reshape(-1, 3)
-    kinds = dict.fromkeys(("x", "y", "z", "nx", "ny", "nz"), "<f4")
-    kinds |= dict.fromkeys(("red", "green", "blue"), "|u1") | {"disagreement": "<f4", "component": "<i4"}
-    of_component = (parts.colour, parts.disagreement, np.arange(k))
-    vertices = vertex_table(
-        kinds, position, normal.reshape(-1, 3), *(values.repeat(n, axis=0) for values in of_component)
-    )
-    faces = np.zeros(k * len(triangles), dtype=[("sides", "|u1"), ("vertex_indices", "<i4", (3,))])
-    faces["sides"] = 3
-    faces["vertex_indices"] = (triangles + n * np.arange(k)[:, None, None]).reshape(-1, 3)
-    legend = [parts.legend, f"ellipsoids of {RADIUS:g} standard deviations"]
-    write_ply(Path(path), {"vertex": vertices, "face": faces}, legend)
-    return k
 
 
 def write_mixture_npz(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> None:
@@ -101,26 +70,6 @@ def write_mixture_npz(path: str | Path, mixture: GaussianMixture, *, T_world_fir
     if T_world_first is not None:
         fields["T_world_first"] = T_world_first.detach().cpu().double().numpy()
     write_atomic(Path(path), lambda file: np.savez(file, allow_pickle=False, **fields))
-
-
-def icosphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Unit vectors [10 4^s + 2, 3] and outward triangles [20 4^s, 3] of a divided icosahedron.
-
-    All vertices lie on the sphere, so the triangles are those of their convex hull; dividing adds the hull's edges'
-    middles as vertices.
-    """
-    g = (1 + 5**0.5) / 2
-    base = [(0, a, b * g) for a in (-1, 1) for b in (-1, 1)]
-    vertices = np.array([np.roll(v, shift) for shift in range(3) for v in base]) / np.hypot(1, g)
-    for _ in range(subdivisions):
-        triangles = ConvexHull(vertices).simplices
-        edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-        middle = vertices[edges].sum(1)
-        vertices = np.concatenate([vertices, middle / np.linalg.norm(middle, axis=-1, keepdims=True)])
-    triangles = ConvexHull(vertices).simplices.astype(np.int64)
-    inward = np.linalg.det(vertices[triangles]) < 0
-    triangles[inward] = triangles[inward][:, ::-1]
-    return vertices, triangles
 
 
 class Components:
@@ -165,16 +114,9 @@ def vertex_table(kinds: Mapping[str, str], *columns: NDArray[Any]) -> NDArray[An
     return unstructured_to_structured(np.column_stack(columns), np.dtype(list(kinds.items())))
 
 
-def write_ply(path: Path, elements: Mapping[str, NDArray[Any]], comments: list[str]) -> None:
-    """Binary little-endian PLY; a field of shape (3,) behind ``sides`` is a list property."""
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
-    for element, table in elements.items():
-        lines.append(f"element {element} {len(table)}")
-        for name in table.dtype.names or ():
-            kind = table.dtype[name]
-            if kind.subdtype is not None:
-                lines.append(f"property list uchar int {name}")
-            elif name != "sides":
-                lines.append(f"property {_TYPES[kind.str]} {name}")
+def write_ply(path: Path, vertices: NDArray[Any], comment: str) -> None:
+    """Write the structured array ``vertices`` as binary little-endian PLY."""
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {comment}", f"element vertex {len(vertices)}"]
+    lines += [f"property {_TYPES[vertices.dtype[name].str]} {name}" for name in vertices.dtype.names or ()]
     content = "\n".join([*lines, "end_header", ""]).encode("ascii")
-    write_atomic(path, lambda file: file.write(content + b"".join(t.tobytes() for t in elements.values())))
+    write_atomic(path, lambda file: file.write(content + vertices.tobytes()))

@@ -54,7 +54,7 @@ class RunJob:
 
     @cached_property
     def image_fit(self) -> ImageFit | None:
-        """How poses and intrinsics fit the images; None where no corner could be followed."""
+        """The fit of poses and intrinsics to the images; None where no corner could be followed."""
         return image_fit(self.sequence, self.corners)
 
     def metrics(self, checkpoint: Checkpoint) -> RunMetrics:

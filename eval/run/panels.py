@@ -15,21 +15,15 @@ from ufmstar_torch import unmeasured
 from ufmstar_torch.eval.run import colours
 from ufmstar_torch.eval.run.colours import FAINT, INK, ColourScale
 
-# (left, top, width, height) in pixels of the map.
-Box = tuple[int, int, int, int]
-_MARK = "#00d5ff"  # in neither depth's nor sigma's colours
 # Inches.
 _GAP, _MARGIN, _CAPTION, _BAR, _BARS, _TITLE = 0.06, 0.08, 0.2, 0.1, 0.62, 0.34
 
 
 class Panel(NamedTuple):
-    """One picture [h, w, 3] uint8 with a caption above and a box outlined in it; None leaves a place with the words
-    ``absent``.
-    """
+    """One picture [h, w, 3] uint8 with a caption above; None leaves a place with the words ``absent``."""
 
     rgb: NDArray[np.uint8] | None
     caption: str = ""
-    box: Box | None = None
     absent: str = ""
 
 
@@ -142,12 +136,6 @@ def _draw_panel(axes: Any, panel: Panel) -> None:
         axes.text(0.5, 0.5, panel.absent, color=FAINT, size=8, ha="center", va="center", transform=axes.transAxes)
         return
     axes.imshow(panel.rgb, aspect="auto", interpolation="antialiased")
-    if panel.box is not None:
-        from matplotlib.patches import Rectangle
-
-        left, top, width, height = panel.box
-        corner = (left - 0.5, top - 0.5)
-        axes.add_patch(Rectangle(corner, width, height, fill=False, edgecolor=_MARK, linewidth=1.4))
 
 
 def draw_bar(axes: Any, bar: Bar) -> None:

@@ -1,4 +1,4 @@
-"""Pictures of a run: contact sheet, preview video, and the mixture for viewers.
+"""Pictures of a run: contact sheet and preview video.
 
 A run's pictures are drawn from its finished frames on disk, so that their scales fit the whole run, and a run that was
 stopped and continued gets the same ones.
@@ -6,9 +6,8 @@ stopped and continued gets the same ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +18,14 @@ from numpy.typing import NDArray
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.run.colours import INVALID_GREY, known_where
-from ufmstar_torch.eval.run.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.run.panels import FramePanel, MapColumn, contact_sheet, map_columns
 from ufmstar_torch.eval.run.video import preview_frame, write_video
-from ufmstar_torch.eval.run.writers import read_frame
+from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
-from ufmstar_torch.ufmstar import UfMStar
 
 SHEET = "contact_sheet.png"
-PLY, ELLIPSOIDS, NPZ = "mixture.ply", "ellipsoids.ply", "mixture.npz"
 SHEET_ROWS, POSTERIOR_ROWS, SCALE_FRAMES = 6, 3, 12
 # Without timestamps; and the range in which a recording's own rate is kept.
 DEFAULT_FPS, FPS_RANGE = 10.0, (2.0, 30.0)
@@ -49,7 +45,7 @@ class Finished:
     def panel(self, number: int) -> FramePanel:
         """Finished frame ``number``, with square pixels, and the image cut to what the prediction shows."""
         record = self.records[number]
-        stored = read_frame(self.out / "frames" / f"{record['name']}.npz")
+        stored = read_frame(frame_file(self.out, record["name"]))
         K, size = pinhole(*record["intrinsics"]), (record["size"][0], record["size"][1])
         K_square, size_square = square_pixels(K, size)
         try:
@@ -89,23 +85,18 @@ class Finished:
         return float(np.clip(1 / np.median(np.diff(known)), *FPS_RANGE))
 
 
-def panel_of(name: str, note: str, frame: Frame, row: RowResult, posterior: RowResult | None = None) -> FramePanel:
-    """Depth, sigma and, with ground truth, true error of a row, and of a row of its posterior, beside the image."""
-    if frame.image is None:
-        raise ValueError(f"frame {name} has no image to show")
-    valid, maps = row.valid.numpy(), dict[str, NDArray[Any]]()
-    for prefix, one in (("", row), ("posterior_", posterior)):
-        if one is None or one.variance is None:
-            continue
-        depth = one.depth.float().numpy()
-        maps[prefix.rstrip("_") or "depth"] = depth
-        maps[f"{prefix}sigma"] = one.variance.float().sqrt().numpy()
-        if row.truth is not None:
-            maps[f"{prefix}error"] = absolute_error(depth, row.truth)
+def panel_of(name: str, note: str, frame: Frame, row: RowResult) -> FramePanel:
+    """A row's maps of a frame beside its image: depth, sigma and, with ground truth, the absolute error."""
+    if frame.image is None or row.variance is None:
+        raise ValueError(f"frame {name} has no image or no variance to show")
+    maps = {"depth": row.depth.float().numpy(), "sigma": row.variance.float().sqrt().numpy()}
+    if row.truth is not None:
+        maps["error"] = absolute_error(maps["depth"], row.truth)
     if row.measured is not None:
         maps["measured"] = row.measured.float().numpy()
     image = field_of_view(frame.image, frame.intrinsics, row.intrinsics, row.size)
-    return FramePanel(name, image, {key: known_where(valid, values) for key, values in maps.items()}, note)
+    shown = {key: known_where(row.valid.numpy(), values) for key, values in maps.items()}
+    return FramePanel(name, image, shown, note)
 
 
 def common_columns(finished: Finished) -> list[MapColumn]:
@@ -130,17 +121,6 @@ def draw_video(finished: Finished, columns: Sequence[MapColumn]) -> Iterator[int
         for number in range(len(finished.records)):
             add(preview_frame(finished.panel(number), columns))
             yield number + 1
-
-
-def mixture_writers(ufm: UfMStar) -> dict[str, Callable[[Path], object]]:
-    """By file name, what writes the mixture in world coordinates: as splats, as ellipsoids, and exactly."""
-    mixture, first = ufm.mixture, ufm.T_world_first
-    writers: dict[str, Callable[..., object]] = {
-        PLY: write_mixture_ply,
-        ELLIPSOIDS: write_ellipsoids_ply,
-        NPZ: write_mixture_npz,
-    }
-    return {name: partial(write, mixture=mixture, T_world_first=first) for name, write in writers.items()}
 
 
 def square_pixels(K: NDArray, size: Size) -> tuple[NDArray, Size]:

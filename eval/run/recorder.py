@@ -6,6 +6,9 @@ import math
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
@@ -14,6 +17,8 @@ from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.run_folder import Checkpoint, RunFolder
 from ufmstar_torch.eval.run.summary import GOING_ON, NEAR_ZERO, write_summary
+from ufmstar_torch.eval.run.writers import frame_file, write_frame
+from ufmstar_torch.eval.sequences.frame import Frame
 
 _MAPS = ("depth", "variance", "disagreement", "measured", "anchored", "bias", "posterior_depth", "posterior_variance")
 _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured", "single_view")
@@ -35,12 +40,11 @@ class FrameRecorder(FrameSink):
         self._summarised = self._started
 
     def take(self, result: FrameResult) -> None:
-        """Write and record a frame; raises OSError as ``FrameWriter.write`` and ``RunFolder.add``."""
+        """Write and record a frame; raises OSError as ``write_frame`` and ``RunFolder.add``."""
         record, frames = self._record(result), result.number + 1 - self._first
         session = {"first": self._first, "frames": frames, "seconds": perf_counter() - self._started}
         checkpoint = Checkpoint(
             position=result.number + 1,
-            unit=self._folder.writer.unit,
             state=dict(result.state[UFM]),
             metrics=self._metrics.sums(),
             sessions=[*self._earlier, session],
@@ -66,10 +70,14 @@ class FrameRecorder(FrameSink):
             return {**about, "state": "skipped", "reason": result.skipped[UFM]}
         row, before = result.rows[UFM], perf_counter()
         maps = {name: getattr(row, name) for name in _MAPS}
-        camera = {"T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
-        saturated = {"saturated": self._folder.writer.write(result.name, valid=row.valid, camera=camera, **maps)}
+        camera: dict[str, NDArray[Any]] = {
+            "T_world_cam": row.T_world_cam,
+            "intrinsics": row.intrinsics,
+            **_anchor_array(result.frame, row),
+        }
+        write_frame(frame_file(self._folder.path, result.name), row.valid, camera, **maps)
         times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
-        return {**about, "state": "done", **_figures(row), **saturated, **times, **_anchor_figures(row)}
+        return {**about, "state": "done", **_figures(row), **times, **_anchor_figures(row)}
 
 
 def _figures(row: RowResult) -> dict[str, Any]:
@@ -95,8 +103,11 @@ def _figures(row: RowResult) -> dict[str, Any]:
 
 
 def _times(result: FrameResult, row: RowResult, writing: float, saving: float) -> dict[str, float]:
-    """By stage [ms]. "prepare" is the rest of the prediction beside the network. "save" is the frame before's: this
-    frame's is not known yet. "cycle" is the time since the frame before; stages overlap."""
+    """The times by stage [ms].
+
+    "prepare" is the rest of the prediction beside the network. "save" is that of the previous frame, since this frame's
+    is not known yet. "cycle" is the time since the previous frame; stages overlap.
+    """
     ms = result.ms
     return {
         "read": ms["read"],
@@ -111,7 +122,7 @@ def _times(result: FrameResult, row: RowResult, writing: float, saving: float) -
 
 
 def _anchor_figures(row: RowResult) -> dict[str, Any]:
-    """With anchors: the frame's counts, and the means of B [m^2] and of r.
+    """The frame's counts of anchors, and the means of B [m^2] and of r; {} without anchors.
 
     ``tracked`` corners were followed from the frame before, ``found`` of them triangulated; ``usable`` lie on a pixel
     with a depth, and ``used`` agree with others. ``without`` is the reason where none is used.
@@ -136,8 +147,17 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
     }
 
 
+def _anchor_array(frame: Frame | None, row: RowResult) -> dict[str, NDArray[np.float32]]:
+    """With anchors: [N, 4] their u, v in the maps [px], depth and its standard deviation [m]."""
+    if row.landmarks is None or frame is None:
+        return {}
+    anchors = row.landmarks.anchors(frame.intrinsics, torch.from_numpy(row.intrinsics))
+    columns = (anchors.pixel[0], anchors.depth[0, :, None], anchors.variance[0, :, None].sqrt())
+    return {"anchors": torch.cat(columns, dim=1).float().numpy()}
+
+
 def _posterior_figures(row: RowResult) -> dict[str, Any]:
-    """With a posterior: its mean sigma [m], and the figures of held-out anchors (``FrameStatistics``)."""
+    """The posterior's mean sigma [m] and figures of held-out anchors (``FrameStatistics``); {} without one."""
     variance, statistics = row.posterior_variance, row.statistics
     if variance is None or statistics is None or statistics.calibration is None or statistics.unseen is None:
         return {}

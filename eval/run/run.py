@@ -15,8 +15,9 @@ from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.engine.writer_thread import WriterThread
 from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.run.gaussians import write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.run.job import RunJob
-from ufmstar_torch.eval.run.pictures import Finished, common_columns, draw_sheet, draw_video, mixture_writers
+from ufmstar_torch.eval.run.pictures import Finished, common_columns, draw_sheet, draw_video
 from ufmstar_torch.eval.run.recorder import FrameRecorder
 from ufmstar_torch.eval.run.run_folder import RunFolder
 from ufmstar_torch.eval.run.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
@@ -117,10 +118,11 @@ def _outputs(
     done = [record for record in folder.records if record["state"] == "done"]
     if not done:
         return {}
-    for name, write in mixture_writers(job.ufm(folder.checkpoint)).items():
-        write(folder.path / name)
+    ufm = job.ufm(folder.checkpoint)
+    write_mixture_ply(folder.path / "mixture.ply", ufm.mixture, T_world_first=ufm.T_world_first)
+    write_mixture_npz(folder.path / "mixture.npz", ufm.mixture, T_world_first=ufm.T_world_first)
     write_json_atomic(folder.path / "curves.json", job.metrics(folder.checkpoint).curves())
-    made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json"))
+    made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "mixture.npz", "curves.json"))
     with_error = any(record["ground_truth"] for record in done) and not job.source.is_truth
     finished = Finished(folder.path, job.sequence, done, with_error)
     try:

@@ -27,12 +27,11 @@ from torch import Tensor
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.files import to_json, write_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
-from ufmstar_torch.eval.run.writers import FrameWriter
+from ufmstar_torch.eval.run.writers import FRAMES, frame_file
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
 
 # Outputs that are made from the finished frames.
-_MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json")
-_FRAMES = ("frames/*.npz", "depth/*.png", "sigma/*.png", "network_depth/*.png", "network_sigma/*.png")
+_MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "mixture.npz", "curves.json")
 CHECKPOINT_EVERY = 2.0  # [s]
 # Raised by torch and zipfile for a damaged checkpoint.
 _DAMAGED = (OSError, EOFError, RuntimeError, LookupError, TypeError, ValueError, UnpicklingError, zipfile.BadZipFile)
@@ -40,9 +39,9 @@ RUN = FolderKind(
     program="ufmstar run",
     noun="run",
     manifest="resume/run.json",
-    format=3,
+    format=4,
     lock="resume/lock",
-    clear=remover(*_FRAMES, "summary.json", RECORDS, "resume/state.pt", *_MADE_AT_END),
+    clear=remover(f"{FRAMES}/*.npz", "summary.json", RECORDS, "resume/state.pt", *_MADE_AT_END),
     temporary=(".*.tmp", "*/.*.tmp", ".preview.*.tmp.mp4"),
 )
 
@@ -52,7 +51,6 @@ class Checkpoint:
     """The state of a run after a frame."""
 
     position: int = 0  # number of frames handled, skipped ones included
-    unit: float | None = None  # of the depth PNGs [m per count]; None: no frame is written yet
     state: dict[str, Tensor] = field(default_factory=dict)  # of the run's row: UfM*, alternation, tracks
     metrics: dict[str, dict[str, Tensor]] = field(default_factory=dict)  # sums of the metrics, by name
     # {"first", "frames", "seconds"} of every start of the program.
@@ -64,7 +62,6 @@ class RunFolder:
 
     Attributes:
         path: the folder.
-        writer: of the frames.
         checkpoint: after the last finished frame; on disk it may be some seconds older.
         records: the lines of frames.jsonl up to there.
     """
@@ -72,7 +69,7 @@ class RunFolder:
     def __init__(self, folder: OutputFolder) -> None:
         self.path, self._folder = folder.path, folder
         self.checkpoint, self.records = _load(folder.path) if folder.resumed else (Checkpoint(), [])
-        self.writer = FrameWriter(folder.path, self.checkpoint.unit)
+        (self.path / FRAMES).mkdir(exist_ok=True)
         lines = b"".join(_line(record) for record in self.records)
         write_atomic(self.path / RECORDS, lambda file: file.write(lines))
         self._stored, self._stored_at = self.checkpoint, monotonic()
@@ -147,8 +144,7 @@ def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:
         raise FolderError(f"--resume: the state in {out} cannot be read ({e}); --overwrite starts again") from e
     if len(records) != checkpoint.position:
         raise FolderError(f"--resume: the state in {out} is incomplete; --overwrite starts again")
-    writer = FrameWriter(out)
-    lost = [r["name"] for r in records if r["state"] == "done" and not writer.finished(r["name"])]
+    lost = [r["name"] for r in records if r["state"] == "done" and not frame_file(out, r["name"]).is_file()]
     if lost:
         shown = ", ".join(lost[:3])
         raise FolderError(

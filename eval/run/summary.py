@@ -16,7 +16,7 @@ from ufmstar_torch.eval.run import machine
 from ufmstar_torch.eval.run.files import to_json, write_json_atomic
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
-from ufmstar_torch.eval.run.writers import read_frame
+from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
 from ufmstar_torch.mixture import GaussianMixture
@@ -88,7 +88,7 @@ def _depth_fit(job: RunJob, folder: RunFolder, done: Sequence[Mapping[str, Any]]
         if index not in records:
             return None
         record = records[index]
-        stored = read_frame(folder.writer.paths(record["name"])["frames"])
+        stored = read_frame(frame_file(folder.path, record["name"]))
         to_map = pinhole(*record["intrinsics"]) @ np.linalg.inv(sequence.intrinsics_of(sequence.entries[index]))
         u, v, _ = np.rint(to_map @ np.vstack([pixel.T, np.ones(len(pixel))])).astype(int)
         height, width = stored["depth"].shape
@@ -111,7 +111,7 @@ def _warnings(job: RunJob, depth: DepthFit | None, done: Sequence[Mapping[str, A
 
 
 def _posterior(done: Sequence[Mapping[str, Any]], figures: Mapping[str, float] | None) -> dict[str, Any]:
-    """With a posterior: its metrics, and the last frame's figures of held-out anchors; else {}."""
+    """The posterior's metrics, and the last frame's figures of held-out anchors; {} without a posterior."""
     records = [record["posterior"] for record in done if "posterior" in record]
     if not records:
         return {}
@@ -138,7 +138,7 @@ def _sequence(sequence: FrameSequence) -> dict[str, Any]:
 
 
 def _scale(job: RunJob) -> dict[str, Any]:
-    """Where the unit of the poses comes from, if not from the recording: a network's error of scale is then in the
+    """The origin of the poses' unit, if it is not the recording: a network's error of scale is then in the
     poses and in the anchors too, which show the shape of its error alone."""
     if job.scale is None:
         return {} if job.sequence.pose_scale == 1 else {"scale_from": "--pose-scale"}
@@ -166,7 +166,6 @@ def _why_not_alone(done: Sequence[Mapping[str, Any]], judged: bool) -> str:
 def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Means over all valid pixels of all frames. With perfect depth, they are the method's floor."""
     pixels = sum(record["valid_pixels"] for record in done)
-    saturated = {kind: sum(record["saturated"][kind] for record in done) for kind in ("depth", "sigma")}
     return {
         "mean_disagreement": _pixel_mean(done, "mean_disagreement"),
         "mean_sigma": _pixel_mean(done, "mean_sigma"),
@@ -177,7 +176,6 @@ def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         # The valid pixels that no two views compared; their M is ``UfMStarConfig.unmeasured``.
         "unmeasured_share": sum(record["unmeasured"] for record in done) / pixels if pixels else None,
         "valid_pixels": pixels,
-        "saturated_png_pixels": saturated,
     }
 
 

@@ -1,13 +1,11 @@
 """Predictions on disk, so that a network sees an image once, however often the rows on it are changed.
 
-One file for each network, frame and member: ``NETWORK/SEQUENCE/FRAME@MEMBER.maps``, which begins with the SHA-256
-of the rest, an npz with the maps in float32. A file that was changed or cut off is not used.
+One npz for each network, frame and member, ``NETWORK/SEQUENCE/FRAME@MEMBER.npz``, with the maps in float32. A file that
+was changed or cut off is not used.
 """
 
 from __future__ import annotations
 
-import hashlib
-import io
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +23,6 @@ _MAPS = {
     "epistemic": "epistemic_variance",
     "confidence": "confidence",
 }
-_DIGEST = 32  # bytes of a SHA-256
 
 
 class CacheError(Exception):
@@ -57,12 +54,9 @@ class PredictionCache:
         """The prediction, or None where it has to be made: there is no file, it belongs to another image of that name,
         was cut off or changed, or cannot be read."""
         try:
-            packed = (self.folder / path).read_bytes()
-        except OSError:
+            arrays = read_npz_whole(self.folder / path)
+        except (OSError, ValueError):
             return None
-        if len(packed) < _DIGEST or hashlib.sha256(packed[_DIGEST:]).digest() != packed[:_DIGEST]:
-            return None
-        arrays = read_npz_whole(path, packed[_DIGEST:])
         if bytes(arrays.pop("content")).decode() != content:
             return None
         K = torch.from_numpy(arrays.pop("intrinsics"))
@@ -75,13 +69,10 @@ class PredictionCache:
         arrays = {name: value[0].cpu().numpy() for name, value in named.items() if value is not None}
         arrays["intrinsics"] = predicted.intrinsics[0].numpy()
         arrays["content"] = np.frombuffer(content.encode(), np.uint8)
-        packed = io.BytesIO()
-        np.savez(packed, allow_pickle=False, **arrays)
-        body = packed.getvalue()
         file = self.folder / path
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            write_atomic(file, lambda opened: opened.write(hashlib.sha256(body).digest() + body))
+            write_atomic(file, lambda opened: np.savez(opened, allow_pickle=False, **arrays))
         except OSError as error:
             raise CacheError(_cannot(self.folder, error)) from error
 

@@ -112,6 +112,6 @@ def _record(job: EvalJob, item: WorkItem, judge: Judge, result: RowFigures, made
 
 
 def _fitted_to(row: Row, item: WorkItem) -> bool:
-    """Whether the row's recalibration was fitted to a sequence of this name."""
+    """Return whether the row's recalibration was fitted to a sequence of this name."""
     file = row.setting.recalibration
     return bool(file) and item.label in Recalibration.from_json(file).sequences

@@ -96,7 +96,7 @@ def _moments(shares: Iterable[float], total: int) -> list[int]:
 
 
 def _due(moments: list[int], done: int) -> bool:
-    """Whether a moment has come after ``done`` frames; those that have come are removed."""
+    """Return whether a moment has come after ``done`` frames, and remove those that have come."""
     coming = [moment for moment in moments if moment > done]
     due = len(coming) < len(moments)
     moments[:] = coming

@@ -76,7 +76,7 @@ class EvalFolder:
         return self.missing(item, rows)
 
     def is_finished(self, item: WorkItem, rows: Iterable[Row]) -> bool:
-        """Whether every row has a record, or the sequence has failed."""
+        """Return whether every row has a record, or the sequence has failed."""
         return (self.sequence_folder(item) / FAILED).exists() or not self.missing(item, rows)
 
     def missing(self, item: WorkItem, rows: Iterable[Row]) -> list[Row]:
@@ -160,7 +160,7 @@ def _merged(then: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
         **now,
         "networks": networks,
         "missing_bases": [base for base in now["missing_bases"] if base not in networks],
-        **{name: _union(then[name], now[name]) for name in ("rows", "sequences", "datasets", "sweep")},
+        **{name: _union(then[name], now[name]) for name in ("rows", "sequences", "datasets")},
     }
 
 

@@ -60,7 +60,7 @@ class EvalJob:
         return {choice.base: choice.load(device, inference=inference, **passes) for choice in needed}
 
     def judge(self, networks: Mapping[str, DepthSource], device: torch.device) -> Judge:
-        """How sequences are judged by the loaded networks. Raises CacheError: the folder of predictions cannot be
+        """The judge of sequences by the loaded networks. Raises CacheError: the folder of predictions cannot be
         written."""
         store = PredictionCache(self.cache or self.out / CACHE)
         return Judge(networks, device, store, self.frames, self.bins, load_plugins(self.plugin))
@@ -73,7 +73,6 @@ class EvalJob:
         return {
             "suite": suite.name,
             "title": suite.title,
-            "sweep": list(suite.sweep),
             "networks": {base: network.identity for base, network in networks.items()},
             "rows": [row.to_dict() for row in suite.rows],
             "datasets": sorted({item.dataset for item in self.items}),
@@ -85,7 +84,7 @@ class EvalJob:
         }
 
     def stores_examples(self, item: WorkItem) -> bool:
-        """Whether the sequence is one of the first of its data set, from which pictures are drawn."""
+        """Return whether the sequence is one of the first of its data set, from which pictures are drawn."""
         same = [other for other in self.items if other.dataset == item.dataset]
         return item in same[: self.examples]
 

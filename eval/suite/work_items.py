@@ -68,7 +68,7 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """From "i/n", i from 1 to n. Raises ValueError: another form."""
+        """Parse "i/n", i from 1 to n. Raises ValueError: another form."""
         match = _SHARD.fullmatch(text)
         if match is None:
             raise ValueError(f"--shard must be i/n, 1/4 to 4/4 for four parts, got {text!r}")

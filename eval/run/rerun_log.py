@@ -1,0 +1,155 @@
+"""Frames in a rerun stream: of a finished run (``export_rerun``), or of one that goes on (``ufmstar live --view``).
+
+In 3D: the camera with its depth (16 bits), its points coloured by sigma, and its anchors, each with a line to the depth
+of its pixel. Beside it the image, sigma, and plots.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Mapping
+from time import monotonic, sleep
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
+from ufmstar_torch.eval.run.export import Gated, points_in_camera, points_of
+from ufmstar_torch.eval.run.length_png import fitting_unit
+from ufmstar_torch.optional import optional
+
+WORLD, CAMERA = "world", "world/camera"
+_JPEG = 80  # quality
+_POINTS = 4000  # of a frame, coloured by sigma
+_LOCAL = "127.0.0.1"
+_OPENING, _SETTLED = 20.0, 1.0  # [s] that a viewer may take until it listens, and until it has failed if it does
+
+
+def rerun() -> Any:
+    """The module. Raises ModuleNotFoundError: rerun-sdk is not installed."""
+    return optional("rerun", "a rerun recording needs rerun-sdk", "'ufmstar-torch[viz3d]'")
+
+
+class RerunLog:
+    """Logs frames to a ``rerun.RecordingStream``; the first one chooses the scales of colours and depth.
+
+    Attributes:
+        scale: colours of sigma; None before the first frame.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        self._rr, self._stream = rerun(), stream
+        self.scale: ColourScale | None = None
+        self._unit: float | None = None
+        stream.log(WORLD, self._rr.ViewCoordinates.RDF, static=True)
+
+    def add(
+        self,
+        frame: Gated,
+        image: NDArray[np.uint8] | None,
+        K_image: NDArray[np.float64] | None,
+        plots: Mapping[str, float],
+    ) -> None:
+        """Log a frame.
+
+        Args:
+            frame: its maps, camera and anchors.
+            image: [H, W, 3] RGB, or None.
+            K_image: [3, 3] of the image [px]; None = not known.
+            plots: numbers by name.
+        """
+        rr, log, T = self._rr, self._stream.log, frame.T_world_cam
+        if self.scale is None:
+            self.scale = ColourScale(*robust_range([frame.sigma], from_zero=True), ERROR_MAP)
+        self._unit = self._unit or fitting_unit(frame.depth)
+        self._stream.set_time("frame", sequence=frame.index)
+        if frame.timestamp is not None:
+            self._stream.set_time("time", duration=frame.timestamp)
+        log(CAMERA, rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        if image is not None:
+            if K_image is not None:
+                size = [image.shape[1], image.shape[0]]
+                log(f"{CAMERA}/image", rr.Pinhole(image_from_camera=K_image, resolution=size))
+            log(f"{CAMERA}/image/rgb", rr.Image(image).compress(jpeg_quality=_JPEG))
+        size = [frame.depth.shape[1], frame.depth.shape[0]]
+        log(f"{CAMERA}/maps", rr.Pinhole(image_from_camera=frame.intrinsics, resolution=size))
+        counts = np.nan_to_num(np.rint(frame.depth / self._unit), nan=0).clip(0, 65535).astype(np.uint16)
+        log(f"{CAMERA}/maps/depth", rr.DepthImage(counts, meter=1 / self._unit))
+        log(f"{CAMERA}/maps/sigma", rr.Image(self.scale.rgb(frame.sigma)).compress(jpeg_quality=_JPEG))
+        points, (v, u) = points_in_camera(frame)
+        some = slice(None, None, max(1, len(points) // _POINTS))
+        colours = self.scale.rgb(frame.sigma[v, u][some])
+        log(f"{CAMERA}/points", rr.Points3D(points[some], colors=colours, radii=rr.Radius.ui_points(2)))
+        if frame.anchors is not None:
+            self._add_anchors(frame, frame.anchors)
+        for name, value in plots.items():
+            log(f"plots/{name}", rr.Scalars(value))
+
+    def _add_anchors(self, frame: Gated, anchors: NDArray[np.float32]) -> None:
+        """Anchors [N, 4], and lines from them to the depth of their pixels, coloured by the distance as sigma is."""
+        rr, K, scale = self._rr, frame.intrinsics, self.scale
+        assert scale is not None
+        u, v, measured = anchors[:, 0], anchors[:, 1], anchors[:, 2]
+        ends = points_of(u, v, measured, K)
+        self._stream.log(f"{CAMERA}/anchors", rr.Points3D(ends, radii=rr.Radius.ui_points(3)))
+        height, width = frame.depth.shape
+        column, row = np.rint(u).astype(int).clip(0, width - 1), np.rint(v).astype(int).clip(0, height - 1)
+        depth = frame.depth[row, column]
+        known = np.isfinite(depth)
+        lines = np.stack([ends, points_of(u, v, depth, K)], axis=1)[known]
+        colours = scale.rgb(np.abs(depth - measured)[known])
+        self._stream.log(f"{CAMERA}/residuals", rr.LineStrips3D(lines, colors=colours))
+
+
+def blueprint() -> Any:
+    """The arrangement of the views."""
+    rrb = optional("rerun.blueprint", "a rerun recording needs rerun-sdk", "'ufmstar-torch[viz3d]'")
+    views = rrb.Vertical(
+        rrb.Spatial2DView(origin=f"{CAMERA}/image", name="image"),
+        rrb.Spatial2DView(origin=f"{CAMERA}/maps", contents=f"{CAMERA}/maps/sigma", name="sigma"),
+        rrb.TimeSeriesView(origin="plots", name="means of a frame"),
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(rrb.Spatial3DView(origin=WORLD, name="world"), views, column_shares=[2, 1]),
+        collapse_panels=True,
+    )
+
+
+def open_viewer() -> tuple[Any, subprocess.Popen[bytes]]:
+    """A stream to a new viewer that listens on this computer alone (rerun's own ``spawn`` listens on every network),
+    and the viewer's process, which stays when this one ends.
+
+    Raises:
+        ModuleNotFoundError: rerun-sdk is not installed.
+        RuntimeError: the viewer does not start, as without a display.
+    """
+    rr = rerun()
+    with socket.socket() as free:
+        free.bind((_LOCAL, 0))
+        port = free.getsockname()[1]
+    words = [sys.executable, "-m", "rerun_cli", "--bind", _LOCAL, "--port", str(port), "--hide-welcome-screen"]
+    environment = {**os.environ, "RERUN_APP_ONLY": "true"}  # as spawn sets it
+    quiet: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)  # a pipe would wait for its end
+    viewer = subprocess.Popen(words, env=environment, start_new_session=True, **quiet)
+    ready, ends = 0.0, monotonic() + _OPENING
+    while monotonic() < ready + _SETTLED or not ready:  # without a display it listens before it fails
+        if viewer.poll() is not None or monotonic() > ends:
+            viewer.terminate()
+            raise RuntimeError("rerun's viewer does not start: is there a display?")
+        ready = ready or (monotonic() if _listens(port) else 0.0)
+        sleep(0.1)
+    stream = rr.RecordingStream("ufmstar")
+    stream.connect_grpc(f"rerun+http://{_LOCAL}:{port}/proxy", default_blueprint=blueprint())
+    return stream, viewer
+
+
+def _listens(port: int) -> bool:
+    try:
+        socket.create_connection((_LOCAL, port), timeout=1).close()
+    except OSError:
+        return False
+    return True
