@@ -15,7 +15,6 @@ from torch import nn
 from ufmstar_torch import (
     AnchorConfig,
     ConfidenceConfig,
-    DepthPrediction,
     UfMStar,
     UfMStarConfig,
     UncertainDepth,
