@@ -328,3 +328,6 @@ def test_fastdepth_from_a_checkpoint(tmp_path: Path, suffix: str, folded: bool) 
     x = network.preprocess.apply_image(torch.rand(1, 3, 300, 400))
     with torch.inference_mode():
         assert torch.equal(network(x).depth, source(x).depth)
+    save_checkpoint(path, {"a": torch.zeros(1)})
+    with pytest.raises(ValueError, match=rf"w.{suffix}: not the weights of a FastDepth"):
+        load_network("fastdepth", path)

@@ -61,6 +61,8 @@ def test_a_module_is_made_from_a_saved_state_alone():
     config = torch.tensor(list(b'{"eta": 0.5, "etta": 1}'), dtype=torch.uint8)
     with pytest.raises(ValueError, match=r"of another version: .*etta"):
         UfMStar.from_state_dict(state | {"_extra_state": config})
+    with pytest.raises(RuntimeError, match="keeps its state"):
+        UfMStar.from_state_dict(state | {"weight": -state["weight"]})
 
 
 def put(index, value):
