@@ -129,3 +129,4 @@ def test_a_network_of_ones_own_on_a_recording(tmp_path):
     assert result["map"] == "224 x 224"
     assert result["sequence"]["layout"] == "tum"
     assert result["networks"]["depth_only"]["latency"]["once"]["count"] == 2
+    assert cli.main(["bench", "--sequence", "nowhere"]) == 2

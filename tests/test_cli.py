@@ -115,7 +115,6 @@ MISTAKES = {
     "bench: sizes": ("ufmstar bench --sizes 100", "--sizes must be multiples of 32"),
     "bench: weights": ("ufmstar bench --model onnx", "--model onnx needs --weights"),
     "bench: device": ("ufmstar bench --device cuda:99", "--device cuda:99 is not available"),
-    "bench: sequence": ("ufmstar bench --sequence nowhere", "nowhere"),
     "live: network": ("ufmstar live tour:3", "live needs a network"),
     "live: camera": (f"ufmstar live 0 {NETWORK}", "0 needs --trajectory FILE"),
     "live: folder": (f"ufmstar live images --follow --intrinsics 1 1 1 1 {NETWORK}", "images needs --trajectory FILE"),
