@@ -48,6 +48,17 @@ def ufmstar(capsys, weights):
     return run
 
 
+def malicious(folder):
+    """A file of torch.save that makes FOLDER/ran when its objects are loaded."""
+
+    class Code:
+        def __reduce__(self):
+            return open, (str(folder / "ran"), "w")
+
+    torch.save({"ufm": Code()}, folder / "malicious.pt")
+    return (folder / "malicious.pt").read_bytes()
+
+
 def content(image):
     file = io.BytesIO()
     Image.fromarray(image).save(file, "PNG")
@@ -187,10 +198,14 @@ def test_a_recording_live(ufmstar, tmp_path):
     assert sorted((tmp_path / "out").iterdir()) == before
     assert ufmstar("tour:4?frames=2&size=64x96", "--out", tmp_path / "out", "--overwrite")[0] == 0
     assert not any((tmp_path / "out" / f"{line['stamp']:.6f}.npz").exists() for line in lines[2:])
-    (tmp_path / "state.pt").write_bytes(b"no state")
-    code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt")
-    assert code == 2
-    assert "cannot be continued" in err
+    for content, text in ((b"no state", "it begins with b'no state'"), (malicious(tmp_path), "never loaded because")):
+        (tmp_path / "state.pt").write_bytes(content)
+        code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt")
+        assert code == 2
+        assert "cannot be continued" in err
+        assert text in err
+        assert "weights_only" not in err, "torch's advice is to run the code"
+        assert not (tmp_path / "ran").exists()
 
 
 def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):

@@ -46,6 +46,16 @@ def test_maps_pair_by_stem_by_number_or_in_order(tmp_path, names):
     assert values(DepthFolder(tmp_path, scale=1e-3).for_frames(NAMES)) == [1, 2, 3]
 
 
+def test_a_damaged_first_map_is_a_frame_that_cannot_be_read(tmp_path):
+    for number, depth in enumerate(DEPTHS):
+        np.save(tmp_path / f"{number}.npy", depth.astype(np.float32))
+    truncate(tmp_path / "0.npy")
+    maps = DepthFolder(tmp_path).for_frames(("0", "1", "2"))
+    with pytest.raises(FrameError, match=r"0\.npy"):
+        maps[0]
+    assert float(maps[1][0][0, 0]) == 2
+
+
 def test_sorted_order_counts_skipped_frames(tmp_path):
     write_pngs(tmp_path, ["x", "y", "z"])
     folder = DepthFolder(tmp_path, scale=1e-3)

@@ -148,17 +148,6 @@ def test_depth_only_ignores_variances(network_files, sequence):
     assert agrees(result["UfMstar-DepthOnly"].figures, by_hand)
 
 
-def test_ground_truth_as_prediction_shows_the_floor(sequence):
-    floor = {"depth_only": base_network("depth_only=ground-truth:24x32")}
-    result = evaluate(sequence, [row("UfM*-DepthOnly"), row("DepthOnly")], floor)
-    assert result["DepthOnly"].figures["rmse"] == 0
-    assert result["DepthOnly"].figures["delta1"] == 1
-    assert result["UfMstar-DepthOnly"].figures["rmse"] == 0
-    assert np.isfinite(result["UfMstar-DepthOnly"].figures["nll"])
-    assert result["UfMstar-DepthOnly"].state["smoothing_bytes"] == 4 * 24 * 32
-    assert "network" not in result["UfMstar-DepthOnly"].ms, "no network ran"
-
-
 # ---- MC-Dropout ----
 
 

@@ -62,17 +62,6 @@ def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
     assert [path.parent.name for path in sorted(job.out.glob("records/*/*/examples"))] == ["ash"]
 
 
-def test_resume_computes_nothing_that_is_there(rooms, tmp_path):
-    job = job_on(rooms, tmp_path / "out")
-    go(job)
-    before = {path: path.stat().st_mtime_ns for path in job.out.rglob("*.json")}
-    stub = Stub()
-    outcome, lines = go(job, stub, resume=True)
-    assert (outcome.finished, outcome.complete, lines) == (True, True, [])
-    assert stub.asked == []
-    assert {path: path.stat().st_mtime_ns for path in job.out.rglob("*.json")} == before
-
-
 def test_resume_computes_rows_and_sequences_added_since(rooms, tmp_path):
     job = job_on(rooms, tmp_path / "out")
     rows = job.suite.rows

@@ -273,18 +273,6 @@ def test_a_tour_by_name_is_a_sequence_whose_depth_and_poses_fit():
     assert check.error < 0.01
 
 
-def test_image_and_depth_of_a_frame_come_from_one_rendering(monkeypatch):
-    calls = []
-    real = render
-    monkeypatch.setattr("ufmstar_torch.eval.tour.sequence.render", lambda *a, **k: (calls.append(1), real(*a, **k))[1])
-    sequence = tour_sequence(2, frames=9, size=(24, 32))
-    assert not calls, "nothing is rendered before it is asked for"
-    frames = list(sequence)
-    assert len(calls) == 9
-    np.testing.assert_array_equal(sequence[0].image, frames[0].image)
-    assert len(calls) == 10, "only a few are kept"
-
-
 def test_path_seed_and_sensor_are_options_of_the_name():
     plain, other = (
         open_sequence("tour:2?frames=4&size=24x32"),

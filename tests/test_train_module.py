@@ -17,7 +17,6 @@ from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.models import (
     AleatoricHead,
     DepthAnything,
-    EvidentialHead,
     MonteCarloDropout,
     Preprocess,
     load_network,
@@ -25,7 +24,7 @@ from ufmstar_torch.models import (
     read_info,
     wrap_network,
 )
-from ufmstar_torch.train import FitSettings, loss_of, own_job, train_module
+from ufmstar_torch.train import FitSettings, own_job, train_module
 from ufmstar_torch.train.member import new_network
 
 SIZE = (32, 32)
@@ -60,17 +59,6 @@ def train(backbone, head, frames, out, **options):
 
 def image(seed=0):
     return torch.rand(2, 3, *SIZE, generator=torch.Generator().manual_seed(seed))
-
-
-@pytest.mark.parametrize(("head", "channels"), [(AleatoricHead, 1), (EvidentialHead, 3)])
-def test_a_head_on_any_feature_map(head, channels):
-    one = head(5)
-    depth = torch.full((2, 8, 12), 2.0, requires_grad=True)
-    distribution = one(torch.rand(2, 5, 4, 6), depth)
-    assert distribution.prediction().variance.shape == (2, 8, 12)
-    loss_of(distribution, torch.full((2, 8, 12), 2.5), torch.ones(2, 8, 12, dtype=torch.bool)).backward()
-    assert one.convolution.out_channels == channels
-    assert all(p.grad is not None and p.grad.isfinite().all() for p in (*one.parameters(), depth))
 
 
 def test_a_frozen_network_keeps_its_depth_and_gets_a_variance(frames, tmp_path):

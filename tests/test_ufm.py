@@ -126,28 +126,6 @@ def test_halves_are_rounded_to_even():
     assert x.tolist() == [1.5, 3.5], "columns 1 and 3 met nobody"
 
 
-def test_the_newest_point_wins_a_collision():
-    """Seen from twice the distance, the points of columns 0 and 1 share a pixel; both fuse, the later one is shown."""
-    ufm = UfM(dtype=torch.float64)
-    s2 = torch.tensor([[[0.1, 0.2, 0.4, 0.8]]], dtype=torch.float64)
-    ufm(plane(1.0), torch.eye(4, dtype=torch.float64), K1, s2)
-    out = ufm(plane(2.0), moved(0, 0, -1.0), K1, plane(0.0))
-    # Columns 0 to 3 land at 0, .5, 1, 1.5: pixels 0, 0, 1, 2.
-    assert ufm.cloud.count.tolist() == [2, 2, 2, 2, 1]
-    # S' = S/2 + A/2 + (p - mu)(p - mu)^T / 4 with equal depths: half of the point's own s^2.
-    assert torch.allclose(out.variance[0, 0, :3], torch.tensor([0.1, 0.2, 0.4], dtype=torch.float64))
-
-
-def test_no_occlusion_test_and_nothing_behind_the_camera():
-    ufm = UfM(dtype=torch.float64)
-    ufm(plane(2.0), torch.eye(4, dtype=torch.float64), K1)
-    # A wall in front: the points behind it fuse all the same.
-    ufm(plane(0.5), torch.eye(4, dtype=torch.float64), K1)
-    assert ufm.cloud.count.tolist() == [2] * 4
-    ufm(plane(1.0), moved(0, 0, 10.0), K1)
-    assert ufm.cloud.count.tolist() == [2] * 4 + [1] * 4
-
-
 def test_points_out_of_view_are_pruned_first_and_the_oldest_of_them():
     ufm = UfM(9, dtype=torch.float64)
     for x in (0.0, 100.0, 200.0):  # three views that share nothing, of four points each

@@ -13,10 +13,8 @@ from __future__ import annotations
 import signal
 import threading
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import lightning.pytorch as pl
@@ -24,6 +22,7 @@ import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from ufmstar_torch.atomic import write_atomic
+from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.train.module import FIGURES_KEY
 
 NAME = "last.ckpt"
@@ -88,8 +87,9 @@ class Stops(pl.Callback):
 def require_checkpoint(path: Path) -> None:
     """Raises ResumeError: a file cannot be read, or is not a checkpoint of this program."""
     try:
-        stored = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, EOFError, RuntimeError, KeyError, UnpicklingError, zipfile.BadZipFile, ValueError) as error:
+        with path.open("rb") as file:
+            stored = read_tensors(file, "it")
+    except (OSError, ValueError) as error:
         raise ResumeError(f"--resume: {path} cannot be read ({error}); --overwrite starts again") from error
     if not isinstance(stored, dict) or FIGURES_KEY not in stored:
         raise ResumeError(f"--resume: {path} is no checkpoint of this program; --overwrite starts again")

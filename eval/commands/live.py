@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -105,7 +104,7 @@ class LiveOptions:
 
     @property
     def recorded(self) -> bool:
-        """Whether the source is a recording."""
+        """True if the source is a recording."""
         return not (self.follow or self.source == _STANDARD_INPUT or self.source.isdecimal())
 
 
@@ -211,6 +210,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
     from ufmstar_torch.eval.engine.progress import Progress
     from ufmstar_torch.eval.engine.warm_up import warm_up_command
     from ufmstar_torch.eval.run.make_job import recalibration_of
+    from ufmstar_torch.models.checkpoints import read_tensors
     from ufmstar_torch.models.inference import Inference
     from ufmstar_torch.pipeline import UncertainDepth
 
@@ -239,8 +239,10 @@ def _model(options: LiveOptions) -> UncertainDepth:
         )
     if options.state is not None and options.state.exists():
         try:
-            model.load_state_dict(torch.load(options.state, map_location=options.device, weights_only=True))
-        except (RuntimeError, ValueError, OSError, pickle.UnpicklingError) as error:
+            with options.state.open("rb") as file:
+                state = read_tensors(file, "it")
+            model.load_state_dict(state)
+        except (RuntimeError, TypeError, ValueError, OSError) as error:
             raise ValueError(f"--state {options.state} cannot be continued: {error}") from error
     return model
 

@@ -12,12 +12,10 @@ A killed run computes the frames after its checkpoint again and writes the same 
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from pickle import UnpicklingError
 from time import monotonic
 from typing import Any
 
@@ -29,12 +27,11 @@ from ufmstar_torch.eval.run.files import to_json, write_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
 from ufmstar_torch.eval.run.writers import FRAMES, frame_file
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
+from ufmstar_torch.models.checkpoints import read_tensors
 
 # Outputs that are made from the finished frames.
 _MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "mixture.npz", "curves.json")
 CHECKPOINT_EVERY = 2.0  # [s]
-# Raised by torch and zipfile for a damaged checkpoint.
-_DAMAGED = (OSError, EOFError, RuntimeError, LookupError, TypeError, ValueError, UnpicklingError, zipfile.BadZipFile)
 RUN = FolderKind(
     program="ufmstar run",
     noun="run",
@@ -126,21 +123,13 @@ def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:
     if not file.is_file():
         return Checkpoint(), []
     try:
-        stored = torch.load(file, map_location="cpu", weights_only=True)
+        with file.open("rb") as opened:
+            stored = read_tensors(opened, "it")
         sums = {name: {key: unpack(v) for key, v in own.items()} for name, own in stored.pop("metrics").items()}
         checkpoint = Checkpoint(metrics=sums, **stored)
         content = b"".join(lines.read_bytes().splitlines(keepends=True)[: checkpoint.position])
         records = read_records(content, lines)
-    except (
-        OSError,
-        EOFError,
-        RuntimeError,
-        LookupError,
-        TypeError,
-        UnpicklingError,
-        zipfile.BadZipFile,
-        ValueError,
-    ) as e:
+    except (OSError, RuntimeError, LookupError, TypeError, ValueError) as e:
         raise FolderError(f"--resume: the state in {out} cannot be read ({e}); --overwrite starts again") from e
     if len(records) != checkpoint.position:
         raise FolderError(f"--resume: the state in {out} is incomplete; --overwrite starts again")

@@ -28,7 +28,7 @@ _SAME_FRAME = 2e-3  # [s] names of one frame's files are rounded to 1 ms
 
 
 def detect(path: Path) -> bool:
-    """Whether the folder, or one VIDEO_frames in it, has this layout."""
+    """True if the folder, or one VIDEO_frames in it, has this layout."""
     return _root(path) is not None
 
 

@@ -129,7 +129,7 @@ class _Topics(NamedTuple):
 
 
 def detect(path: Path) -> bool:
-    """Whether the path is a bag, or a folder that holds one."""
+    """True if the path is a bag, or a folder that holds one."""
     return _bag_path(path) is not None
 
 
@@ -260,7 +260,7 @@ def _listing(types: dict[str, str]) -> str:
 
 
 class _Content:
-    """What one pass over the chosen topics finds: the places of images and depth maps, the camera, and poses."""
+    """The content of the chosen topics, found in one pass: places of images and depth maps, the camera, and poses."""
 
     def __init__(self, bag: Bag, topics: _Topics) -> None:
         self.bag, self.topics = bag, topics

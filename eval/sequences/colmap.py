@@ -49,7 +49,7 @@ class _View(NamedTuple):
 
 
 def detect(path: Path) -> bool:
-    """Whether a model lies in the folder."""
+    """True if a model lies in the folder."""
     return _model_folder(path) is not None
 
 

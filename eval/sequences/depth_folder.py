@@ -70,12 +70,14 @@ class DepthFolder:
         self.files = _maps(self.path, DEPTH_SUFFIXES, "depth")
         self.variance_path = None if variance is None else Path(variance)
         self.variance_files = [] if variance is None else _maps(Path(variance), _VARIANCE_SUFFIXES, "variance")
-        if scale is None:
-            values, named = read_map(self.files[0], key="depth")
+        for file in self.files if scale is None else ():
+            try:
+                values, named = read_map(file, key="depth")
+            except FrameError:  # counted when its turn comes
+                continue
             if named is None and np.issubdtype(values.dtype, np.integer):
-                raise ValueError(
-                    f"scale: {self.files[0]} holds integers and no text {SCALE_KEY!r}: pass metres per unit"
-                )
+                raise ValueError(f"scale: {file} holds integers and no text {SCALE_KEY!r}: pass metres per unit")
+            break
 
     def __len__(self) -> int:
         return len(self.files)

@@ -31,7 +31,7 @@ _LARGEST_YAML = 100_000  # [bytes]
 
 
 def detect(path: Path) -> bool:
-    """Whether a camera's folder is there."""
+    """True if a camera's folder is there."""
     return _camera_folder(path) is not None
 
 

@@ -271,7 +271,7 @@ def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:
 
 
 def fits(K: np.ndarray, size: Size) -> bool:
-    """Whether K's principal point lies where a camera with images of ``size`` (H, W) can have it."""
+    """True if K's principal point lies where a camera with images of ``size`` (H, W) can have it."""
     low, high = _CENTRE_RANGE
     return bool(low < K[0, 2] / size[1] < high and low < K[1, 2] / size[0] < high)
 

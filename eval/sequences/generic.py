@@ -46,7 +46,7 @@ LOOKED_FOR = (
 
 
 def detect(path: Path) -> bool:
-    """Whether images and a trajectory lie where this reader looks for them."""
+    """True if images and a trajectory lie where this reader looks for them."""
     if path.is_file():
         return path.suffix.lower() in VIDEO_SUFFIXES
     has_trajectory = any((path / name).is_file() for name in TRAJECTORIES)
@@ -84,7 +84,7 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def has_images_and_depth(path: Path) -> bool:
-    """Whether a folder has a folder of images and one of depth maps where :func:`open_unposed` looks for them."""
+    """True if a folder has a folder of images and one of depth maps where :func:`open_unposed` looks for them."""
     return path.is_dir() and all(any((path / name).is_dir() for name in names) for names in (IMAGES, DEPTHS))
 
 

@@ -44,7 +44,7 @@ _MIN_RANGE = 2.0  # [m] nearer returns are the car's own roof
 
 
 def detect(path: Path) -> bool:
-    """Whether the path is the dataset's root, a drive or a camera of one."""
+    """True if the path is the dataset's root, a drive or a camera of one."""
     if (path / _RAW).is_dir():
         return bool(drives(path))
     camera = _camera(path)
@@ -207,7 +207,7 @@ class _Laser:
     beside: int  # so many scans before and after a frame are added to its own
 
     def sees(self, number: int) -> bool:
-        """Whether a frame has a scan and a pose."""
+        """True if a frame has a scan and a pose."""
         return number in self.scans and number in self.poses
 
     def depth(self, number: int) -> np.ndarray:

@@ -56,7 +56,7 @@ class Lens:
 
     @property
     def distorts(self) -> bool:
-        """Whether its images differ from a pinhole camera's."""
+        """True if its images differ from a pinhole camera's."""
         return any(self.coefficients)
 
     @property

@@ -32,7 +32,7 @@ _BROKEN = (OSError, KeyError, RuntimeError, ValueError)
 
 
 def detect(path: Path) -> bool:
-    """Whether the path is the root, a part or a scene."""
+    """True if the path is the root, a part or a scene."""
     return bool(part_files(path / "val")) or bool(_files(path))
 
 

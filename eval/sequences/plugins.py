@@ -24,7 +24,7 @@ _NEEDED = {"readers": ("detect", "read", "LOOKED_FOR"), "methods": ("__call__",)
 
 @dataclass(frozen=True)
 class Plugins:
-    """What is plugged in, by name."""
+    """Plugged-in readers, methods and metrics, by name."""
 
     readers: Mapping[str, Any] = field(default_factory=dict)
     methods: Mapping[str, Any] = field(default_factory=dict)

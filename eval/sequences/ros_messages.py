@@ -183,7 +183,7 @@ class FrameTree:
         return listed
 
     def moves(self, frames: Iterable[str]) -> bool:
-        """Whether any of these frames moves in its parent."""
+        """True if any of these frames moves in its parent."""
         return any(len(self._edge(frame)) > 1 for frame in frames)
 
     def at(self, frame: str, above: str, time: float, max_gap: float) -> np.ndarray | None:

@@ -21,7 +21,7 @@ _NATIVE_COLOR, _NATIVE_DEPTH = (968, 1296), (480, 640)
 
 
 def detect(path: Path) -> bool:
-    """Whether the folder has this layout."""
+    """True if the folder has this layout."""
     return all((path / folder).is_dir() for folder in ("color", "pose", "intrinsic"))
 
 

@@ -48,7 +48,7 @@ _MICROSECOND = 1e-6
 
 
 def detect(path: Path) -> bool:
-    """Whether the path is such a file, or a folder that holds exactly one and is no export."""
+    """True if the path is such a file, or a folder that holds exactly one and is no export."""
     if path.is_dir():
         return len(_files(path)) == 1 and not scannet.detect(path)
     return path.suffix.lower() == _SUFFIX and path.is_file()

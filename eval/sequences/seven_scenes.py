@@ -37,7 +37,7 @@ _FRAME = re.compile(r"(frame-\d+)\.(color\.png|color\.jpg|depth\.png|pose\.txt)"
 
 
 def detect(path: Path) -> bool:
-    """Whether the folder has this layout."""
+    """True if the folder has this layout."""
     return path.is_dir() and any(path.glob("frame-*.pose.txt"))
 
 

@@ -27,7 +27,7 @@ _FOCAL = ("fx", "fy", "cx", "cy")
 
 
 def detect(path: Path) -> bool:
-    """Whether the folder has this layout."""
+    """True if the folder has this layout."""
     return all((path / name).is_file() for name in (_VIDEO, _ODOMETRY, _CAMERA))
 
 

@@ -24,7 +24,7 @@ _K = (320.0, 320.0, 320.0, 240.0)
 
 
 def detect(path: Path) -> bool:
-    """Whether the folder has this layout, itself or in trajectory folders below it."""
+    """True if the folder has this layout, itself or in trajectory folders below it."""
     return bool(trajectory_folders(path))
 
 

@@ -33,7 +33,7 @@ _MODELS = (*_FISHEYES, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "")
 
 
 def detect(path: Path) -> bool:
-    """Whether the folder, or the path itself, holds a file of this layout."""
+    """True if the folder, or the path itself, holds a file of this layout."""
     return (path / FILE).is_file() or (path.is_file() and path.suffix == ".json")
 
 

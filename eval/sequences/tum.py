@@ -33,7 +33,7 @@ _INTRINSICS = {"1": (517.3, 516.5, 318.6, 255.3), "2": (520.9, 521.0, 325.1, 249
 
 
 def detect(path: Path) -> bool:
-    """Whether the folder has this layout."""
+    """True if the folder has this layout."""
     return (path / "rgb.txt").is_file() and (path / "groundtruth.txt").is_file()
 
 

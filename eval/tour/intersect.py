@@ -1,4 +1,4 @@
-"""Where rays meet a tour's surfaces, exactly: closed forms in unit coordinates, in float64.
+"""Intersections of rays with a tour's surfaces, exactly: closed forms in unit coordinates, in float64.
 
 A ray is origin + t direction, in the unit coordinates of the surface (see ``shapes``); an affine map leaves t
 alone, so with directions of camera z = 1, t is the depth. A miss is infinity.

@@ -23,7 +23,7 @@ _CAP = 1e-3  # how near to a frustum's end a point is on its cap, in unit coordi
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where pixels see a surface; P of them, float32, pixels of the same room, kind and texture side by side."""
+    """The points that pixels see; P of them, float32, pixels of the same room, kind and texture side by side."""
 
     surface: Tensor  # [P] int64
     point: Tensor  # [3, P] [m]

@@ -26,7 +26,7 @@ NOBODY = -1
 
 @dataclass(frozen=True)
 class Finish:
-    """How a surface looks."""
+    """The look of a surface: texture and colours."""
 
     texture: str = "plain"  # one of ``TEXTURES``
     # first, second: its two colours, linear RGB in [0, 1].

@@ -36,7 +36,7 @@ def surface_windows(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, wid
 
 
 def room_windows(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> list[Window]:
-    """Where each room can be seen from the camera's own, through the doorways."""
+    """The part of the image in which each room is visible from the camera's own, through the doorways."""
     windows = [_EMPTY] * len(tour.rooms)
     windows[int(tour.room_at(T_world_cam[:3, 3]))] = (0, height, 0, width)
     if len(tour.doors) == 0:

@@ -1,4 +1,4 @@
-"""How much of each light reaches a grid of points in a room: soft shadows for the price of a lookup.
+"""The share of each light that reaches a grid of points in a room: soft shadows for the price of a lookup.
 
 Computed once per tour with shadow rays; a surface looks up a point a little before it.
 """
