@@ -69,8 +69,8 @@ class OutputSpec(Checked):
         if self.kind in NOT_METRIC:
             raise ValueError(
                 f"the depth output is declared {self.kind!r}, but UfM* needs metric depth: it compares 3D points of "
-                "several views, and without a common scale in metres their disagreement means nothing. Use a network "
-                "with metric output, or align its scale (and shift) to measured depth before it is wrapped"
+                "several views, and without a common scale in metres their disagreement means nothing. In Python, "
+                "AlignedNetwork(network, Alignment('inverse', scale, shift)) makes it metric: 1/d = scale x + shift"
             )
         if self.kind != METRIC:
             raise ValueError(f"OutputSpec.kind must be {METRIC!r} (refused: {NOT_METRIC}), got {self.kind!r}")

@@ -10,9 +10,10 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch import nn
 
-from ufmstar_torch import UfMStar
-from ufmstar_torch.models import AlignedNetwork, Alignment, fit_affine_depth, fit_inverse_depth
+from ufmstar_torch import UfMStar, UncertainDepth
+from ufmstar_torch.models import AlignedNetwork, Alignment, fit_affine_depth, fit_inverse_depth, wrap_network
 
 SIZE = (24, 32)
 FITS = {"inverse": fit_inverse_depth, "affine": fit_affine_depth}
@@ -213,3 +214,17 @@ def test_half_precision_outputs_are_aligned_in_single():
     depth = AlignedNetwork(Nearness(), Alignment("inverse", 2.5, 0.25))(image).depth
     assert depth.dtype == torch.float32
     torch.testing.assert_close(depth.double(), random_depth(), rtol=0.02, atol=0)
+
+
+def test_a_disparity_between_a_least_and_a_largest_depth_is_one_line():
+    """Monodepth's sigmoid s in (0, 1) is 1/d = 1/max + (1/min - 1/max) s; what refuses it names the line."""
+    disparity = nn.Sequential(nn.Conv2d(3, 1, 1), nn.Sigmoid())
+    image = torch.rand(2, 3, 4, 6, generator=torch.Generator().manual_seed(0))
+    model = AlignedNetwork(disparity, Alignment("inverse", 1 / 0.1 - 1 / 100, 1 / 100))
+    with torch.no_grad():
+        expected = 1 / (1 / 100 + (1 / 0.1 - 1 / 100) * disparity(image)[:, 0])
+        torch.testing.assert_close(model(image).depth, expected)
+    K = torch.tensor([[5.0, 0, 2.5], [0, 5.0, 1.5], [0, 0, 1]])
+    assert bool((UncertainDepth(model)(image[:1], torch.eye(4), K).depth > 0).all())
+    with pytest.raises(ValueError, match=r"AlignedNetwork\(network, Alignment\('inverse', scale, shift\)\)"):
+        wrap_network(disparity, inverse=True)
