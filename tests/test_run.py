@@ -106,7 +106,7 @@ def test_the_summary_says_what_it_came_from(path, tmp_path):
     assert text == read_summary(tmp_path / "out")
     assert (text["state"], text["reason"]) == ("finished", "2 of 2 frames")
     assert (text["sequence"]["name"], text["settings"]) == ("walk", {"note": "a test"})
-    assert {"ufmstar-torch", "torch", "numpy", "numba", "python", "platform"} <= text["versions"].keys()
+    assert {"ufmstar_torch", "torch", "numpy", "numba", "python"} <= text["versions"].keys()
     assert text["network_alone"] is None
     assert "without a variance" in text["network_alone_reason"]
     assert all(text["time"]["median_ms"][stage] > 0 for stage in ("read", "network", "ufm", "metrics", "write"))

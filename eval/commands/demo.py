@@ -25,7 +25,7 @@ class DemoOptions:
     """The method on rendered rooms, without data or weights.
 
     Walks through rendered rooms with small depth networks that come with the package, compares their own variance with
-    UfM's and UfM*'s, and makes the report of an evaluation. Nothing else is needed; two minutes on two cores.
+    UfM's and UfM*'s, and makes the report of an evaluation. Nothing else is needed; one to two minutes on two cores.
 
     Attributes:
         out: folder for the results
@@ -98,8 +98,7 @@ def _onboard(options: DemoOptions, weights: Path) -> int:
     from ufmstar_torch.eval.report.text import onboard_table
     from ufmstar_torch.eval.run.files import to_json, write_json_atomic
     from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
-    from ufmstar_torch.eval.run.machine import hardware, share_threads
-    from ufmstar_torch.eval.run.summary import versions
+    from ufmstar_torch.eval.run.machine import hardware, share_threads, versions
 
     if options.threads is None:
         share_threads()

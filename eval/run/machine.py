@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -16,10 +15,10 @@ _PACKAGES |= {"torchvision": "torchvision", "llvmlite": "llvmlite", "onnxruntime
 _ENVIRONMENT = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER")
 
 
-def versions(packages: Mapping[str, str] = _PACKAGES) -> dict[str, str | None]:
-    """Versions of packages, given as {name in the result: distribution}, and of Python; None = not installed."""
+def versions() -> dict[str, str | None]:
+    """Versions of the packages on which results depend, and of Python; None = not installed."""
     installed: dict[str, str | None] = {}
-    for name, distribution in packages.items():
+    for name, distribution in _PACKAGES.items():
         try:
             installed[name] = version(distribution)
         except PackageNotFoundError:

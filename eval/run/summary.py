@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from statistics import mean, median
@@ -12,9 +11,9 @@ import numpy as np
 
 from ufmstar_torch.eval.check.image_fit import DepthFit, depth_fit
 from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM
-from ufmstar_torch.eval.run import machine
 from ufmstar_torch.eval.run.files import to_json, write_json_atomic
 from ufmstar_torch.eval.run.job import RunJob
+from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
 from ufmstar_torch.eval.run.writers import frame_file, read_frame
 from ufmstar_torch.eval.sequences import FrameSequence
@@ -26,7 +25,6 @@ FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
 # [m] A sigma below it claims more than any depth network can measure.
 NEAR_ZERO = 1e-3
 STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "save")
-_PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")
 
 
 # State and reason of an unfinished run.
@@ -72,6 +70,7 @@ def write_summary(
         "outputs": outputs or {},
         "settings": job.settings,
         "versions": versions(),
+        "machine": hardware(),
     }
     depth = None if job.image_fit is None or job.image_fit.problem else _depth_fit(job, folder, done)
     summary |= {"image_fit": job.image_fit, "depth_fit": depth, "warnings": _warnings(job, depth, done)}
@@ -117,11 +116,6 @@ def _posterior(done: Sequence[Mapping[str, Any]], figures: Mapping[str, float] |
         return {}
     sigma = mean(record["mean_sigma"] for record in records)
     return {"posterior": {**records[-1], "mean_sigma": sigma, "metrics": figures}}
-
-
-def versions() -> dict[str, str | None]:
-    """Versions of the packages that a run depends on (None = not installed) and of Python, and the platform."""
-    return {**machine.versions({name: name for name in _PACKAGES}), "platform": platform.platform()}
 
 
 def _sequence(sequence: FrameSequence) -> dict[str, Any]:
