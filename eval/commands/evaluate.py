@@ -140,6 +140,8 @@ class EvalOptions:
                 raise ValueError(f"--{name} must be at least {least}, got {values[name]}")
         if self.output.resume and self.output.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
+        if self.shard and self.output.overwrite:
+            raise ValueError("--overwrite goes without shards: another one may have begun")
 
 
 read = reader(EvalOptions, "ufmstar eval")
