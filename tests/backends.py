@@ -112,7 +112,7 @@ def _by_field(m: GaussianMixture, stream: int):
     """All slots of a stream by field (``rigid_cpu``)."""
     table = np.empty((rigid_cpu.FIELDS, rigid_cpu.padded(m.capacity)))
     moments = (v[stream].numpy() for v in (m.mean, m.covariance, m.weight))
-    rigid_cpu.gather(np.arange(m.capacity), 0, m.capacity, *moments, table)
+    rigid_cpu.gather(m.capacity, *moments, table)
     return table
 
 
@@ -139,7 +139,7 @@ def _fused(previous, current, pairs, config, *, rounds=None):
         new = (v[b].numpy() for v in (current.mean, current.covariance, current.weight, current.features))
         compiled(fuse_cpu.fuse_pairs)(
             *(value[b].numpy() for value in out.tensors().values()), *new,
-            c.numpy(), k.numpy(), np.arange(previous.capacity), pairs.overlap[b, c, k].numpy(), distance.numpy(),
+            c.numpy(), k.numpy(), pairs.overlap[b, c, k].numpy(), distance.numpy(),
             config.overlap_weighted, epsilon, np.empty(fuse_cpu.WORK),
         )  # fmt: skip
     return out

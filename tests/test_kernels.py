@@ -25,8 +25,7 @@ pytestmark = pytest.mark.numerics
 
 KERNELS = (
     "_regress", "_prepare", "_project", "_match", "_fuse", "_floor", "_bins", "_scanline", "_join", "_label",
-    "_feature_means", "_cameras",
-    "_append", "_camera", "_maps",
+    "_feature_means",
 )  # fmt: skip
 
 

@@ -130,7 +130,6 @@ def test_kernels_import_back_only_plain_types():
         "Regression",
         "regress",
         "distribute",
-        "regress_pixels",
         "random_order",
         "Correspondence",
         "PIXEL_VARIANCE",

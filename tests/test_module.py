@@ -48,21 +48,6 @@ def test_saved_state_continues_bit_for_bit(tmp_path, cut, dtype, own):
     assert unchanged(second, whole.state_dict())
 
 
-def test_a_module_is_made_from_a_saved_state_alone():
-    ufm = UfMStar(CONFIG.replace(eta=0.4, initial_capacity=16), dtype=torch.float64)
-    ufm(*frame(0, torch.float64))
-    state = {key: value.clone() for key, value in ufm.state_dict().items()}
-    twin = UfMStar.from_state_dict(state)
-    assert twin.config == ufm.config
-    assert twin.mean.dtype == torch.float64
-    assert same(twin(*frame(1, torch.float64)).variance, ufm(*frame(1, torch.float64)).variance)
-    with pytest.raises(ValueError, match="with '_extra_state'"):
-        UfMStar.from_state_dict({f"ufm.{key}": value for key, value in state.items()})
-    config = torch.tensor(list(b'{"eta": 0.5, "etta": 1}'), dtype=torch.uint8)
-    with pytest.raises(ValueError, match=r"of another version: .*etta"):
-        UfMStar.from_state_dict(state | {"_extra_state": config})
-
-
 def put(index, value):
     """An edit that writes a value (a number, or a function of the old ones) at an index of a tensor."""
 

@@ -79,7 +79,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: spgf(D, K1, features=D), r"features must have shape \(2, -1, 5, 6\)"),
     (lambda: spgf(D, K1, {}), "config must be an SPGFConfig"),  # type: ignore[arg-type]
     (lambda: spgf(D, K1, SPGFConfig(min_gaussian_length=1e-6)), "config.min_gaussian_length = 1e-06 m"),
-    (lambda: spgf(D, K1, compute_dtype=torch.float16), "compute_dtype .* got torch.float16"),
     (lambda: resize_intrinsics(K1, (0, 4), (5, 6)), "positive sizes"),
     (lambda: barycenter(torch.zeros(2, 3), torch.eye(3).expand(2, 3, 3), -torch.ones(2)), "weight must be non-neg"),
 ]

@@ -204,23 +204,6 @@ def test_slope_keeps_metric_thresholds(slope_focal, scale_with_image, size, foca
     assert config.scaled_to(*size).slope(focal) == pytest.approx(expected)
 
 
-@pytest.mark.slow
-def test_float32_with_centred_moments():
-    """640 x 480, float32 throughout. Measured over all 17 frames: every label as in float64; over Gaussians
-    of at least 200 pixels the smallest eigenvalue is off by at most 1.4e-4 of itself; raw float32 moments
-    are off by up to 6.8 (median .1)."""
-    r = reference("spgf_vga_tum")
-    r = replace(r, depth=r.depth[2:], intrinsics=r.intrinsics[2:])
-    exact, labels = make_backend("numba").spgf(r.depth, r.intrinsics, r.config, before_pruning=True)
-    mixture, single = segment.spgf(r.depth, r.intrinsics, r.config, before_pruning=True, compute_dtype=torch.float32)
-    assert float((labels == single).double().mean()) > 0.9999
-    large = exact.weight[0] >= 200
-    torch.testing.assert_close(mixture.mean[0][large], exact.mean[0][large], rtol=0, atol=1e-5)
-    expected, actual = (torch.linalg.eigvalsh(m.covariance[0][large]) for m in (exact, mixture))
-    assert float(((actual - expected).abs() / expected)[:, 0].max()) < 5e-4
-    torch.testing.assert_close(actual, expected, rtol=5e-4, atol=0)
-
-
 def test_static_bounds_change_nothing(monkeypatch):
     """The loops and tables of an accelerator, run on the CPU."""
     depth, K = (torch.cat(parts) for parts in zip(clutter(8, 14, 22), clutter(9, 14, 22), strict=True))

@@ -9,8 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from backends import compiled
-from random_gaussians import mixture
 from walks import HEIGHT, SPGF, WIDTH, oracle_settings
 
 import oracle
@@ -18,8 +16,7 @@ import scenes
 from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.frame import FrameMaps, check_values
-from ufmstar_torch.kernels import rigid_cpu, step_cpu, threads_cpu, visibility_cpu
-from ufmstar_torch.kernels.regress_cull_cpu import in_view
+from ufmstar_torch.kernels import threads_cpu
 
 pytestmark = pytest.mark.numerics
 
@@ -64,8 +61,6 @@ def test_a_walk_agrees_with_the_oracle(backend, variant):
     count = 2 if backend.slow else 20 if variant == "default" else 4
     depths, poses, camera, aleatoric, maps, matches, expected = oracle_walk(variant, count)
     config = VARIANTS[variant][0]
-    if backend.name == "triton":  # what finds no slot is in the next frame's map (test_triton.py)
-        config = config.replace(initial_capacity=256)
     ufm = backend.module(config, torch.float64)
 
     def batch(x):
@@ -164,8 +159,6 @@ def test_agrees_with_the_reference(compiled_backend, name, dtype, tolerance):
     slow, config = compiled_backend.slow, CONFIGS[name].replace(on_bad_frame="skip")
     if slow and (dtype == torch.float64) != (name in ("full", "anchored")):
         pytest.skip("in one precision")
-    if compiled_backend.name == "triton":  # as above
-        config = config.replace(initial_capacity=config.max_components or 64)
     fast, reference = compiled_backend.module(config, dtype), UfMStar(config.replace(backend="torch"), dtype=dtype)
     few = {"count": 2, "streams": 2, "size": (24, 32)} if slow else {"count": 4}
     for arguments, more in frames(config=config, dtype=dtype, **few):
@@ -221,52 +214,6 @@ def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(backend
         n = int(ufm.mixture.components)
         for key, value in ufm.mixture.tensors().items():
             assert torch.equal(getattr(together[0].mixture, key)[s, :n], value[0, :n]), key
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_components_out_of_reach_change_no_bit(dtype, monkeypatch):
-    """The same frames with every component looked at; on the way back, many lie behind the camera."""
-    chosen, every = (UfMStar(CONFIGS["default"], dtype=dtype) for _ in range(2))
-    given = [arguments for arguments, _ in frames(14, CONFIGS["default"], dtype)]
-    for depth, pose, intrinsics in (given[0], *given[3:], *reversed(given[3:])):
-        one = chosen(depth, pose, intrinsics)
-        with monkeypatch.context() as patch:
-            patch.setattr(step_cpu, "EPSILON", {dtype: 0.0})
-            other = every(depth, pose, intrinsics)
-        assert_same(one, other)
-    for name, value in chosen.state.tensors().items():
-        assert torch.equal(value.nan_to_num(-1), getattr(every.state, name).nan_to_num(-1)), name
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_what_is_out_of_reach_neither_matches_nor_is_summed(dtype):
-    m = mixture(1, 400, 7, empty=0)
-    scale = 10 ** torch.linspace(-6, 1, 400, dtype=torch.float64)[:, None, None]
-    far = (m.mean[0] - torch.tensor([0.0, 0.0, 3.0])) * 10
-    T = torch.tensor(scenes.look((0.3, -0.2, 0.1), 0.7, 0.4)).numpy()
-    slots = [v.numpy().astype(dtype) for v in (far, m.covariance[0] * scale, m.weight[0])]
-    motion, camera = np.empty((3, 4)), K.numpy()
-    rigid_cpu.relative(np.eye(4), T, motion)
-    everyone, here = np.arange(400), np.zeros((rigid_cpu.FIELDS, 400))
-    rigid_cpu.gather(everyone, 0, 400, *slots, here)
-    mean, covariance, weight = here[:3].T, here[3:12].T.reshape(-1, 3, 3), here[12]
-    mean, covariance = mean @ motion[:, :3].T + motion[:, 3], motion[:, :3] @ covariance @ motion[:, :3].T
-    here[:12] = np.concatenate([mean, covariance.reshape(-1, 9)], 1).T
-    index, group = np.empty(400, np.int64), np.empty((rigid_cpu.FIELDS, visibility_cpu.GROUP))
-    work = group, np.empty(visibility_cpu.GROUP), np.empty((6, 4))
-    n, occupied = compiled(visibility_cpu.reached)(motion, *slots, camera, SIZE, 1.0, 1e-6, 0, index, *work)
-    near = index[:n]
-    u, v = (camera[i, i] * mean[:, i] / mean[:, 2] + camera[i, 2] for i in range(2))
-    inside = (u >= -0.5) & (u < SIZE[1] - 0.5) & (v >= -0.5) & (v < SIZE[0] - 0.5) & (mean[:, 2] > 0.05)
-    args = (400, camera, np.full(SIZE, 1e4), 1.0, 0.0, 1e-6)
-    summed = in_view(here, weight.copy(), np.zeros((400, 0)), *args)[0]
-    assert occupied == 400
-    assert set(everyone[inside]) | set(summed) <= set(near)
-    assert 20 < len(set(everyone[inside]) | set(summed)) <= len(near) < 300
-    chosen = np.zeros((rigid_cpu.FIELDS, rigid_cpu.padded(len(near))))
-    chosen[:, : len(near)] = here[:, near]
-    again = in_view(chosen, weight[near], np.zeros((len(near), 0)), *args)[0]
-    assert np.array_equal(near[again], summed)
 
 
 @ON_CPU

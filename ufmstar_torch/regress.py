@@ -94,24 +94,11 @@ def regress_image(
         pixels: [B, n] indices into the flattened image; None = every pixel.
     """
     if pixels is not None:
-        return regress_pixels(mixture_cam, depth, intrinsics, valid, config, pixels, regress)
+        chosen = torch.gather(depth.flatten(1), 1, pixels)
+        result = regress(mixture_cam, unproject_at(chosen, pixels, depth.shape[2], intrinsics), config)
+        return _where(torch.gather(valid.flatten(1), 1, pixels), result.disagreement, result.features)
     result = regress(mixture_cam, unproject(depth, intrinsics).flatten(1, 2), config)
     return _where(valid, result.disagreement.view(valid.shape), result.features.view(*valid.shape, -1))
-
-
-def regress_pixels(
-    mixture_cam: GaussianMixture,
-    depth: Tensor,
-    intrinsics: Tensor,
-    valid: Tensor,
-    config: UfMStarConfig,
-    pixels: Tensor,
-    at_points: Callable[[GaussianMixture, Tensor, UfMStarConfig], Regression],
-) -> Regression:
-    """:func:`regress_image` at some pixels, by any implementation of :func:`regress`."""
-    chosen = torch.gather(depth.flatten(1), 1, pixels)
-    result = at_points(mixture_cam, unproject_at(chosen, pixels, depth.shape[2], intrinsics), config)
-    return _where(torch.gather(valid.flatten(1), 1, pixels), result.disagreement, result.features)
 
 
 def _where(valid: Tensor, disagreement: Tensor, features: Tensor) -> Regression:

@@ -29,7 +29,6 @@ def spgf(
     valid: Tensor | None = None,
     features: Tensor | None = None,
     before_pruning: bool = False,
-    compute_dtype: torch.dtype | None = None,
 ) -> tuple[GaussianMixture, Tensor]:
     """Fit Gaussians to the surfaces of B depth maps.
 
@@ -46,7 +45,6 @@ def spgf(
         valid: [B, H, W] bool, True = use.
         features: [B, F, H, W] averaged over the pixels of each Gaussian; not read where no Gaussian is.
         before_pruning: return every Gaussian that was emitted.
-        compute_dtype: torch.float64 (default), or torch.float32, the default where the device has no float64.
 
     Returns:
         The mixture [B, K] in the camera frame in order of emission: sample covariance (divisor N - 1;
@@ -60,20 +58,14 @@ def spgf(
         ValueError: an argument has the wrong shape or lies on another device than depth; on the CPU also
             intrinsics that are not finite with fx, fy > 0 (elsewhere such a stream's result means nothing).
     """
-    if compute_dtype not in (None, torch.float32, torch.float64):
-        raise ValueError(f"compute_dtype must be torch.float32 or torch.float64, got {compute_dtype}")
     given = SegmentInput.checked(depth, intrinsics, config, variance, valid, features)
-    return segment(given, before_pruning=before_pruning, compute_dtype=compute_dtype)
+    return segment(given, before_pruning=before_pruning)
 
 
 @torch.no_grad()
-def segment(
-    given: SegmentInput, *, before_pruning: bool = False, compute_dtype: torch.dtype | None = None
-) -> tuple[GaussianMixture, Tensor]:
-    """:func:`spgf` of checked input."""
-    if compute_dtype is None:
-        compute_dtype = torch.float32 if given.depth.device.type == "mps" else torch.float64
-    frame = Frame.of(given, compute_dtype)
+def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Tensor]:
+    """:func:`spgf` of checked input, float64 inside."""
+    frame = Frame.of(given)
     segments = scanlines(frame)
     return _output(frame, segments, *fuse_segments(frame, segments), before_pruning)
 

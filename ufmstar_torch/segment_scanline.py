@@ -39,7 +39,7 @@ class OpenSegment(NamedTuple):
 
 @dataclass(frozen=True)
 class Frame:
-    """The images as R = B H rows [R, W] in the compute dtype, 0 where a pixel does not take part."""
+    """The images as R = B H rows [R, W] in float64, 0 where a pixel does not take part."""
 
     given: SegmentInput
     z: Tensor
@@ -52,7 +52,8 @@ class Frame:
     lengths2: Tensor  # [B, bins] [m^2]
 
     @classmethod
-    def of(cls, given: SegmentInput, dtype: torch.dtype) -> Frame:
+    def of(cls, given: SegmentInput) -> Frame:
+        dtype = torch.float64
         b, height, width = given.depth.shape
         limits = given.config
         z = given.depth.to(dtype)

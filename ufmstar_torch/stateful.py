@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -24,12 +24,10 @@ class StatefulModule(nn.Module):
     Attributes:
         STATE: the buffers' names.
         ALWAYS_FLOAT64: those of them that keep float64 under ``.float()``: a world coordinate of kilometres needs it.
-        CONFIG: class of the config.
         config: of the module.
     """
 
     STATE: tuple[str, ...]
-    CONFIG: ClassVar[type[Checked]]
     ALWAYS_FLOAT64: tuple[str, ...] = ("T_world_first",)
     config: Checked
 
@@ -57,16 +55,8 @@ class StatefulModule(nn.Module):
         chosen[given if given.numel() else given.long()] = True
         return chosen
 
-    def _settle(self) -> None:
-        """Write what is pending into the buffers, before they are saved, loaded, copied or moved."""
-
-    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
-        self._settle()
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """``.to()`` and friends, with the exceptions that the class states."""
-        self._settle()
         before = {name: getattr(self, name) for name in self.STATE}
         super()._apply(fn, recurse)
         for name, old in before.items():
@@ -91,30 +81,6 @@ class StatefulModule(nn.Module):
             each = ", ".join(f"{key} was {saved.get(key)!r}, is {ours.get(key)!r}" for key in changed)
             warnings.warn(f"the loaded state was made with another config: {each}", stacklevel=4)
 
-    @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any], **options: Any) -> Self:
-        """A module with the configuration, the dtype and the content of a saved state.
-
-        Args:
-            state: what ``state_dict`` returned (of an ``UncertainDepth``: its ``.ufm``'s).
-            options: further arguments of the constructor, as ``device``.
-
-        Raises:
-            ValueError: the state does not say with which configuration it was made, or with one that is not known here.
-            RuntimeError: the state is incomplete or impossible.
-        """
-        if "_extra_state" not in state:
-            raise ValueError(f"state must be that of a {cls.__name__}, with '_extra_state', got {sorted(state)[:5]}")
-        try:
-            config = cls.CONFIG.from_dict(_config_of(state["_extra_state"]))
-        except ValueError as error:
-            raise ValueError(f"state: its configuration is of another version: {error}") from error
-        first = state.get(cls.STATE[0])
-        dtype = first.dtype if isinstance(first, Tensor) and first.is_floating_point() else torch.float32
-        module = cls(config, dtype=dtype, **options)
-        module.load_state_dict(state)
-        return module
-
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         """Check a state that is about to be loaded, in the buffers' dtypes; a class states its own rules.
 
@@ -128,7 +94,6 @@ class StatefulModule(nn.Module):
         Raises:
             ValueError: tensors that do not fit together, or values that no run can produce.
         """
-        self._settle()
         try:
             saved = {
                 n: _fitting(n, state_dict[prefix + n], getattr(self, n)) for n in self.STATE if prefix + n in state_dict

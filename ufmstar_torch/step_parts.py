@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Protocol
 
 from torch import Tensor
 
@@ -28,13 +26,6 @@ class StepObserver(Protocol):
         overlaps, the segments into the first camera's frame, growth, and the fusion. append: the new components, the
         mixture into the camera frame, and the columns of extensions. regress: the regression. average: the moving
         average, statistics and the new state. The caller of a step ends "check" itself.
-        """
-        ...
-
-    def kernel(self, name: str) -> AbstractContextManager[object]:
-        """Around the kernel of this name, a field of :class:`Kernels`.
-
-        A compiled step names spgf, correspond, fuse (which appends as well) and regress_image.
         """
         ...
 
@@ -121,19 +112,6 @@ class Kernels:
     regress_image: RegressKernel
     smooth: SmoothKernel
     distribute: DistributeKernel
-
-    def observed(self, observer: StepObserver) -> Kernels:
-        """The same kernels, with the observer around every call."""
-
-        def around(name: str, kernel: Callable[..., Any]) -> Callable[..., Any]:
-            def call(*args: Any, **kwargs: Any) -> Any:
-                with observer.kernel(name):
-                    return kernel(*args, **kwargs)
-
-            return call
-
-        kernels: dict[str, Any] = {f.name: around(f.name, getattr(self, f.name)) for f in fields(self)}
-        return Kernels(**kernels)
 
 
 REFERENCE = Kernels(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 import torch
@@ -59,10 +59,6 @@ class _Stages:
     def stage(self, name: str) -> None:
         """A stage has ended."""
         self.step()
-
-    def kernel(self, name: str) -> AbstractContextManager[object]:
-        """Nothing is counted within a stage."""
-        return nullcontext()
 
 
 def warm_up(

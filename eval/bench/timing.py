@@ -7,7 +7,7 @@ hardly moves, and the minimum are reported.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -120,10 +120,6 @@ class StagedStep:
             ms = self._timer.take()
             for stage, times in self.stages.items():
                 times.append(ms.get(stage, 0.0))
-
-    def kernel(self, name: str) -> AbstractContextManager[object]:
-        """Kernels are not timed."""
-        return nullcontext()
 
     def summary(self, *, warm_up: int) -> dict[str, Any]:
         """Spread of every stage and of the steps' sums; the first ``warm_up`` steps do not count."""

@@ -169,16 +169,16 @@ def floored(count, mean, covariance, near, focal, widening, epsilon, covariance_
 @leaf
 def fuse_pairs(
     mean, covariance, weight, disagreement, count, features,
-    mean_c, cov_c, weight_c, features_c, pair_c, pair_k, slots, overlap, distance, weighted, epsilon, work,
+    mean_c, cov_c, weight_c, features_c, pair_c, pair_k, overlap, distance, weighted, epsilon, work,
 ):  # fmt: skip
-    """Fuse the pairs [P] of one stream in their order, in place; ``slots`` are those to which ``pair_k`` refers.
+    """Fuse the pairs [P] of one stream in their order, in place.
 
     After each pair the values take the precision they are stored in. ``distance`` [P] takes the place of W2^2 where it
     is not empty; with ``weighted``, pi_c is multiplied by the overlap [P].
     """
     mean_k, cov_k = work[6, 1], work[7]
     for p in range(pair_c.size):
-        c, k = pair_c[p], slots[pair_k[p]]
+        c, k = pair_c[p], pair_k[p]
         pi_k = np.float64(weight[k])
         pi_c = weight_c[c] * (overlap[p] if weighted else 1.0)
         lam = pi_c / (pi_k + pi_c)

@@ -18,12 +18,12 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.regress_cull_cpu import in_view
-from ufmstar_torch.kernels.regress_near_cpu import near_image, near_points
+from ufmstar_torch.kernels.regress_near_cpu import near
 from ufmstar_torch.kernels.regress_tiles_cpu import exact, exact_at
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, padded
 from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.regress import Regression, regress_pixels
+from ufmstar_torch.regress import Regression
 
 # Share of the denominator that culling may leave out: about the rounding of a sum in the dtype, so that culling is no
 # coarser than the arithmetic itself.
@@ -33,14 +33,12 @@ View = tuple[Any, ...]  # what `in_view` returns
 
 
 class Seen(NamedTuple):
-    """The part of a stream's mixture that can matter in an image: n components by field [13, n and more] in the
-    camera's frame (``rigid_cpu``), their disagreement [n] and features [n, F], and how many components the mixture
-    has."""
+    """A stream's mixture: n components by field [13, n and more] in the camera's frame (``rigid_cpu``), their
+    disagreement [n] and features [n, F]."""
 
     components: NDArray[np.float64]
     disagreement: NDArray[np.float64]
     features: NDArray[np.float64]
-    occupied: int
 
     def moments(self) -> tuple[NDArray[np.float64], ...]:
         """Mean [n, 3], covariance [n, 3, 3] and weight [n]."""
@@ -49,14 +47,14 @@ class Seen(NamedTuple):
         return mean.copy(), np.ascontiguousarray(covariance).reshape(-1, 3, 3), weight[:, 0].copy()
 
 
-def in_slots(seen: Sequence[Seen], slots: Sequence[NDArray[np.int64]], capacity: int) -> GaussianMixture:
-    """The components in those slots [n] of a mixture [B, capacity] in the camera's frame, the others empty."""
+def in_slots(seen: Sequence[Seen], capacity: int) -> GaussianMixture:
+    """The components in the first slots of a mixture [B, capacity] in the camera's frame, the others empty."""
     features = seen[0].features.shape[1]
     mixture = GaussianMixture.empty(len(seen), capacity, features=features, dtype=torch.float64, device="cpu")
-    for b, (one, at) in enumerate(zip(seen, map(torch.from_numpy, slots), strict=True)):
+    for b, one in enumerate(seen):
         values = map(torch.from_numpy, (*one.moments(), one.disagreement, one.features))
         for field, value in zip(_tensors(mixture), values, strict=True):
-            field[b, at] = value
+            field[b, : len(value)] = value
     return mixture
 
 
@@ -68,7 +66,7 @@ def all_seen(mixture_cam: GaussianMixture, features: int | None = None) -> tuple
         n = len(at)
         components = np.zeros((FIELDS, padded(n)))
         components[:, :n] = np.column_stack([mean[at], covariance[at].reshape(n, 9), weight[at]]).T
-        seen.append(Seen(components, disagreement[at], own[at] if features is None else np.zeros((n, features)), n))
+        seen.append(Seen(components, disagreement[at], own[at] if features is None else np.zeros((n, features))))
         slots.append(at)
     return seen, slots
 
@@ -98,41 +96,35 @@ def regress_maps(
     With the exact sum, ``views`` are those of :func:`look`, which None makes, and ``shift`` [B, 2] is added to the two
     features before the last, of three or more; None = nothing.
     """
-    if pixels is not None and config.regression != "exact":
-        most = max(len(one.disagreement) for one in seen)
-        mixture = in_slots(seen, [np.arange(len(one.disagreement)) for one in seen], most)
-        return regress_pixels(mixture, depth, intrinsics, depth > 0, config, pixels, _regress_near)
     z, K = array(depth), _doubles(intrinsics)[0]
     shape, features = z.shape if pixels is None else tuple(pixels.shape), seen[0].features.shape[1]
     out, out_f = np.empty(shape, z.dtype), np.empty((len(z), features, *shape[1:]), z.dtype)
     shares = 1 if pixels is not None else shares_of_stream(len(z), z[0].size)
     moved = np.zeros((len(z), 2)) if shift is None else shift
-    kernel = near_image if config.regression != "exact" else exact if pixels is None else exact_at
-    if views is None and kernel is not near_image:
+    if config.regression != "exact":
+        at = np.arange(z[0].size)[None].repeat(len(z), 0) if pixels is None else array(pixels)
+        settings = (
+            config.prior_weight, config.prior_mean, config.neighbourhood_sigmas, config.near_radius, config.far_radius,
+        )  # fmt: skip
+        calls: list[tuple[Any, ...]] = [
+            (z[b], K[b], at[b], one.components, one.disagreement, one.features, settings, out[b].reshape(-1),
+             out_f[b].reshape(features, -1), i, shares)
+            for b, one in enumerate(seen) for i in range(shares)
+        ]  # fmt: skip
+        each(near, calls)
+        return _regression(out, out_f)
+    if views is None:
         views = look(seen, depth, intrinsics, config)
-    calls: list[tuple[Any, ...]] = []
+    calls = []
     for b, one in enumerate(seen):
         into = out[b], out_f[b]
-        if views is None:
-            given = (z[b], K[b], *one.moments(), one.disagreement, one.features, *_neighbourhood(config), *into)
-            calls += [(*given, i, shares) for i in range(shares)]
-            continue
         view = views[b]
         if pixels is None:
             calls += [(z[b], K[b], view, one.features, moved[b], *into, i, shares) for i in range(shares)]
         else:
             calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, one.features, moved[b], *into))
-    each(kernel, calls)
+    each(exact if pixels is None else exact_at, calls)
     return _regression(out, out_f)
-
-
-def _regress_near(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> Regression:
-    """As :func:`ufmstar_torch.regress.regress` with the neighbourhood, for CPU tensors."""
-    x = points.detach().contiguous().numpy()
-    out, features = np.empty(x.shape[:2], x.dtype), np.empty((len(x), mixture.features.shape[2], x.shape[1]), x.dtype)
-    streams = zip(x, *_fields(mixture), out, features, strict=True)
-    each(near_points, [(*given[:6], *_neighbourhood(config), *given[6:]) for given in streams])
-    return _regression(out, features)
 
 
 def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
@@ -149,13 +141,6 @@ def _smooth(previous, current, alpha, memory, shown):
         before, now = previous[i], memory.dtype.type(current[i])
         memory[i] = before if now != now else now if before != before else (1 - alpha) * before + alpha * now
         shown[i] = now if now != now else memory[i]
-
-
-def _neighbourhood(config: UfMStarConfig) -> tuple[float, ...]:
-    """The settings of the paper's neighbourhood, as compiled code takes them."""
-    return (
-        config.prior_weight, config.prior_mean, config.neighbourhood_sigmas, config.near_radius, config.far_radius,
-    )  # fmt: skip
 
 
 def _doubles(*values: Tensor) -> list[NDArray[np.float64]]:

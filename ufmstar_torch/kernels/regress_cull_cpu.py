@@ -28,24 +28,25 @@ import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
 from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, bounds, largest
-from ufmstar_torch.kernels.rigid_cpu import padded
+from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, WEIGHT, padded
 from ufmstar_torch.kernels.vectors_cpu import LANES
-from ufmstar_torch.kernels.whiten_cpu import PEAK, SQUARE, WHITENED, meets, whiten
 
 HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 _PRIOR = 1e-3  # share of the prior in a threshold
 FIELDS = 10  # of a component: mean (3), whitening (6), log2 of the peak
 _LOG2_E = math.log2(math.e)
+_SCALE = math.sqrt(0.5 * _LOG2_E)
+# Rows of :func:`whiten`, and the squared radius of the ellipsoid that counts, in standard deviations.
+WHITENED, PEAK, SQUARE = 8, 6, 7
 
 
 @kernel
-def in_view(components, m, features, occupied, K, depth, prior_weight, prior_mean, epsilon):
+def in_view(components, m, features, K, depth, prior_weight, prior_mean, epsilon):
     """The components that can matter in an image, as :func:`exact` takes them.
 
     Args:
         components: in the camera's frame by field [13, n and more] (``rigid_cpu``).
         m, features: of the n components [n], [n, F].
-        occupied: how many components the mixture has, others than those included.
         depth: [H, W], not positive where there is none.
 
     Returns:
@@ -54,10 +55,10 @@ def in_view(components, m, features, occupied, K, depth, prior_weight, prior_mea
         and how many components level 1 left.
     """
     height, width = depth.shape
-    least, limit = math.log2(_PRIOR * prior_weight), negligible(prior_weight, epsilon, occupied)
+    least, limit = math.log2(_PRIOR * prior_weight), _limit(epsilon, m.size) + math.log2(_PRIOR * prior_weight)
     whitened = empty((WHITENED, components.shape[1]), np.float64)
     index, kept = empty(m.size, np.int64), empty(m.size, np.int64)
-    n = _visible(components, m.size, whitened, K, height, width, limit, empty((2, 3), np.float64), index)
+    n = _visible(components, m.size, whitened, K, height, width, limit, index)
     packed = empty((FIELDS, padded(n)), depth.dtype)
     _pack(components, whitened, index, n, packed)
     z = _farthest(depth, empty(1, depth.dtype))
@@ -119,12 +120,6 @@ def _farthest(depth, work):
 
 
 @leaf
-def negligible(prior_weight, epsilon, count):
-    """log2 of the density that one of ``count`` components must exceed somewhere in an image to be looked at."""
-    return _limit(epsilon, count) + math.log2(_PRIOR * prior_weight)
-
-
-@leaf
 def _limit(epsilon, count):
     """log2 of the share of a lower bound that one component may add at one level, a little less for rounding."""
     return math.log2(epsilon / (3 * max(count, 1))) - 0.01
@@ -140,24 +135,64 @@ def pad(packed, n):
 
 
 @leaf
-def _visible(components, count, whitened, K, height, width, limit, view, index):
-    """Write whitening and log2 of the peak of the first ``count`` components, and the indices of those whose density
-    can exceed 2^limit at a pixel of the image; return how many these are. ``view`` [2, 3] is scratch."""
-    whiten(components, components.shape[1], padded(count), whitened)
-    for k in range(count):
-        log_peak = math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED
-        whitened[PEAK, k] = log_peak * _LOG2_E
-        whitened[SQUARE, k] = 2 * (log_peak - limit / _LOG2_E) * (1 + 1e-6)
-    for k in range(count, padded(count)):
-        whitened[SQUARE, k] = 0
-    for axis in range(2):
-        view[axis, 0], view[axis, 1], view[axis, 2] = K[axis, axis], K[axis, 2], height if axis else width
-    meets(components, components.shape[1], padded(count), whitened, view)
+def whiten(components, n, whitened):
+    """Write the inverse Cholesky factor (row by row, 6 numbers) of the first n components by field, and weight over its
+    determinant."""
+    for k in range(n):
+        xx, yy, zz = components[COVARIANCE, k], components[COVARIANCE + 4, k], components[COVARIANCE + 8, k]
+        least = max(xx, yy, zz) * 1e-14  # fusion keeps pivots far above it
+        l00 = math.sqrt(max(xx, least))
+        l10, l20 = components[COVARIANCE + 3, k] / l00, components[COVARIANCE + 6, k] / l00
+        l11 = math.sqrt(max(yy - l10 * l10, least))
+        l21 = (components[COVARIANCE + 7, k] - l20 * l10) / l11
+        l22 = math.sqrt(max(zz - l20 * l20 - l21 * l21, least))
+        a, c, f = 1 / l00, 1 / l11, 1 / l22
+        b, e = -l10 / (l00 * l11), -l21 / (l11 * l22)
+        whitened[0, k], whitened[1, k], whitened[2, k] = a, b, c
+        whitened[3, k], whitened[4, k], whitened[5, k] = -(l20 * a + l21 * b) / l22, e, f
+        whitened[PEAK, k] = components[WEIGHT, k] / (l00 * l11 * l22)
+
+
+@leaf
+def _visible(components, count, whitened, K, height, width, limit, index):
+    """Write scaled whitening and log2 of the peak of the first ``count`` components, and the indices of those whose
+    density can exceed 2^limit at a pixel of the image; return how many these are."""
+    whiten(components, count, whitened)
     n = 0
     for k in range(count):
+        for i in range(6):
+            whitened[i, k] *= _SCALE
+        log_peak = math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED
+        whitened[PEAK, k] = log_peak * _LOG2_E
+        square = 2 * (log_peak - limit / _LOG2_E) * (1 + 1e-6)
         index[n] = k
-        n += whitened[SQUARE, k] > 0
+        n += square > 0 and _meets(components, k, square, K, height, width)
     return n
+
+
+@leaf
+def _meets(components, k, square, K, height, width):
+    """False if the ellipsoid (x - mu)^T S^-1 (x - mu) = square of component k certainly has no point in view.
+
+    Its silhouette lies between the planes x = s z (and y = s z) that touch it, (mu_x - s mu_z)^2 =
+    square (S_xx - 2 s S_xz + s^2 S_zz): a quadratic equation in s. One that reaches z = 0 may be anywhere.
+    """
+    xx, yy, zz = components[COVARIANCE, k], components[COVARIANCE + 4, k], components[COVARIANCE + 8, k]
+    least, z = max(xx, yy, zz) * 1e-14, components[2, k]
+    depth = square * (zz + least)
+    a = z * z - depth
+    if not a > depth * 1e-6:  # it reaches the camera's plane
+        return True
+    for axis in range(2):
+        x, own, mixed = components[axis, k], yy if axis else xx, components[COVARIANCE + 2 + 3 * axis, k]
+        half_b = x * z - square * mixed
+        root = math.sqrt(max(half_b * half_b - a * (x * x - square * (own + least)), 0.0))
+        root += (abs(half_b) + root) * 1e-9
+        p = (half_b - root) / a * K[axis, axis] + K[axis, 2]
+        q = (half_b + root) / a * K[axis, axis] + K[axis, 2]
+        if max(p, q) < -1 or min(p, q) > (height if axis else width):
+            return False
+    return not z < 0
 
 
 @leaf

@@ -1,4 +1,4 @@
-"""The paper's neighbourhood regression on the CPU (numba), at every pixel and at points."""
+"""The paper's neighbourhood regression on the CPU (numba)."""
 
 from __future__ import annotations
 
@@ -7,99 +7,55 @@ import math
 import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, part
-from ufmstar_torch.kernels.regress_cull_cpu import HALF_LOG_TWO_PI_CUBED
+from ufmstar_torch.kernels.regress_cull_cpu import HALF_LOG_TWO_PI_CUBED, PEAK, WHITENED, whiten
+from ufmstar_torch.kernels.rigid_cpu import COVARIANCE
 
 
 @kernel
-def near_image(
-    depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f,
-    first, shares,
-):  # fmt: skip
-    """One stream, depth [H, W] into out [H, W] and out_f [F, H, W]; of the rows every ``shares``-th, from ``first``."""
-    index, log_peak, local, extent = _components(mean, covariance, weight, sigmas)
-    gaps, kept, sums = empty(index.size, np.float64), empty(index.size, np.int64), empty(features.shape[1], np.float64)
-    for v in range(first, depth.shape[0], shares):
-        for u in range(depth.shape[1]):
-            if depth[v, u] > 0:
-                z = np.float64(depth[v, u])
-                x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
-                out[v, u] = _point(
-                    x, y, z, index, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps,
-                    kept, sums,
-                )  # fmt: skip
-            else:
-                out[v, u] = np.nan
-            for g in range(sums.size):
-                out_f[g, v, u] = sums[g] if depth[v, u] > 0 else np.nan
+def near(depth, K, pixels, components, m, features, settings, out, out_f, first, shares):
+    """One stream at pixels [n], indices into the flattened image [H, W], of which the share ``first`` is done, into
+    out [n] and out_f [F, n]; NaN where the depth is not positive.
 
-
-@kernel
-def near_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f):
-    """At points [P, 3] into out [P] and out_f [F, P]; NaN where a point is not finite."""
-    index, log_peak, local, extent = _components(mean, covariance, weight, sigmas)
-    gaps, kept, sums = empty(index.size, np.float64), empty(index.size, np.int64), empty(features.shape[1], np.float64)
-    for p in range(points.shape[0]):
-        x, y, z = np.float64(points[p, 0]), np.float64(points[p, 1]), np.float64(points[p, 2])
-        known = x + y + z
-        finite = known - known == 0
-        value = _point(
-            x, y, z, index, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, kept, sums
-        )
-        out[p] = value if finite else np.nan
+    ``settings``: prior weight and mean, standard deviations of an extent, near and far radius.
+    """
+    prior_weight, prior_mean, sigmas, near, far = settings
+    log_peak, local, extent = _prepared(components, m.size, sigmas)
+    gaps, kept, sums = empty(m.size, np.float64), empty(m.size, np.int64), empty(features.shape[1], np.float64)
+    for i in range(first * pixels.size // shares, (first + 1) * pixels.size // shares):
+        v = pixels[i] // depth.shape[1]
+        u = pixels[i] - v * depth.shape[1]
+        z, value = np.float64(depth[v, u]), np.nan
+        if z > 0:
+            x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
+            value = _point(
+                x, y, z, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, kept, sums
+            )
+        out[i] = value
         for g in range(sums.size):
-            out_f[g, p] = sums[g] if finite else np.nan
+            out_f[g, i] = sums[g] if z > 0 else np.nan
 
 
 @part
-def _components(mean, covariance, weight, sigmas):
-    """Occupied components: index, log peak density, mean and whitening [K, 9], and half the sides of their boxes."""
-    index, whitening, log_peak = _prepare(_slots_in_use(weight), mean, covariance, weight)
-    local, extent = empty((index.size, 9), np.float64), empty((index.size, 3), np.float64)
-    for k in range(index.size):
+def _prepared(components, n, sigmas):
+    """Log peak density [n], mean and whitening [n, 9], and half the sides of the components' boxes [n, 3]."""
+    log_peak, local, extent = empty(n, np.float64), empty((n, 9), np.float64), empty((n, 3), np.float64)
+    whitened = empty((WHITENED, n), np.float64)
+    whiten(components, n, whitened)
+    for k in range(n):
+        log_peak[k] = math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED
         for i in range(3):
-            local[k, i] = mean[index[k], i]
-            extent[k, i] = sigmas * math.sqrt(covariance[index[k], i, i])
+            local[k, i] = components[i, k]
+            extent[k, i] = sigmas * math.sqrt(components[COVARIANCE + 4 * i, k])
         for i in range(6):
-            local[k, 3 + i] = whitening[k, i]
-    return index, log_peak, local, extent
+            local[k, 3 + i] = whitened[i, k]
+    return log_peak, local, extent
 
 
 @part
-def _prepare(index, mean, covariance, weight):
-    """Index, inverse Cholesky factor (row by row, 6 numbers) and log peak density of some occupied components [n]."""
-    whitening = empty((index.size, 6), np.float64)
-    log_peak = empty(index.size, np.float64)
-    for i in range(index.size):
-        S = covariance[index[i]]
-        least = 1e-14 * max(S[0, 0], S[1, 1], S[2, 2])  # fusion keeps pivots far above it
-        l00 = math.sqrt(max(S[0, 0], least))
-        l10, l20 = S[1, 0] / l00, S[2, 0] / l00
-        l11 = math.sqrt(max(S[1, 1] - l10 * l10, least))
-        l21 = (S[2, 1] - l20 * l10) / l11
-        l22 = math.sqrt(max(S[2, 2] - l20 * l20 - l21 * l21, least))
-        whitening[i, 0] = 1 / l00
-        whitening[i, 1], whitening[i, 2] = -l10 / (l00 * l11), 1 / l11
-        whitening[i, 4], whitening[i, 5] = -l21 / (l11 * l22), 1 / l22
-        whitening[i, 3] = -(l20 * whitening[i, 0] + l21 * whitening[i, 1]) / l22
-        log_peak[i] = math.log(weight[index[i]] / (l00 * l11 * l22)) - HALF_LOG_TWO_PI_CUBED
-    return index, whitening, log_peak
-
-
-@part
-def _slots_in_use(weight):
-    """Indices of positive weights; ``np.flatnonzero`` takes longer to compile."""
-    index, n = empty(weight.size, np.int64), 0
-    for k in range(weight.size):
-        index[n] = k
-        n += weight[k] > 0
-    return index[:n]
-
-
-@part
-def _point(x, y, z, index, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, kept, sums):
+def _point(x, y, z, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, kept, sums):
     """The regression at one point; its features are left in ``sums`` [F]."""
     count, least = 0, np.inf
-    for k in range(index.size):
+    for k in range(m.size):
         gap = abs(z - local[k, 2]) - extent[k, 2]
         gap = max(gap, abs(x - local[k, 0]) - extent[k, 0], abs(y - local[k, 1]) - extent[k, 1])
         if gap <= far:
@@ -120,9 +76,9 @@ def _point(x, y, z, index, log_peak, local, extent, m, features, prior_weight, p
         y2 = local[k, 6] * dx + local[k, 7] * dy + local[k, 8] * dz
         w = math.exp(log_peak[k] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2))
         evidence += w
-        total += w * m[index[k]]
+        total += w * m[k]
         for g in range(sums.size):
-            sums[g] += w * features[index[k], g]
+            sums[g] += w * features[k, g]
     for g in range(sums.size):
         sums[g] /= evidence
     return total / evidence

@@ -33,15 +33,14 @@ def relative(T_a, T_b, motion):
 
 
 @leaf
-def gather(slots, first, n, mean, covariance, weight, fields):
-    """Write n slots from ``slots[first]`` on by field, as they are; behind them zeros up to the padded number."""
+def gather(n, mean, covariance, weight, fields):
+    """Write the first n slots by field, as they are; behind them zeros up to the padded number."""
     for j in range(n):
-        k = slots[first + j]
         for i in range(3):
-            fields[i, j] = mean[k, i]
+            fields[i, j] = mean[j, i]
             for axis in range(3):
-                fields[COVARIANCE + 3 * i + axis, j] = covariance[k, i, axis]
-        fields[WEIGHT, j] = weight[k]
+                fields[COVARIANCE + 3 * i + axis, j] = covariance[j, i, axis]
+        fields[WEIGHT, j] = weight[j]
     for j in range(n, padded(n)):
         for i in range(FIELDS):
             fields[i, j] = 0.0

@@ -8,7 +8,6 @@ of threads changes a bit.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -26,7 +25,7 @@ from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.fuse import make_room
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.regress_cpu import EPSILON, Seen, View, in_slots, look, regress_maps
+from ufmstar_torch.kernels.regress_cpu import Seen, View, in_slots, look, regress_maps
 from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, padded
 from ufmstar_torch.kernels.segment_cpu import feature_means, fit, most_gaussians
@@ -37,7 +36,7 @@ from ufmstar_torch.output import StepOutput
 from ufmstar_torch.regress import distribute, moving_average
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.step import filled_in, frame_statistics
+from ufmstar_torch.step import filled_in, frame_statistics, unobserved
 from ufmstar_torch.step_parts import StepObserver
 
 Floats = NDArray[np.floating[Any]]
@@ -57,16 +56,14 @@ class _Pairs(NamedTuple):
     matched: int
     created: int
     occupied: int
-    near: NDArray[np.int64]
     here: NDArray[np.float64]
 
 
 class _Joined(NamedTuple):
-    """The mixture after the fusion by field; of each stream the slots within reach [n], and what is in them; tensors of
-    extensions by name, and how many components are new and how many were dropped."""
+    """The mixture after the fusion by field, and as the regression takes it; tensors of extensions by name; how many
+    components are new, and how many were dropped."""
 
     mixture: dict[str, Tensor]
-    slots: list[NDArray[np.int64]]
     seen: list[Seen]
     sums: dict[str, Tensor]
     new: list[int]
@@ -84,17 +81,15 @@ def step(
     observer: StepObserver | None = None,
 ) -> tuple[UfMStarState, StepOutput]:
     """As :func:`ufmstar_torch.step.step`, for CPU tensors."""
-    stage, kernel = (observer.stage, observer.kernel) if observer is not None else (_unobserved, nullcontext)
-    segments, labels = _segment(frame, array(frame.intrinsics), config, state.covariance.dtype, kernel)
+    stage = unobserved if observer is None else observer.stage
+    segments, labels = _segment(frame, array(frame.intrinsics), config, state.covariance.dtype)
     current_cam = GaussianMixture(*map(torch.from_numpy, segments))
     stage("segment")
 
-    with kernel("correspond"):
-        cameras, pairs = _match(state, frame, segments, config, extensions.columns)
+    cameras, pairs = _match(state, frame, segments, config)
     stage("correspond")
 
-    with kernel("fuse"):
-        joined = _join(state, frame, segments, cameras[0], pairs, config, extensions.columns)
+    joined = _join(state, frame, segments, cameras[0], pairs, config, extensions.columns)
     stage("fuse")
 
     changed: dict[str, Tensor] = {}
@@ -103,8 +98,7 @@ def step(
         changed, views, shift = _columns(state, joined, frame, extensions, config)
     stage("append")
 
-    with kernel("regress_image"):
-        result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels, views, shift)
+    result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels, views, shift)
     result, measured = filled_in(result, frame, config, pixels)
     result = extensions.after_regression(result)
     stage("regress")
@@ -123,22 +117,13 @@ def step(
     return updated, out
 
 
-def _unobserved(name: str) -> None:
-    """Without an observer nothing happens between stages."""
-
-
 def _segment(
-    frame: FrameInput,
-    intrinsics: Floats,
-    config: UfMStarConfig,
-    stored: torch.dtype,
-    kernel: Callable[[str], AbstractContextManager],
+    frame: FrameInput, intrinsics: Floats, config: UfMStarConfig, stored: torch.dtype
 ) -> tuple[tuple[NDArray[Any], ...], Callable[[], Tensor]]:
     """Step 2: the fields of C_i in the camera frame, float64, its covariances lifted to the floor that the reference
     states, and its labels."""
     given = SegmentInput.of_frame(frame, config)
-    with kernel("spgf"):
-        fits, labels = fit(given)
+    fits, labels = fit(given)
     rounding = np.float32 if given.dtype == torch.float32 else np.float64
     b, n = len(fits), most_gaussians(fits)
     mean, covariance, weight, zero = np.zeros((b, n, 3)), np.zeros((b, n, 3, 3)), np.zeros((b, n)), np.zeros((b, n))
@@ -155,7 +140,7 @@ def _segment(
 
 
 def _match(
-    state: UfMStarState, frame: FrameInput, segments: Sequence[NDArray[Any]], config: UfMStarConfig, columns: int
+    state: UfMStarState, frame: FrameInput, segments: Sequence[NDArray[Any]], config: UfMStarConfig
 ) -> tuple[tuple[NDArray[Any], ...], list[_Pairs]]:
     """Step 3: of the state after the frame, camera-to-world of the first camera, started, frames and skipped; and what
     each stream matches."""
@@ -166,13 +151,11 @@ def _match(
     first = np.empty_like(first_before)
     mixture = tuple(array(value) for value in (state.mean, state.covariance, state.weight))
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
-    least = min(EPSILON[frame.depth.dtype], EPSILON[state.covariance.dtype] if columns else 1.0)
-    reach = config.prior_weight, least if config.regression == "exact" else 0.0
     calls = [
         (
             (bool(fine[b]), poses[b], cameras[b]), bool(started[b]), first_before[b], first[b],
             tuple(value[b] for value in mixture), tuple(value[b] for value in segments[:3]),
-            frame.size, thresholds, reach,
+            frame.size, thresholds,
         )
         for b in range(len(fine))
     ]  # fmt: skip
@@ -202,16 +185,15 @@ def _join(
     calls = [
         (
             poses[b], first[b], tuple(value[b] for value in updated), tuple(value[b] for value in given), pair[:3],
-            _distance(b, pair, segments, config), pair.new, pair.occupied, pair.near, pair.here,
+            _distance(b, pair, segments, config), pair.new, pair.occupied,
             settings, columns + 1,
         )
         for b, pair in enumerate(pairs)
     ]  # fmt: skip
-    joined = each(join, calls)
     mixture = dict(zip(_NAMES, map(torch.from_numpy, updated), strict=True))
-    seen = [Seen(pair.here, *one[1:]) for pair, one in zip(pairs, joined, strict=True)]
+    seen = [Seen(*one) for one in each(join, calls)]
     sums = dict(state.by_component)
-    all_of_them = _Joined(mixture, [one[0] for one in joined], seen, sums, [p.created for p in pairs], [0] * len(seen))
+    all_of_them = _Joined(mixture, seen, sums, [p.created for p in pairs], [0] * len(seen))
     limit = config.max_components
     if limit is None or capacity <= limit:
         return all_of_them
@@ -233,20 +215,14 @@ def _within_limit(joined: _Joined, old: Sequence[int], position: Tensor, limit: 
     before = torch.tensor(old)
     coming = torch.zeros_like(before)
     room = make_room(GaussianMixture(**joined.mixture), joined.sums, before, coming, position, limit)
-    slots, seen = [], []
-    for at, one, source, components in zip(
-        joined.slots, joined.seen, array(room.slot), room.mixture.components.tolist(), strict=True
-    ):
-        place = np.full(source.size, -1)
-        place[source[:components]] = np.arange(components)
-        kept = np.flatnonzero(place[at] >= 0)
-        here = np.zeros((FIELDS, padded(kept.size)))
-        here[:, : kept.size] = one.components[:, kept]
-        slots.append(place[at[kept]])
-        seen.append(Seen(here, one.disagreement[kept], one.features[kept], components))
+    seen = []
+    for one, source, components in zip(joined.seen, array(room.slot), room.mixture.components.tolist(), strict=True):
+        kept = source[:components]
+        here = np.zeros((FIELDS, padded(components)))
+        here[:, :components] = one.components[:, kept]
+        seen.append(Seen(here, one.disagreement[kept], one.features[kept]))
     return _Joined(
         {name: value[:, :limit].contiguous() for name, value in room.mixture.tensors().items()},
-        slots,
         seen,
         {name: value[:, :limit].contiguous() for name, value in room.sums.items()},
         (room.mixture.components - before + room.dropped).tolist(),
@@ -260,15 +236,16 @@ def _columns(
     """Write the columns of extensions to the features before the last. Returns the tensors of the state that change;
     what is in view, and what the regression is to add to the columns, where an extension works on what is in view."""
     capacity, tensors = joined.mixture["weight"].shape[1], {**state.by_stream, **joined.sums}
+    slots = [np.arange(len(one.disagreement)) for one in joined.seen]
     if config.regression == "exact":
         views = look(joined.seen, frame.depth, frame.intrinsics, config, state.covariance.dtype)
-        if (found := extensions.in_view(tensors, capacity, joined.slots, joined.seen, views)) is not None:
+        if (found := extensions.in_view(tensors, capacity, slots, joined.seen, views)) is not None:
             return found[0], views, array(found[1])
-    mixture_cam = in_slots(joined.seen, joined.slots, capacity)
+    mixture_cam = in_slots(joined.seen, capacity)
     changed, with_columns = extensions.before_regression(tensors, mixture_cam, distribute)
     columns = array(with_columns.features)[..., -extensions.columns :]
-    for slots, one, values in zip(joined.slots, joined.seen, columns, strict=True):
-        one.features[:, -extensions.columns - 1 : -1] = values[slots]
+    for one, values in zip(joined.seen, columns, strict=True):
+        one.features[:, -extensions.columns - 1 : -1] = values[: len(one.disagreement)]
     return changed, None, None
 
 
@@ -287,7 +264,7 @@ def _counts(frame: FrameInput, pairs: Sequence[_Pairs], joined: _Joined, measure
     valid, shares = array(frame.valid), array(measured)
     for b, (pair, one, new, gone) in enumerate(zip(pairs, joined.seen, joined.new, joined.dropped, strict=True)):
         totals[:, b] = (
-            one.occupied,
+            len(one.disagreement),
             pair.found,
             pair.matched,
             pair.c.size,

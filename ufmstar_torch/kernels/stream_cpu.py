@@ -9,7 +9,6 @@ from ufmstar_torch.kernels.correspond_cpu import matches
 from ufmstar_torch.kernels.fuse_cpu import WORK, append, floored, fuse_pairs
 from ufmstar_torch.kernels.rigid_cpu import FIELDS, gather, move, padded, relative, turn
 from ufmstar_torch.kernels.segment_image_cpu import write_gaussians
-from ufmstar_torch.kernels.visibility_cpu import GROUP, reached
 
 
 @kernel
@@ -30,8 +29,8 @@ def describe(fit, rounded, near, focal, widening, epsilon, mean, covariance, wei
 
 
 @kernel
-def match(camera, started, first_before, first, mixture, segments, size, thresholds, reach):
-    """Step 3 of a stream: what the frame can reach of M_(i-1) [K] in the camera frame, and its pairs with C_i [C].
+def match(camera, started, first_before, first, mixture, segments, size, thresholds):
+    """Step 3 of a stream: M_(i-1) [K] in the camera frame, and its pairs with C_i [C].
 
     Args:
         camera: whether the frame has no fault, camera-to-world [4, 4] and intrinsics [3, 3].
@@ -40,12 +39,11 @@ def match(camera, started, first_before, first, mixture, segments, size, thresho
         mixture, segments: mean, covariance and weight.
         size: H, W of the image.
         thresholds: of :func:`matches`: eta, eta_occl, near plane, widening.
-        reach: prior weight and epsilon of :func:`reached`.
 
     Returns:
         The pairs c [P], k [P] and their overlap [P]; which segments are new [C]; how many segments there are, how many
-        of them are matched, how many new, and how many components the mixture had; the slots within reach [n], to
-        which k refers; and these by field [13, n + C and more], with room for what is new.
+        of them are matched, how many new; the n occupied slots, which are the first ones; and these by field
+        [13, n and more].
     """
     fine, present, K = camera
     mean, covariance, weight = mixture
@@ -53,20 +51,15 @@ def match(camera, started, first_before, first, mixture, segments, size, thresho
     for i in range(4):
         for j in range(4):
             first[i, j] = present[i, j] if fine and not started else first_before[i, j]
-    motion, near = empty((3, 4), np.float64), empty(weight.size, np.int64)
+    motion, n = empty((3, 4), np.float64), 0
     relative(first, present, motion)
-    n, occupied = reached(
-        motion, mean, covariance, weight, K, size, reach[0], reach[1], weight_c.size, near,
-        empty((FIELDS, GROUP), np.float64), empty(GROUP, np.float64), empty((6, 4), np.float64),
-    )  # fmt: skip
-    here = empty((FIELDS, padded(n + weight_c.size)), np.float64)
+    while n < weight.size and weight[n] > 0:
+        n += 1
+    here = empty((FIELDS, padded(n)), np.float64)
     segments_here = empty((FIELDS, padded(weight_c.size)), np.float64)
-    gather(near, 0, n, mean, covariance, weight, here)
-    turn(motion, padded(n), here.shape[1], here)
-    everyone = empty(weight_c.size, np.int64)
-    for i in range(everyone.size):
-        everyone[i] = i
-    gather(everyone, 0, weight_c.size, mean_c, cov_c, weight_c, segments_here)
+    gather(n, mean, covariance, weight, here)
+    turn(motion, here.shape[1], here.shape[1], here)
+    gather(weight_c.size, mean_c, cov_c, weight_c, segments_here)
     c, k, overlap = matches(here, n, segments_here, weight_c.size, K, size[0], size[1], thresholds)
     new, found, matched, created = empty(weight_c.size, np.bool_), 0, 0, 0
     for i in range(new.size):
@@ -79,13 +72,13 @@ def match(camera, started, first_before, first, mixture, segments, size, thresho
         # A Gaussian nearer than the near plane could never be matched again: it is not appended.
         new[i] = new[i] and weight_c[i] > 0 and mean_c[i, 2] > thresholds[2]
         created += new[i]
-    return c, k, overlap, new, found, matched, created, occupied, near[:n], here
+    return c, k, overlap, new, found, matched, created, n, here
 
 
 @kernel
-def join(present, first, slots, segments, pairs, distance, new, occupied, near, here, settings, extra):
-    """Step 4 of a stream: the mixture with the pairs fused and what is new appended, and what of it is within reach as
-    the regression takes it, in the camera frame.
+def join(present, first, slots, segments, pairs, distance, new, occupied, settings, extra):
+    """Step 4 of a stream: the mixture with the pairs fused and what is new appended, and all of it as the
+    regression takes it, in the camera frame.
 
     Args:
         present, first: camera-to-world [4, 4].
@@ -94,15 +87,12 @@ def join(present, first, slots, segments, pairs, distance, new, occupied, near, 
         pairs: c, k and overlap [P].
         distance: as :func:`fuse_pairs`.
         new: [C] which segments to append, from slot ``occupied`` on.
-        near, here: the slots within reach [n], and they by field [13, n + C and more], as :func:`match` returns them;
-            what has changed of the latter is written, and what is new behind it.
         settings: ``weighted`` and ``epsilon`` as :func:`fuse_pairs`.
         extra: features of the regression behind the mixture's own. The last one is that of
             ``unmeasured.before_regression``, the others are unset.
 
     Returns:
-        The slots within reach [n], with those of the new components, their disagreement [n] and features [n, F] for the
-        regression, and how many components the mixture has.
+        The n components by field [13, n and more], their disagreement [n] and features [n, F] for the regression.
     """
     mean, covariance, weight, disagreement, count, features = slots
     mean_c, cov_c, weight_c, features_c = segments
@@ -112,31 +102,20 @@ def join(present, first, slots, segments, pairs, distance, new, occupied, near, 
     relative(present, first, motion)
     move(motion, mean_c, cov_c, weight_c, moved, turned, work[0])
     fuse_pairs(
-        mean, covariance, weight, disagreement, count, features, moved, turned, weight_c, features_c, c, k, near,
+        mean, covariance, weight, disagreement, count, features, moved, turned, weight_c, features_c, c, k,
         overlap, distance, settings[0], settings[1], work,
     )  # fmt: skip
-    components = append(
+    n = append(
         mean, covariance, weight, disagreement, count, features, moved, turned, weight_c, features_c, new, occupied
     )
-    n, old = near.size + components - occupied, near.size
-    slots_near, columns = empty(n, np.int64), empty(k.size + n - old, np.int64)
-    changed_slots, changed = empty(columns.size, np.int64), empty((FIELDS, padded(columns.size)), np.float64)
-    for i in range(n):
-        slots_near[i] = near[i] if i < old else occupied + i - old
-    for i in range(columns.size):  # of what has changed, then of what is new
-        columns[i] = k[i] if i < k.size else old + i - k.size
-        changed_slots[i] = slots_near[columns[i]]
+    here = empty((FIELDS, padded(n)), np.float64)
+    gather(n, mean, covariance, weight, here)
     relative(first, present, motion)
-    gather(changed_slots, 0, columns.size, mean, covariance, weight, changed)
-    turn(motion, changed.shape[1], changed.shape[1], changed)
-    for field in range(FIELDS):
-        for i in range(columns.size):
-            here[field, columns[i]] = changed[field, i]
+    turn(motion, here.shape[1], here.shape[1], here)
     m, more = empty(n, np.float64), empty((n, features.shape[1] + extra), np.float64)
     for i in range(n):
-        slot = slots_near[i]
-        m[i] = disagreement[slot]
+        m[i] = disagreement[i]
         for f in range(features.shape[1]):
-            more[i, f] = features[slot, f]
-        more[i, more.shape[1] - 1] = 1.0 if count[slot] > 1 else 0.0
-    return slots_near, m, more, components
+            more[i, f] = features[i, f]
+        more[i, more.shape[1] - 1] = 1.0 if count[i] > 1 else 0.0
+    return here, m, more

@@ -72,20 +72,6 @@ class Lanes:
         """The quotient."""
         return self._new(self._builder.fdiv(self.value, by.value))
 
-    def root(self) -> Lanes:
-        """The square root."""
-        kind = self.value.type
-        name = f"llvm.sqrt.v{kind.count}f{64 if isinstance(kind.element, ir.DoubleType) else 32}"
-        sqrt = cgutils.get_or_insert_function(self._builder.module, ir.FunctionType(kind, [kind]), name)
-        return self._new(self._builder.call(sqrt, [self.value]))
-
-    def log2_above(self) -> Lanes:
-        """An upper bound of log2 of positive doubles, at most .0862 above it: their bits, read as an integer, are a
-        straight line between powers of two."""
-        b, count = self._builder, self.value.type.count
-        bits = b.bitcast(self.value, ir.VectorType(ir.IntType(64), count))
-        return self._new(b.sitofp(bits, self.value.type)) * 2.0**-52 + (0.0861 - 1023)
-
     def everywhere(self, choose: Callable[[Lanes, Lanes], Lanes]) -> Lanes:
         """The least or greatest number (``Lanes.at_most``, ``Lanes.at_least``) in all places."""
         value, n = self, self.value.type.count
