@@ -311,7 +311,7 @@ def test_fastdepth_on_a_real_sequence(tmp_path):
     sequence = require_shared("data/rgbd_dataset_freiburg1_xyz")
     weights = require_shared("weights/fastdepth_nyu.onnx")
     command = [sys.executable, "-m", "ufmstar_torch.cli", "run", sequence, "--model", "fastdepth", "--weights", weights]
-    command += ["--frames", "0:3", "--threads", "1", "--out", tmp_path / "out"]
+    command += ["--frames", "0:3", "--distortion", "none", "--threads", "1", "--out", tmp_path / "out"]
     done = subprocess.run([str(word) for word in command], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
