@@ -125,7 +125,7 @@ class Metric(nn.Module):
 
 @pytest.mark.parametrize("around", ["wrapped", "declared", "ensemble", "lazy", "samples", "batched", "aligned"])
 def test_the_intrinsics_pass_through_every_wrapper(image: Tensor, around: str) -> None:
-    """Whatever contains a network that takes intrinsics takes them as well and passes them on, in single precision."""
+    """Every wrapper takes the intrinsics and passes them on, in single precision."""
     inner: DepthNetwork = wrap_network(Metric())
     networks: dict[str, Callable[[], DepthNetwork]] = {
         "wrapped": lambda: inner,
@@ -197,3 +197,6 @@ def test_fastdepth_from_a_checkpoint(tmp_path: Path, suffix: str, folded: bool) 
     x = network.preprocess.apply_image(torch.rand(1, 3, 300, 400))
     with torch.inference_mode():
         assert torch.equal(network(x).depth, source(x).depth)
+    save_checkpoint(path, {"a": torch.zeros(1)})
+    with pytest.raises(ValueError, match=rf"w.{suffix}: not the weights of a FastDepth"):
+        load_network("fastdepth", path)

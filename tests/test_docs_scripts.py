@@ -100,3 +100,22 @@ def test_the_table_of_confidences(script: Any, capsys: pytest.CaptureFixture[str
     }
     assert len(rows) == 14
     assert rows["dense: random"] == rows["dense: today"] != rows["dense: A, in metres"]
+
+
+def test_distances_of_clouds(script: Any, tmp_path: Path) -> None:
+    """A plane 3 cm before the truth's, as exported clouds are written; a tenth of its points is 50 cm off."""
+    from ufmstar_torch.eval.run.gaussians import vertex_table, write_ply
+
+    plane = np.stack([*np.meshgrid(np.arange(20) / 100, np.arange(20) / 100), np.ones((20, 20))], -1).reshape(-1, 3)
+    moved = plane + np.array([0, 0, 0.03])
+    moved[:36] += [0, 0, 0.5]
+    for name, points in (("truth", plane), ("cloud", moved)):
+        table = vertex_table(dict.fromkeys(("x", "y", "z", "sigma"), "<f4"), points, np.ones((400, 1)))
+        write_ply(tmp_path / f"{name}.ply", table, "x y z sigma [m]")
+    clouds = script("measure_clouds")
+    read = [clouds.read_points(tmp_path / f"{name}.ply") for name in ("cloud", "truth")]
+    np.testing.assert_allclose(read[0], moved, atol=1e-6)
+    median, most, back = clouds.distances(*read)
+    assert median == pytest.approx(3, abs=1e-3)
+    assert most == pytest.approx(3, abs=1e-3)
+    assert back == pytest.approx(3, abs=0.5)

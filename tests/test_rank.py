@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import math
 
@@ -111,6 +112,21 @@ def test_a_pool_of_two_sequences(ufmstar, tmp_path, weights):
     assert json.loads((tmp_path / "out" / "rank.json").read_text())["settings"]["by"] == "total"
     assert np.isfinite([float(row["aleatoric_median_m2"]) for row in rows]).all()
     assert ufmstar(*words)[0] == 2, "an earlier ranking is not overwritten"
+
+
+def test_a_ranking_that_fails_is_no_earlier_one(ufmstar, tmp_path, weights, monkeypatch):
+    """Where the disk is full at its last file, rank.json does not state that there is a ranking."""
+    words = ("rank", TOURS[0], "--depth", "self", "--measured", "0", "--out", tmp_path / "out")
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device", "contact_sheet.png")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("ufmstar_torch.eval.run.panels.contact_sheet", full)
+        code, _, err = ufmstar(*words)
+    assert code == 1
+    assert "No space left on device: 'contact_sheet.png'" in err
+    assert ufmstar(*words)[0] == 0
 
 
 def test_scores_are_those_of_mean_uncertainty(ufmstar, tmp_path):

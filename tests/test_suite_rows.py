@@ -121,8 +121,8 @@ def test_a_choice_as_it_is_typed():
     choice = NetworkChoice.parse("ensemble=trained:a/m0.safetensors,m1.safetensors#3")
     assert (choice.base, choice.model) == ("ensemble", "trained")
     assert (choice.weights, choice.spec) == (("a/m0.safetensors", "m1.safetensors#3"), None)
-    with_spec = NetworkChoice.parse("depth_only=onnx:net.onnx,spec.json", "My network")
-    assert (with_spec.weights, with_spec.spec, with_spec.label) == (("net.onnx",), "spec.json", "My network")
+    with_spec = NetworkChoice.parse("depth_only=onnx:net.onnx,spec.json")
+    assert (with_spec.weights, with_spec.spec) == (("net.onnx",), "spec.json")
     assert NetworkChoice.parse("depth_only=ground-truth:48x64").size == (48, 64)
     assert NetworkChoice.parse("depth_only=ground-truth").size is None
 

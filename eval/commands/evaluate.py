@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -141,6 +140,8 @@ class EvalOptions:
                 raise ValueError(f"--{name} must be at least {least}, got {values[name]}")
         if self.output.resume and self.output.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
+        if self.shard and self.output.overwrite:
+            raise ValueError("--overwrite goes without shards: another one may have begun")
 
 
 read = reader(EvalOptions, "ufmstar eval")
@@ -211,6 +212,7 @@ def _evaluate(options: EvalOptions) -> int:
     from ufmstar_torch import UfMStarConfig
     from ufmstar_torch.anchors.landmarks import DENSE
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.engine.progress import Progress
     from ufmstar_torch.eval.engine.warm_up import warm_up_command
     from ufmstar_torch.eval.methods.method import UFM_STAR
     from ufmstar_torch.eval.suite.shards import evaluate_suite
@@ -228,10 +230,15 @@ def _evaluate(options: EvalOptions) -> int:
                 anchors=AnchorConfig() if anchors != {""} else None,
                 posterior=PosteriorConfig() if any(row.setting.posterior for row in rows) else None,
             )
-            shown = partial(bars.frames, "kernels, compiled on the first run")
-            warm_up_command(config, torch.device("cpu"), shown, dense=DENSE in anchors)
+
+            def compiling(done: int, total: int) -> None:
+                bars.show(Progress("kernels", done, total))
+
+            warm_up_command(config, torch.device("cpu"), compiling, dense=DENSE in anchors)
         shard = Shard.parse(options.shard) if options.shard else None
-        outcome = evaluate_suite(job, shard=shard, **how, stop=stop, report=bars.say, progress=bars.frames)
+        if sys.stderr.isatty():
+            how["progress"] = bars.show
+        outcome = evaluate_suite(job, shard=shard, **how, stop=stop, report=bars.say)
     return _report(job, outcome, options)
 
 

@@ -13,14 +13,16 @@ if TYPE_CHECKING:
 
 
 class Bars:
-    """A progress bar for each stage of a run, or for each running sequence. Where standard error is no terminal, a line
-    at the start and the end of each stage instead."""
+    """A progress bar of the present stage of a run, or of the present sequence of an evaluation.
+
+    Where standard error is no terminal, it is a line at the start and the end of each stage instead.
+    """
 
     def __init__(self) -> None:
         self._bars: dict[str, Any] = {}
 
     def show(self, progress: Progress) -> None:
-        """Bring the bar of the stage up to date; those of earlier stages stay as they are."""
+        """Bring the bar of the stage up to date; the bar of an earlier stage goes."""
         from tqdm import tqdm
 
         stage = progress.stage
@@ -29,7 +31,7 @@ class Bars:
             first = progress.done if progress.components is None and stage == "frames" else 0
             unit = "frame" if stage == "frames" else "step"
             # None: no bar where standard error is no terminal
-            how = {"unit": unit, "dynamic_ncols": True, "disable": None}
+            how = {"unit": unit, "dynamic_ncols": True, "leave": False, "disable": None}
             bar = tqdm(total=progress.total, initial=first, desc=stage, **how)
             if bar.disable:
                 self.say(f"{stage}: {progress.done} of {progress.total}")
@@ -44,17 +46,6 @@ class Bars:
         bar.update(progress.done - bar.n)
         if bar.disable and progress.done == progress.total:
             self.say(f"{stage}: done, {progress.total} of {progress.total}")
-
-    def frames(self, label: str, done: int, total: int) -> None:
-        """Bring the bar of a sequence's frames up to date; it goes when they are done."""
-        from tqdm import tqdm
-
-        if label not in self._bars:
-            how = {"unit": "frame", "dynamic_ncols": True, "leave": False, "disable": None}
-            self._bars[label] = tqdm(total=total, desc=label, **how)
-        self._bars[label].update(done - self._bars[label].n)
-        if done == total:
-            self._bars.pop(label).close()
 
     def say(self, text: str) -> None:
         """Print a line without breaking the bar."""

@@ -44,7 +44,6 @@ class NetworkChoice:
     # weights, one or several files, in the order of the members: "FILE#2" is member 2 of a file of "trained" alone, a
     # file .json the spec that belongs to the weights; for "ground-truth" nothing, or "HxW".
     files: tuple[str, ...] = ()
-    label: str = ""  # as shown; "" = derived from the files
 
     def __post_init__(self) -> None:
         if self.base not in BASES:
@@ -66,13 +65,13 @@ class NetworkChoice:
             raise ValueError(f"{self.base}={self.model} takes one spec, got {self.files}")
 
     @classmethod
-    def parse(cls, text: str, label: str = "") -> NetworkChoice:
+    def parse(cls, text: str) -> NetworkChoice:
         """Parse ``BASE=MODEL:FILE[,FILE...]``. Raises ValueError: another form."""
         base, equals, rest = text.partition("=")
         model, _, files = rest.partition(":")
         if not (base and equals and model):
             raise ValueError(f"a network must be given as {_FORM}, got {text!r}")
-        return cls(base, model, tuple(file for file in files.split(",") if file), label)
+        return cls(base, model, tuple(file for file in files.split(",") if file))
 
     def with_spec(self, spec: str | None) -> NetworkChoice:
         """The choice with that spec, unless it has one, or needs none as the sequence's own depth."""
@@ -114,7 +113,7 @@ class NetworkChoice:
             FileNotFoundError, ValueError: as :func:`load_members`, or as ``check_members``.
         """
         if self.model == TRUTH:
-            return own_depth(self.size, *([self.label] if self.label else []))
+            return own_depth(self.size)
         try:
             members = load_members(self.model, self.weights, spec=self.spec, inference=inference, device=device)
         except ValueError as error:
@@ -123,8 +122,7 @@ class NetworkChoice:
         members = members if sampling else [without_sampling(member) for member in members]
         check_members(self.base, members, device)
         passes = samples if sampling else None
-        how: dict[str, Any] = {"label": self.label, "stored": True}
-        return _source(self.model, self.weights, self.spec, members, passes, inference, device, **how)
+        return _source(self.model, self.weights, self.spec, members, passes, inference, device, stored=True)
 
 
 def network_source(
@@ -170,7 +168,6 @@ def _source(
     inference: Inference,
     device: torch.device,
     *,
-    label: str = "",
     stored: bool = False,
     **more: Any,
 ) -> NetworkSource:
@@ -178,7 +175,7 @@ def _source(
     named = [(Path(path), member) for path, member in map(_path, files)]
     identity = {
         "model": model,
-        "label": label or _label(model, named[0][0], members[0]),
+        "label": _label(model, named[0][0], members[0]),
         "files": [{"name": path.name, "sha256": sha256(path), "member": member} for path, member in named],
         "spec": None if spec is None else sha256(Path(spec)),
         "members": len(members),

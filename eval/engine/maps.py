@@ -144,8 +144,8 @@ def _of_whole_image(file: Path, depth: np.ndarray, size: Size | None, K: np.ndar
         raise FrameError(file, f"{reason}whole image: give the intrinsics of the maps, --map-intrinsics") from error
 
 
-def own_depth(size: Size | None = None, label: str = "ground truth") -> MapSource:
-    """The sequence's own depth as the prediction: UfM* on perfect depth, the method's floor. ``size``, ``label``: see
+def own_depth(size: Size | None = None) -> MapSource:
+    """The sequence's own depth as the prediction: UfM* on perfect depth, the method's floor. ``size``: see
     :class:`MapSource`."""
 
     def read(frame: Frame) -> Maps:
@@ -153,6 +153,6 @@ def own_depth(size: Size | None = None, label: str = "ground truth") -> MapSourc
             raise FrameError(frame.name, "no depth map")
         return frame.depth, None, depth_camera(frame)
 
-    identity = {"model": TRUTH, "label": label, "size": size}
+    identity = {"model": TRUTH, "label": "ground truth", "size": size}
     digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
-    return MapSource(read, identity, size=size, is_truth=True, label=label, digest=digest)
+    return MapSource(read, identity, size=size, is_truth=True, label="ground truth", digest=digest)

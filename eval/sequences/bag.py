@@ -8,7 +8,7 @@ Messages are of ROS's own types, so that no definition in the file is compiled.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,6 +42,10 @@ _BROKEN = (
     *(OSError, EOFError, LookupError, AssertionError, ArithmeticError, AttributeError, RuntimeError, TypeError),
     *(ValueError, MemoryError, struct.error),
 )
+
+
+def _module(name: str) -> Any:
+    return optional(name, "ROS bags need rosbags", "'ufmstar-torch[recordings]'")
 
 
 class Place(NamedTuple):
@@ -93,9 +97,8 @@ class Bag:
 
     def _open(self) -> Any:
         if self._reader is None:
-            how = ("ROS bags need rosbags", "'ufmstar-torch[recordings]'")
-            stores, ros1 = optional("rosbags.typesys", *how), self.path.suffix == ".bag"
-            reader = optional("rosbags.rosbag1" if ros1 else "rosbags.rosbag2", *how).Reader(self.path)
+            stores, ros1 = _module("rosbags.typesys"), self.path.suffix == ".bag"
+            reader = _module("rosbags.rosbag1" if ros1 else "rosbags.rosbag2").Reader(self.path)
             reader.open()
             self._store = stores.get_typestore(stores.Stores.ROS1_NOETIC if ros1 else stores.Stores.ROS2_HUMBLE)
             if ros1:  # ROS 1's types in rosbags have no tf
@@ -105,10 +108,9 @@ class Bag:
         return self._reader
 
     def _errors(self) -> tuple[type[Exception], ...]:
-        how = ("ROS bags need rosbags", "'ufmstar-torch[recordings]'")
-        own = [optional(f"rosbags.{name}", *how).ReaderError for name in ("rosbag1", "rosbag2")]
-        zstd, sqlite = optional("rosbags.rosbag2.storage_mcap", *how).zstd, optional("apsw", *how)
-        return (*own, optional("rosbags.serde", *how).SerdeError, zstd.ZstdError, sqlite.Error, *_BROKEN)
+        own = [_module(f"rosbags.{name}").ReaderError for name in ("rosbag1", "rosbag2")]
+        zstd = _module("rosbags.rosbag2.storage_mcap").zstd
+        return (*own, _module("rosbags.serde").SerdeError, zstd.ZstdError, _module("apsw").Error, *_BROKEN)
 
     def _broken(self, error: Exception) -> FrameError:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
@@ -165,31 +167,26 @@ def read(path: Path, options: Options) -> FrameSequence:
     for number, place in enumerate(content.images):
         load_depth = None
         if number in paired:
-            load_depth = partial(_depth, bag, content.depths[paired[number]], options.depth_scale)
+            load_depth = partial(_decoded, ros.depth, bag, content.depths[paired[number]], options.depth_scale)
         time = float(stamps[number])
         T = content.pose(time + options.time_offset, options.max_pose_gap) if options.trajectory is None else UNKNOWN
         name = f"{number:06d}"
         if T is None:
             entries.append(Skipped(name, f"no pose within {options.max_pose_gap:g} s around the image"))
         else:
-            entries.append(Entry(name, T, partial(_colour, bag, place), load_depth, time))
+            entries.append(Entry(name, T, partial(_decoded, ros.colour, bag, place), load_depth, time))
     lens = content.lens or _sized(bag, content.images)
-    lenses = dict.fromkeys((entry.name for entry in entries), lens)
-    return sequence_of_lenses(path.resolve().stem, "bag", entries, lenses, path, options, times=stamps)
+    return sequence_of_lenses(path.resolve().stem, "bag", entries, lens, path, options, times=stamps)
 
 
-def _colour(bag: Bag, place: Place) -> np.ndarray:
-    return ros.colour(bag.read(place), bag.path)
-
-
-def _depth(bag: Bag, place: Place, scale: float | None) -> np.ndarray:
-    return ros.depth(bag.read(place), scale, bag.path)
+def _decoded(decode: Callable[..., np.ndarray], bag: Bag, place: Place, *how: Any) -> np.ndarray:
+    return decode(bag.read(place), *how, bag.path)
 
 
 def _sized(bag: Bag, images: list[Place]) -> Lens:
     """A camera of which the images' size alone is known, for ``options.intrinsics``."""
     for place in images:
-        height, width = _colour(bag, place).shape[:2]
+        height, width = _decoded(ros.colour, bag, place).shape[:2]
         return Lens((1.0, 1.0, width / 2, height / 2), (height, width))
     raise ValueError(f"{bag.path} holds no image")
 
@@ -268,7 +265,7 @@ class _Content:
         self.images: list[Place] = []
         self.depths: list[Place] = []
         self._stamps: dict[str, list[float]] = {topics.image: [], topics.depth: []}
-        self._tree, self._body, self._camera, samples = ros.FrameTree(), "", "", ros.Samples()
+        self._tree, self._body, self._camera, samples = ros.FrameTree(), "", "", list[ros.Sample]()
         tf = [name for name, kind in bag.topics.items() if kind == _TF]
         for place, message in bag.messages({*filter(None, topics[:4]), *tf}):
             if place.topic in tf:
@@ -276,7 +273,7 @@ class _Content:
                     self._tree.add(_stamp(transform, place), transform)
             elif place.topic == topics.pose:
                 pose = message.pose if message.__msgtype__ == _POSES[1] else message.pose.pose
-                samples.add(_stamp(message, place), pose.position, pose.orientation)
+                samples.append(ros.sample(_stamp(message, place), pose.position, pose.orientation))
                 self._body = ros.frame_name(getattr(message, "child_frame_id", ""))
             elif place.topic == topics.info:
                 self._add_lens(message)
@@ -286,7 +283,7 @@ class _Content:
                 if place.topic == topics.image:
                     self._camera = ros.frame_name(message.header.frame_id)
         self.image_stamps, self.depth_stamps = (np.array(self._stamps[name]) for name in (topics.image, topics.depth))
-        self._trajectory = samples.trajectory() if samples.stamps else None
+        self._trajectory = ros.trajectory(samples) if samples else None
         self._prepare()
 
     def _add_lens(self, message: Any) -> None:

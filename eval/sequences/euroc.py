@@ -57,9 +57,8 @@ def read(path: Path, options: Options) -> FrameSequence:
     if options.trajectory is None and frames:
         frames = attach(frames, stamps + options.time_offset, _trajectory(folder), options)
     lens = _lens(folder / "sensor.yaml", first_image_size(folder / "data" / words[-1] for words, _ in rows))
-    lenses = dict.fromkeys((frame.name for frame in frames), lens)
     name = folder.parent.parent.resolve().name if folder.parent.name == "mav0" else folder.resolve().name
-    return sequence_of_lenses(name, "euroc", frames, lenses, path, options, times=stamps)
+    return sequence_of_lenses(name, "euroc", frames, lens, path, options, times=stamps)
 
 
 def _camera_folder(path: Path) -> Path | None:

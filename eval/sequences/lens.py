@@ -117,7 +117,7 @@ def sequence_of_lenses(
     name: str,
     layout: str,
     frames: Sequence[Entry | Skipped],
-    lenses: Mapping[str, Lens],
+    lenses: Lens | Mapping[str, Lens],
     root: Path,
     options: Options,
     *,
@@ -129,7 +129,7 @@ def sequence_of_lenses(
     Args:
         name, layout: of the sequence.
         frames: all on disk, in order.
-        lenses: of the entries' images, by frame name. ``options.intrinsics`` replaces them by a pinhole camera.
+        lenses: of the entries' images, one or by frame name. ``options.intrinsics`` replaces them by a pinhole camera.
         root: its folder, for ``options.trajectory``.
         options: of the user.
         times: [N] of the frames [s], for a trajectory; None = not known.
@@ -138,6 +138,8 @@ def sequence_of_lenses(
     Raises:
         FileNotFoundError, ValueError: see ``attach_given`` and ``make_sequence``.
     """
+    if isinstance(lenses, Lens):
+        lenses = dict.fromkeys((frame.name for frame in frames), lenses)
     if options.intrinsics is not None:
         K = read_intrinsics(options.intrinsics)
         lenses = {key: Lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), lens.size) for key, lens in lenses.items()}

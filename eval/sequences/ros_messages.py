@@ -7,7 +7,7 @@ REP 103: an image's ``header.frame_id`` names the optical frame, x right, y down
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -132,29 +132,25 @@ def frame_name(text: str) -> str:
     return text.lstrip("/")
 
 
-class Samples:
-    """Poses of one frame in another, as they are read; ``add`` and then ``trajectory``."""
+Sample = tuple[float, ...]  # stamp [s], x y z [m], qx qy qz qw
 
-    def __init__(self) -> None:
-        self.stamps: list[float] = []
-        self.values: list[tuple[float, ...]] = []
 
-    def add(self, stamp: float, position: Any, rotation: Any) -> None:
-        """A pose at ``stamp`` [s], of a message's position [m] and quaternion."""
-        self.stamps.append(stamp)
-        at, q = position, rotation
-        self.values.append((at.x, at.y, at.z, q.x, q.y, q.z, q.w))
+def sample(stamp: float, position: Any, rotation: Any) -> Sample:
+    """A pose at ``stamp`` [s], of a message's position and quaternion."""
+    at, q = position, rotation
+    return (stamp, at.x, at.y, at.z, q.x, q.y, q.z, q.w)
 
-    def trajectory(self) -> Trajectory:
-        """In the order of time, one of each; NaN where the quaternion is none."""
-        stamps, first = np.unique(np.array(self.stamps), return_index=True)
-        values = np.array(self.values, dtype=np.float64)[first]
-        norm = np.linalg.norm(values[:, 3:], axis=1)
-        usable = np.isfinite(values).all(axis=1) & (np.abs(norm - 1) < _NORM_TOLERANCE)
-        T = np.full((len(stamps), 4, 4), np.nan)
-        if usable.any():
-            T[usable] = poses_from_quaternions(values[usable, :3], values[usable, 3:])
-        return Trajectory(stamps, T)
+
+def trajectory(samples: Sequence[Sample]) -> Trajectory:
+    """Poses of one frame in another in the order of time, one of each; NaN where the quaternion is none."""
+    values = np.array(samples, dtype=np.float64)
+    stamps, first = np.unique(values[:, 0], return_index=True)
+    values = values[first, 1:]
+    usable = np.isfinite(values).all(axis=1) & (np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1) < _NORM_TOLERANCE)
+    T = np.full((len(stamps), 4, 4), np.nan)
+    if usable.any():
+        T[usable] = poses_from_quaternions(values[usable, :3], values[usable, 3:])
+    return Trajectory(stamps, T)
 
 
 class FrameTree:
@@ -162,7 +158,7 @@ class FrameTree:
 
     def __init__(self) -> None:
         self._parents: dict[str, str] = {}
-        self._samples: dict[str, Samples] = {}
+        self._samples: dict[str, list[Sample]] = {}
         self._edges: dict[str, Trajectory] = {}
 
     def add(self, stamp: float, transform: Any) -> None:
@@ -171,7 +167,7 @@ class FrameTree:
         if self._parents.setdefault(child, parent) != parent:
             raise ValueError(f"tf: frame {child!r} has the parents {self._parents[child]!r} and {parent!r}")
         motion = transform.transform
-        self._samples.setdefault(child, Samples()).add(stamp, motion.translation, motion.rotation)
+        self._samples.setdefault(child, []).append(sample(stamp, motion.translation, motion.rotation))
 
     def chain(self, frame: str) -> list[str]:
         """The frame, its parent, ... up to the root. Raises ValueError: a loop."""
@@ -213,7 +209,7 @@ class FrameTree:
     def _edge(self, child: str) -> Trajectory:
         """A frame's poses in its parent: one, where it does not move."""
         if child not in self._edges:
-            edge = self._samples[child].trajectory() if child in self._samples else Trajectory(None, np.eye(4)[None])
+            edge = trajectory(self._samples[child]) if child in self._samples else Trajectory(None, np.eye(4)[None])
             if not (np.abs(edge.T_world_cam - edge.T_world_cam[0]) > _STILL).any():
                 edge = Trajectory(None, edge.T_world_cam[:1])
             self._edges[child] = edge

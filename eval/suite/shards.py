@@ -14,7 +14,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -36,7 +36,7 @@ KILLED = "a process was killed (for want of memory?), which ends the others too"
 
 Stop = Callable[[], bool]
 Report = Callable[[str], None]
-Frames = Callable[[str, int, int], None]
+Shown = Callable[[Progress], object]
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def evaluate_suite(
     overwrite: bool = False,
     stop: Stop = lambda: False,
     report: Report = lambda _: None,
-    progress: Frames = lambda *_: None,
+    progress: Shown = lambda _: None,
     evaluate: Evaluate = evaluate_sequence,
 ) -> EvalOutcome:
     """Evaluate the sequences of a shard.
@@ -73,8 +73,7 @@ def evaluate_suite(
             several resumes what the first one has begun.
         stop: called before every frame; True ends the work.
         report: receives a line for every finished sequence; that of several processes goes to standard error.
-        progress: receives a sequence's label, its number of finished frames, and the number of all of them; one process
-            alone.
+        progress: called after every frame, with the sequence's label as the stage; one process alone.
         evaluate: see :func:`evaluate_item`; one process alone.
 
     Raises:
@@ -160,7 +159,7 @@ def _evaluate(
     how: Mapping[str, Any],
     stop: Stop,
     report: Report,
-    progress: Frames = lambda *_: None,
+    progress: Shown = lambda _: None,
     evaluate: Evaluate = evaluate_sequence,
 ) -> bool:
     """Evaluate one sequence of a shard after another in this process; whether all were done."""
@@ -176,7 +175,7 @@ def _evaluate(
                     return False
 
                 def shown(now: Progress, label: str = item.label) -> None:
-                    progress(label, now.done, now.total)
+                    progress(replace(now, stage=label))
 
                 if line := evaluate_item(job, item, judge, stop=stop, progress=shown, evaluate=evaluate):
                     report(line)

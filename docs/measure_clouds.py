@@ -1,0 +1,43 @@
+"""Distances between exported clouds and the ground truth's, for docs/results/accuracy.md:
+``python docs/measure_clouds.py truth/export/cloud.ply out/export/cloud.ply ...``.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+_KINDS = {"float": "<f4", "uchar": "|u1"}
+
+
+def read_points(path: Path) -> NDArray[np.float64]:
+    """[P, 3] the points of a cloud of ``ufmstar export`` [m]."""
+    head, body = path.read_bytes().split(b"end_header\n", 1)
+    properties = [line.split()[1:] for line in head.decode().splitlines() if line.startswith("property")]
+    table = np.frombuffer(body, [(name, _KINDS[kind]) for kind, name in properties])
+    return np.stack([table[axis] for axis in "xyz"], axis=-1).astype(np.float64)
+
+
+def distances(cloud: NDArray[np.float64], truth: NDArray[np.float64]) -> tuple[float, float, float]:
+    """[cm] median and 90 % quantile from the cloud's points to the nearest of the truth, and the median back."""
+    to_truth, back = cKDTree(truth).query(cloud)[0], cKDTree(cloud).query(truth)[0]
+    median, most = np.quantile(to_truth, [0.5, 0.9])
+    return 100 * float(median), 100 * float(most), 100 * float(np.median(back))
+
+
+def main(words: Sequence[str]) -> None:
+    truth = read_points(Path(words[0]))
+    print("| cloud | points | median [cm] | 90 % [cm] | median from the truth [cm] |\n|---|---|---|---|---|")
+    for word in words[1:]:
+        cloud = read_points(Path(word))
+        median, most, back = distances(cloud, truth)
+        print(f"| {word} | {len(cloud):,} | {median:.1f} | {most:.1f} | {back:.1f} |")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
