@@ -60,6 +60,7 @@ class DenseConfig(Checked):
         rival: a match is unique where the best other one has this many times its 1 - ZNCC at least.
         sigmas: standard deviations by which measurements may differ, and half width of the search in them.
         match_noise: variance of a match, over that which its residual would make of independent pixels.
+        coarse_noise: the same factor again for windows of twice the width, which surfaces without fine texture need.
         min_share: least share of the pixels with a match on which the views agree. Where fewer do, poses and images
             contradict each other, and none is used.
         memory: share of the running estimates that remains after a frame.
@@ -79,6 +80,7 @@ class DenseConfig(Checked):
     rival: float = number(1.5, "", "1", 1)
     sigmas: float = number(3.5, "", "1", 0, open_low=True)
     match_noise: float = number(1.0, "", "1", 0, open_low=True)
+    coarse_noise: float = number(4.0, "", "1", 0, open_low=True)
     min_share: float = number(0.2, "", "1", 0, 1)
     memory: float = number(0.8, "", "1", 0, 1, open_high=True)
 
@@ -215,15 +217,38 @@ class DenseEvidence(SavedState):
             step = (1 - self.config.memory) * np.log(np.median(1 / rho[kept]) / self._depth)
             self._depth *= float(np.exp(step))
         shared = self._tracker.shared(max(self._baseline, self._tracker.baseline))
-        stated = variance[kept] + self._memory.apart * np.square(rho[kept]) + shared
-        surface, alone = check_anchors(small, pixel[kept], rho[kept], stated, cell)
+        pixel, rho, variance = pixel[kept], rho[kept], variance[kept]
+        if searched and trusted:
+            coarse = self._coarse(small, pixel, views, cell)
+            pixel, rho, variance = (np.concatenate(pair) for pair in zip((pixel, rho, variance), coarse, strict=True))
+        stated = variance + self._memory.apart * np.square(rho) + shared
+        surface, alone = check_anchors(small, pixel, rho, stated, cell)
         far = self._apart(corners, surface, small.shape[1]) if trusted else np.zeros(0, np.int64)
-        depth = np.concatenate([1 / rho[kept], corners.depth[far]])
-        spread = np.concatenate([(stated + alone) * depth[: len(kept)] ** 4, corners.variance[far]])
+        depth = np.concatenate([1 / rho, corners.depth[far]])
+        spread = np.concatenate([(stated + alone) * depth[: len(rho)] ** 4, corners.variance[far]])
         position = (np.concatenate([surface, corners.pixel[far]]) - scale[:2, 2]) / scale.diagonal()[:2]
         none = corners.none if corners.contradicted else Landmarks.none
         judged = corners.pose_error, shared, corners.contradicted
         return Landmarks(position, depth, spread, searched + known, none, *judged)
+
+    def _coarse(
+        self, small: NDArray[np.uint8], taken: NDArray[np.float64], views: Views, cell: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Pixels [M, 2], inverse depths and variances [M] in the cells without a pixel of ``taken`` [N, 2], by windows
+        of twice the width: images and views of half the size."""
+        from ufmstar_torch.kernels.dense_cpu import Views, measure
+
+        half = _halved(small)
+        S = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
+        H, images = S @ views.H @ np.linalg.inv(S), np.stack([_halved(image) for image in views.image])
+        reduced = Views(images, np.ascontiguousarray(H), np.ascontiguousarray(views.b @ S.T), views.noise / 4)
+        taken = (taken - 0.5) / 2
+        inside = ((taken >= 0) & (taken < half.shape[::-1])).all(1)
+        pixel = _pixels(half, cell // 2, taken[inside])
+        found = measure(half, pixel, reduced, self._search())
+        variance = self.config.coarse_noise * found.variance + np.square(_SCALE * found.rho)
+        fine = (found.agreed >= _AGREE) & (found.contradicted == 0) & (found.rho > np.sqrt(variance))
+        return 2 * pixel[fine] + 0.5, found.rho[fine], variance[fine]
 
     def _apart(self, corners: Landmarks, taken: NDArray[np.float64], width: int) -> NDArray[np.int64]:
         """Indices of the corners that become anchors: certain ones, away from the ``taken`` positions [N, 2]."""
@@ -269,6 +294,13 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
     along, down = size[0] / gray.shape[1], size[1] / gray.shape[0]
     scale = np.array([[along, 0, 0.5 * along - 0.5], [0, down, 0.5 * down - 0.5], [0, 0, 1]])
     return np.asarray(small, dtype=np.uint8), scale
+
+
+def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Means of two by two pixels; an odd last row or column is left out."""
+    height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    quarters = image[:height, :width].reshape(height // 2, 2, width // 2, 2).astype(np.uint16)
+    return np.asarray((quarters.sum((1, 3)) + 2) // 4, dtype=np.uint8)
 
 
 def _cell(width: int) -> int:
