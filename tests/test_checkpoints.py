@@ -73,7 +73,7 @@ def test_other_programs_read_weights_and_metadata(tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("new", [True, False])
 def test_what_wrappers_add_is_taken_off(tmp_path: Path, wrap: Callable[[dict[str, Tensor]], Any], new: bool) -> None:
-    """In files of today, and in those from before torch 1.6."""
+    """The file may be of today or from before torch 1.6."""
     source, target = Small(), Small()
     torch.save(wrap(dict(source.state_dict())), tmp_path / "w.pth", _use_new_zipfile_serialization=new)
     assert same(load_state_dict_file(tmp_path / "w.pth"), source.state_dict())
@@ -111,7 +111,7 @@ def test_metadata_nested_too_deeply_names_the_file(tmp_path: Path) -> None:
 @given(data=st.data())
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_cut_off_files_are_named(tmp_path: Path, name: str, data: st.DataObject) -> None:
-    """Wherever a file ends early, the error is ours and says which file."""
+    """A file may end at any byte; the error names it."""
     save_checkpoint(tmp_path / name, Small())
     whole = (tmp_path / name).read_bytes()
     broken = tmp_path / f"broken_{name}"

@@ -75,7 +75,8 @@ def test_help_loads_nothing_beyond_the_package():
     assert done.stdout.splitlines()[-1] == "['ufmstar_torch'] False"
 
 
-# The words behind ``ufmstar run SEQUENCE --out OUT``, or a whole line, and what the message contains.
+NETWORK = "--model fastdepth --weights {path}/K.txt"
+# The words behind ``ufmstar run SEQUENCE --out OUT``, or a whole line, and a part of the message.
 MISTAKES = {
     "unknown command": ("ufmstar walk", "no command 'walk', there are demo, run, rank, eval,"),
     "no sequence": ("ufmstar run", "sequence"),
@@ -107,8 +108,33 @@ MISTAKES = {
     "threads": ("--depth self --threads 0", "--threads"),
     "threads without measure": ("--depth self --threads 10000", "--threads must be 1 to"),
     "contradiction": ("--depth self --resume --overwrite", "--resume and --overwrite contradict"),
-    "another command": ("ufmstar bench --frames x", "frames"),
     "report": ("ufmstar report", "out"),
+    "bench: kind": ("ufmstar bench --frames x", "frames"),
+    "bench: frames": ("ufmstar bench --frames 0", "--frames must be at least 1"),
+    "bench: history": ("ufmstar bench --history 0", "--history must be at least 1"),
+    "bench: sizes": ("ufmstar bench --sizes 100", "--sizes must be multiples of 32"),
+    "bench: weights": ("ufmstar bench --model onnx", "--model onnx needs --weights"),
+    "bench: device": ("ufmstar bench --device cuda:99", "--device cuda:99 is not available"),
+    "live: network": ("ufmstar live tour:3", "live needs a network"),
+    "live: camera": (f"ufmstar live 0 {NETWORK}", "0 needs --trajectory FILE"),
+    "live: folder": (f"ufmstar live images --follow --intrinsics 1 1 1 1 {NETWORK}", "images needs --trajectory FILE"),
+    "live: overwrite": (f"ufmstar live - --overwrite {NETWORK}", "--overwrite goes with --out"),
+    "live: drive": (f"ufmstar live - --drive 3 {NETWORK}", "--drive goes with recordings, not with -"),
+    "live: speed": (f"ufmstar live tour:3 --speed 0 {NETWORK}", "--speed must be positive"),
+    "live: scale": (f"ufmstar live tour:3 --scale-from network {NETWORK}", "--scale-from goes with ufmstar run"),
+    "live: anchors": (f"ufmstar live tour:3 --ufm.anchors.half_life 5 {NETWORK}", "needs --anchors"),
+    "live: layout": (f"ufmstar live {{path}}/images {NETWORK}", "has no known layout"),
+    "data: no command": ("ufmstar data", "the following arguments are required"),
+    "data: another command": ("ufmstar data mend x", "mend"),
+    "data: no folder": ("ufmstar data check /nowhere", "no such file or folder"),
+    "data: layout": ("ufmstar data check {path}/images", "has no known layout, and nothing below it has"),
+    "data: poses": ("ufmstar data check {path} --poses upside-down", "choose from 'camera-to-world'"),
+    "data: pairs": ("ufmstar data check {path} --pairs 0", "pairs must be at least 1"),
+    "data: intrinsics": (
+        "ufmstar data check {path} --intrinsics 1 2 3",
+        "--intrinsics must be a file, or the four numb",
+    ),
+    "export": ("ufmstar export {path} --to depth", "no output of `ufmstar run`"),
 }
 
 

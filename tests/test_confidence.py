@@ -15,7 +15,6 @@ from torch import nn
 from ufmstar_torch import (
     AnchorConfig,
     ConfidenceConfig,
-    DepthPrediction,
     UfMStar,
     UfMStarConfig,
     UncertainDepth,
@@ -66,7 +65,7 @@ def variances(config, unit, count=12, **how):
 
 
 def test_values_against_the_oracle():
-    """Over frames, from before the first anchor until it is used; V without the confidence is the plain module's."""
+    """Frames run from before the first anchor until it is used; V without the confidence is the plain module's."""
     state, plain = oracle.start(), variances(PLAIN, None, count=14)[0]
     maps, _ = variances(CONFIG, lambda sigma: 1 / (1 + sigma), count=14)
     for out, before, (depth, sigma, given, _, at) in zip(maps, plain, frames(14), strict=True):
@@ -111,7 +110,7 @@ def test_what_says_nothing_is_ignored(kind):
 
 
 def test_what_the_confidence_meant_is_forgotten():
-    """It is inverted in the middle: soon ignored, later used again the other way round."""
+    """A confidence that is inverted in the middle is soon ignored, and later used the other way round."""
     ufm, used = UfMStar(CONFIG), []
     for i, (depth, sigma, given, T, _) in enumerate(frames(60, dtype=torch.float32)):
         out = ufm(depth, T, K, anchors=given, confidence=sigma.float() if i < 20 else -sigma.float())
@@ -222,34 +221,7 @@ def test_the_commands_pass_it(tmp_path, capsys):
 
 
 class Tuple(nn.Module):
-    """As :class:`Stated`, without names."""
+    """Returns the values of :class:`Stated` without names."""
 
     def forward(self, x):
         return 1 + x.mean(1), x[:, 0]
-
-
-REFUSED = {
-    "a confidence as a spread": (
-        lambda: wrap_network(Stated(), "depth", aleatoric="conf", aleatoric_kind="confidence"), "declare it as conf"
-    ),
-    "a confidence of another size": (
-        lambda: DepthPrediction(torch.ones(1, 4, 4), confidence=torch.ones(1, 2, 2)), "confidence must have the depth's"
-    ),
-    "a confidence that is not used": (
-        lambda: UfMStar()(torch.ones(1, 4, 4), torch.eye(4), torch.eye(3), confidence=torch.ones(1, 4, 4)),
-        "confidence must be None where",
-    ),
-    "a section without anchors": (
-        lambda: UfMStarConfig(confidence=ConfidenceConfig()), "UfMStarConfig.confidence needs anchors"
-    ),
-    "whole numbers": (
-        lambda: UfMStar(CONFIG)(torch.ones(1, 4, 4), torch.eye(4), torch.eye(3), confidence=torch.ones(1, 4, 4).int()),
-        "confidence must have a floating-point",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("call", "message"), REFUSED.values(), ids=REFUSED)
-def test_refusals(call, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        call()

@@ -9,7 +9,7 @@ from modules import CONFIG, H, K, W, frame, same
 from PIL import Image
 from torch import nn
 
-from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import AnchorConfig, ConfidenceConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.models import Preprocess, wrap_network
 from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.recalibrate import Recalibration
@@ -138,6 +138,18 @@ REFUSED = {
     "a prediction of a list": (lambda: DepthPrediction([1.0]), TypeError, "depth must be a torch.Tensor or a NumPy"),
     "a variance of another size": (
         lambda: DepthPrediction(DEPTH, DEPTH[:, 1:]), ValueError, "aleatoric_variance must have the depth's shape"
+    ),
+    "a confidence of another size": (
+        lambda: DepthPrediction(DEPTH, confidence=DEPTH[:, 1:]), ValueError, "confidence must have the depth's"
+    ),
+    "a confidence that is not used": (
+        lambda: ufm(DEPTH, POSE, K, confidence=DEPTH), ValueError, "confidence must be None where"
+    ),
+    "a confidence in whole numbers": (
+        lambda: UfMStar(CONFIG.replace(anchors=AnchorConfig(), confidence=ConfidenceConfig()))(
+            DEPTH, POSE, K, confidence=DEPTH.int()
+        ),
+        TypeError, "confidence must have a floating-point",
     ),
     "a map without knots": (lambda: Recalibration((), ()), ValueError, "Recalibration needs knots"),
 }  # fmt: skip

@@ -167,22 +167,6 @@ def test_several_sequences_give_a_line_each(exported, tmp_path, capsys):
     assert reports[1]["checked"]["poses"] == "camera-to-world"
 
 
-def test_wrong_usage(tmp_path, exported, capsys):
-    for words, message in (
-        ((tmp_path / "absent",), "no such file or folder"),
-        ((tmp_path,), "has no known layout, and nothing below it has"),
-        ((exported, "--poses", "upside-down"), "choose from 'camera-to-world'"),
-        ((exported, "--pairs", 0), "pairs must be at least 1"),
-        ((exported, "--intrinsics", 1, 2, 3), "--intrinsics must be a file, or the four numbers"),
-    ):
-        code, out = command(capsys, *words)
-        assert code == 2
-        assert message in out
-    for words in (["data"], ["data", "mend", "x"], ["data", "check", "x", "--unknown"]):
-        assert main(words) == 2
-        assert capsys.readouterr().err.count("\n") == 1
-
-
 def test_no_depth_and_no_poses(tmp_path, capsys):
     path, _ = layouts.write_generic(tmp_path / "one", frames=3)
     shutil.rmtree(path / "depth")

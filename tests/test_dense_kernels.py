@@ -17,7 +17,7 @@ SEARCH = Search(start=0.5, low=-0.01, high=2.0, sigmas=3.5, least_score=0.85, ri
 
 
 def plane(seed, T, z=2.0, shape=(72, 96)):
-    """What a camera T [4, 4] sees of a textured plane at depth z of the world, uint8."""
+    """The image of a textured plane at depth z of the world, seen by a camera T [4, 4], uint8."""
     texture = gaussian_filter(np.random.default_rng(seed).standard_normal((400, 400)), 4)
     texture = 127 + 45 * texture / texture.std()
     v, u = np.mgrid[: shape[0], : shape[1]]
@@ -156,7 +156,7 @@ def test_a_landmark_is_sighted_where_it_projects_and_not_behind_something(scene)
 
 
 def test_a_search_along_the_last_row_reads_nothing_beyond_the_image():
-    """In Python, which checks bounds: compiled code would read what lies behind the image."""
+    """Python checks bounds; compiled code would read memory behind the image."""
     height, width = 12, 24
     key = np.random.default_rng(0).integers(0, 256, height * width, dtype=np.uint8)
     rows, scores, place = np.empty((2, 9), np.uint64), np.empty(9, np.float32), np.empty(4)

@@ -38,7 +38,7 @@ def lines(pixel, rho, views):
 
 
 def measured(pixel, rho, views, error, noise, rng):
-    """What a search finds where the poses and the camera are wrong by ``error`` [3, 10], with noise [px]."""
+    """The result of a search where the poses and the camera are wrong by ``error`` [3, 10], with noise [px]."""
     along, speed = lines(pixel, rho, views)
     off = np.zeros((*speed.shape, 2))
     for n, k in np.ndindex(speed.shape):

@@ -8,14 +8,10 @@ import random_gaussians
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from walks import SPGF
 
 import oracle
-import scenes
-from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.disagree import overlap_disagreement
 from ufmstar_torch.gaussian import wasserstein_squared
-from ufmstar_torch.ufmstar import UfMStar
 
 pytestmark = pytest.mark.numerics
 
@@ -93,14 +89,3 @@ def test_a_surface_seen_edge_on_stays_finite():
     squared = float(overlap_disagreement(*edge, *flat))
     assert 0 <= squared < 20**2
     np.testing.assert_allclose(squared, oracle.overlap_squared(*(x.numpy() for x in (*edge, *flat))), rtol=1e-9)
-
-
-def test_perfect_depth_has_a_far_lower_floor_than_w2():
-    depths, poses, K = scenes.sequence(20, 96, 128, 0.0)
-    mean = {}
-    for kind in ("w2", "overlap"):
-        ufm = UfMStar(UfMStarConfig(segment=SPGF, unmeasured="paper", disagreement=kind))
-        for depth, T in zip(depths, poses, strict=True):
-            output = ufm(torch.tensor(depth)[None], torch.tensor(T), torch.tensor(K))
-        mean[kind] = float(output.disagreement[output.valid].mean())
-    assert mean["overlap"] < 0.2 * mean["w2"], mean

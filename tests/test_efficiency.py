@@ -17,9 +17,7 @@ from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.bench.energy import CPU, GPU
 from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
-from ufmstar_torch.eval.bench.parts import MULTIVIEW, MultiviewStep, time_parts
-from ufmstar_torch.eval.engine.predictions import Predicted
-from ufmstar_torch.eval.sequences.images import image_tensor
+from ufmstar_torch.eval.bench.parts import MULTIVIEW, time_parts
 from ufmstar_torch.models.any_network import wrap_network
 from ufmstar_torch.models.preprocess import Preprocess
 
@@ -77,19 +75,6 @@ def test_stages_add_up_and_warm_up_is_not_counted(timed):
     for owner, part in (("ensemble", DEPTH), ("ensemble", ONCE), ("ensemble", EVERY), ("UfM-Ensemble", MULTIVIEW)):
         assert len(timed.ms(owner, part)) == 6, "less the warm-up"
     assert timed.ms("aleatoric", EVERY) == []  # nobody asked for it
-
-
-@pytest.mark.parametrize("anchors", ["tracked", "dense"])
-def test_rows_with_anchors_and_a_posterior_are_measured(sequence, anchors):
-    (one,) = rows_of("UfM*-Aleatoric", anchors=anchors, posterior=True)
-    aleatoric = {"aleatoric": TimedNetwork("aleatoric", [network()], "Linear")}
-    timed = parts_of([one], aleatoric, list(sequence)[:4], warm_up=1)
-    assert min(timed.ms(one.label, MULTIVIEW)) > 0
-    step, frame = MultiviewStep(one, torch.device("cpu")), sequence[0]
-    x, K = aleatoric["aleatoric"].prepare(frame, torch.device("cpu"))
-    prediction = aleatoric["aleatoric"].predict(ONCE, x, K)
-    answer = step(image_tensor(frame), frame, Predicted(prediction, K))
-    assert answer["depth"].shape == answer["variance"].shape == (1, *SIZE)
 
 
 LOG: list[float] = []

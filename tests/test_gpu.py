@@ -1,4 +1,4 @@
-"""What only a CUDA device can show: no synchronisation, many streams, flat memory, the graph. ``pytest -m gpu``.
+"""Tests that need a CUDA device: no synchronisation, many streams, flat memory, the graph. ``pytest -m gpu``.
 
 The kernels themselves are in the tests of ``conftest.backend``, which run on the device as well.
 """

@@ -52,6 +52,16 @@ def test_soft_range_is_monotone_and_bounded(x: float, more: float) -> None:
     assert LOW - 1e-9 <= a <= b + 1e-9 <= HIGH + 2e-9
 
 
+@pytest.mark.parametrize("x", [-60.0, -20.0, 0.0, 20.0, 60.0])
+def test_soft_range_keeps_a_gradient(x: float) -> None:
+    """A clamp's is 0 outside; this one's falls as e^-distance."""
+    value = torch.tensor(x, requires_grad=True)
+    soft_range(value, LOW, HIGH).backward()
+    assert value.grad is not None
+    distance = max(0.0, abs(x) - HIGH)
+    assert 0.5 * math.exp(-distance) <= float(value.grad) <= math.exp(-distance) + 1e-6
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("raw", [-1e4, -100.0, 0.0, 100.0, 1e4])
 @pytest.mark.parametrize("method", ["aleatoric", "evidential"])
@@ -111,7 +121,7 @@ def test_heads_at_four_scales_as_the_paper_has_them(method: str, size: int) -> N
 
 @pytest.mark.parametrize("method", ["aleatoric", "evidential"])
 def test_coarse_heads_learn_and_do_not_predict(method: str) -> None:
-    """In training four predictions per image with one depth; in eval mode the network with one head, to the bit."""
+    """Training has four predictions per image with one depth; eval mode is the network with one head, to the bit."""
     network = with_head(small_network(), method, 4)
     single = with_head(network.backbone, method).eval()
     single.head.load_state_dict(network.head.state_dict())

@@ -88,47 +88,6 @@ def test_depth_pro_takes_the_cameras_focal_length(tmp_path):
         network(x)
 
 
-def glpn():
-    small = {"depths": [1] * 4, "hidden_sizes": [8] * 4, "num_attention_heads": [1] * 4, "decoder_hidden_size": 8}
-    return transformers.GLPNConfig(**small)
-
-
-def tiny():
-    return transformers.GLPNForDepthEstimation(glpn()).eval()
-
-
-REFUSED = {
-    "a class": (lambda: wrap_network(nn.ReLU), TypeError, r"got the class ReLU: give an instance, ReLU\(...\)"),
-    "a name": (lambda: wrap_network("glpn-nyu"), TypeError, "got str 'glpn-nyu': load it, as load_network"),
-    "weights": (lambda: wrap_network(nn.ReLU().state_dict()), TypeError, "weights need their network"),
-    "several": (lambda: wrap_network([nn.ReLU()]), TypeError, "several networks are a list of wrapped ones"),
-    "a size": (lambda: wrap_network(nn.ReLU(), preprocess=(224, 224)), TypeError, "preprocess must be a Preprocess"),
-    "features": (
-        lambda: wrap_network(transformers.GLPNModel(glpn())), TypeError, "a ...ForDepthEstimation .*got GLPNModel"
-    ),
-    "no processor": (
-        lambda: wrap_network(tiny()), ValueError, "has no preprocessor_config.json, .* declare it in a spec"
-    ),
-    "two declarations": (
-        lambda: wrap_network(tiny(), focal=300.0), ValueError, "only scale, takes_int"
-    ),
-    "another's camera": (
-        lambda: wrap_network(tiny(), takes_intrinsics=True),
-        ValueError, "takes_intrinsics goes with Depth Pro",
-    ),
-    "a raw model": (
-        lambda: UncertainDepth(tiny())(IMAGES[:1, :, :32, :32] / 255, torch.eye(4), CAMERA),
-        TypeError, "got DepthEstimatorOutput: wrap it with",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("call", "error", "message"), REFUSED.values(), ids=REFUSED)
-def test_every_other_kind_is_refused(call, error, message):
-    with pytest.raises(error, match=message):
-        call()
-
-
 def test_other_tasks_and_relative_models_are_refused(tmp_path):
     pipe = transformers.pipeline("depth-estimation", model=str(write_depth_anything(tmp_path / "n", "relative")))
     with pytest.raises(ValueError, match=r"'relative', which is 'inverse': .*aligned\(alignment\) makes it metric"):

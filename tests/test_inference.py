@@ -1,8 +1,9 @@
-"""Networks as ``run`` and ``eval`` run them: which runtime, what it changes, and what the records say of it."""
+"""Networks as ``run`` and ``eval`` run them: the runtime, its effect and its records; ONNX Runtime and LiteRT."""
 
 from __future__ import annotations
 
 import json
+import pickle
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 import torch
 from layouts import write_tum
 from onnx_files import small_network, write_fastdepth
+from PIL import Image
 from runs import job_of, outputs, read_summary
 from shared_data import require_shared
 from torch import Tensor
@@ -25,13 +27,18 @@ from ufmstar_torch.models import (
     FastDepth,
     FastDepthWidths,
     MonodepthResNet,
+    OnnxNetwork,
+    Preprocess,
+    load_network,
     save_trained,
     with_head,
 )
-from ufmstar_torch.models.inference import Inference
+from ufmstar_torch.models.inference import Inference, runtime_of
 from ufmstar_torch.models.trained import NetworkSpec, build_network
 
 CPU = torch.device("cpu")
+INT8 = "weights/fastdepth_nyu_int8.tflite"
+METRIC = {"outputs": {"kind": "metric"}}
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +156,7 @@ def test_refusals(
     tmp_path: Path, weights: Path, trained: Path, model: str, inference: dict[str, str], message: str
 ) -> None:
     spec = tmp_path / "spec.json"
-    spec.write_text(json.dumps({"outputs": {"kind": "metric"}}))
+    spec.write_text(json.dumps(METRIC))
     with pytest.raises(ValueError, match=message):
         network_source(
             model,
@@ -176,3 +183,61 @@ def test_a_resumed_run_is_the_same_and_needs_the_same_runtime(tmp_path: Path, we
     about = read_summary(tmp_path / "out")["runtime"]
     assert about["name"] == "onnxruntime"
     assert about["version"] == read_summary(tmp_path / "out")["versions"]["onnxruntime"]
+
+
+def test_fastdepth_runs_in_onnx_runtime_unless_asked_otherwise(weights):
+    graph, network = load_network("fastdepth", weights), load_network("fastdepth", weights, runtime="torch")
+    assert isinstance(graph, OnnxNetwork)
+    assert isinstance(network, FastDepth)
+    assert graph.preprocess == network.preprocess == Preprocess.nyu()
+    assert graph.threads == torch.get_num_threads()
+    assert isinstance(load_network("fastdepth", weights, dropout=0.2), FastDepth)
+    assert isinstance(load_network("fastdepth", weights, size=(64, 64)), FastDepth)  # the graph's size is fixed
+    with pytest.raises(ValueError, match="runtime must be 'auto', 'onnx' or 'torch', got 'tensorrt'"):
+        load_network("fastdepth", weights, runtime="tensorrt")
+
+
+def test_onnx_has_fastdepths_crop_unless_the_spec_has_another(weights):
+    assert load_network("onnx", weights, spec=METRIC).preprocess == Preprocess.nyu()
+    stretched = load_network("onnx", weights, spec={**METRIC, "preprocess": {}})
+    assert stretched.preprocess == Preprocess(size=(224, 224))
+
+
+def test_int8_is_close_to_the_network_that_it_was_made_of():
+    pytest.importorskip("ai_edge_litert")
+    network = load_network("fastdepth", require_shared(INT8), threads=1)
+    expected = load_network("fastdepth", require_shared("weights/fastdepth_nyu.onnx"), threads=1)
+    picture = Path(require_shared("data/rgbd_dataset_freiburg1_xyz/rgb"))
+    image = torch.from_numpy(np.array(Image.open(sorted(picture.glob("*.png"))[0]))).permute(2, 0, 1)[None]
+    x, _ = network.preprocess(image, torch.eye(3)[None])
+    depth, reference = network(x).depth, expected(x).depth
+    assert depth.shape == (1, 224, 224)
+    assert float((depth - reference).abs().median()) < 0.15  # [m] two of its steps
+    np.testing.assert_allclose(depth / 0.07169981300830841, (depth / 0.07169981300830841).round(), atol=1e-3)
+    torch.testing.assert_close(network(x.expand(2, -1, -1, -1)).depth, depth.expand(2, -1, -1))
+    again = pickle.loads(pickle.dumps(network))
+    torch.testing.assert_close(again(x).depth, depth)
+    assert runtime_of(network, "float32")["name"] == "litert"
+    with pytest.raises(ValueError, match=r"has \(224, 224\) px, got \(96, 96\)"):
+        network(torch.zeros(1, 3, 96, 96))
+
+
+def test_litert_needs_a_spec_that_fits(tmp_path):
+    pytest.importorskip("ai_edge_litert")
+    file = require_shared(INT8)
+    network = load_network("litert", file, spec={"outputs": {"kind": "metric", "scale": 2.0, "max_depth": 9}})
+    assert network.preprocess == Preprocess(size=(224, 224))
+    assert network.max_depth == 9
+    with pytest.raises(ValueError, match="needs a spec"):
+        load_network("litert", file)
+    with pytest.raises(ValueError, match=r"it has no \['d'\]"):
+        load_network("litert", file, spec={"outputs": {"kind": "metric", "depth": "d"}})
+    with pytest.raises(ValueError, match=r"preprocess\.size"):
+        load_network("litert", file, spec={**METRIC, "preprocess": {"size": [96, 96]}})
+    with pytest.raises(FileNotFoundError, match=r"no \.tflite file"):
+        load_network("litert", tmp_path / "n.tflite", spec=METRIC)
+    (tmp_path / "n.tflite").write_bytes(b"TFL3 nothing")
+    with pytest.raises(ValueError, match="is not a file that LiteRT can run"):
+        load_network("litert", tmp_path / "n.tflite", spec=METRIC)
+    with pytest.raises(ValueError, match="a graph that only LiteRT runs"):
+        Inference("onnx").ready(network, Path(file), torch.device("cpu"))

@@ -1,4 +1,4 @@
-"""Which kernels are chosen, and what all of them keep: threads, warnings, registers."""
+"""The choice of kernels, and properties of all: threads, warnings, registers."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from demo_networks import write_members
-from layouts import quaternion_line, write_generic
+from layouts import quaternion_line
 from PIL import Image
 from rerun_stand_in import stand_in
 
@@ -250,32 +250,6 @@ def test_a_folder_that_grows_live(ufmstar, tmp_path):
     writer.join()
     assert code == 0, err
     assert "UfM*'s share" in out
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        ("0", "0 needs --trajectory FILE"),
-        ("images --follow --intrinsics 1 1 1 1", "images needs --trajectory FILE"),
-        ("- --overwrite", "--overwrite goes with --out"),
-        ("- --drive 3", "--drive goes with recordings, not with -"),
-        ("tour:3 --speed 0", "--speed must be positive"),
-        ("tour:3 --scale-from network", "--scale-from goes with ufmstar run"),
-        ("tour:3 --ufm.anchors.half_life 5", "needs --anchors"),
-        ("{images}", "has no known layout"),
-    ],
-)
-def test_refusals(ufmstar, tmp_path, words, text):
-    write_generic(tmp_path)
-    words = words.format(images=tmp_path / "walk" / "images")
-    code, _, err = ufmstar(*words.split())
-    assert code == 2
-    assert text in err
-
-
-def test_a_network_is_needed(capsys):
-    assert cli.main(["live", TOUR]) == 2
-    assert "live needs a network" in capsys.readouterr().err
 
 
 _VIEWER = """

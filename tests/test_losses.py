@@ -53,7 +53,7 @@ def test_gaussian_is_scipys():
 
 @given(nu=st.floats(1e-4, 1e4), alpha=st.floats(1.0001, 1e5), beta=st.floats(1e-6, 1e4), error=st.floats(-100, 100))
 def test_evidential_is_scipys_student_t(nu, alpha, beta, error):
-    """In double precision to 1e-7, over the whole range of evidence (the series for large alpha is worth 5e-8)."""
+    """Double precision agrees to 1e-7 over the whole range of evidence (the series for large alpha is worth 5e-8)."""
     tensors = [torch.tensor(x, dtype=torch.float64) for x in (3.0, nu, alpha, beta, 3.0 + error)]
     scale = math.sqrt(beta * (1 + nu) / (nu * alpha))
     expected = -stats.t.logpdf(tensors[4].item(), 2 * alpha, 3.0, scale)

@@ -15,7 +15,7 @@ from random_gaussians import as_lists, covariances, mixture
 import scenes
 from ufmstar_torch import AnchorConfig, MergeConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.kernels.select import select_merge
-from ufmstar_torch.merge import merge
+from ufmstar_torch.merge import merge, merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import regress
 
@@ -148,7 +148,7 @@ def test_a_superseded_component_is_dissolved_and_a_lonely_one_is_not(backend):
 @given(st.integers(0, 10**6))
 @settings(max_examples=8)
 def test_the_map_stays_within_the_stated_bound_where_components_are_dissolved(seed):
-    """At a dissolved component's own point a feature in [0, 1] moves by little more than its share; joining is off."""
+    """A feature in [0, 1] at a dissolved component's own point moves by little more than its share; joining is off."""
     before, _ = crowd(seed)
     config = UfMStarConfig(merge=MergeConfig(loss=1e-9, share=0.05), features=2)
     after, _ = merge(before, before.mean.new_zeros(*before.weight.shape, 0), ALL, config, select_merge("torch", "cpu"))
@@ -206,3 +206,10 @@ def test_a_walk_merges_when_due_and_goes_on_from_a_saved_state():
     again = walk(config, 12, 24, walk(config, 0, 12).state_dict())
     for name, value in merging.state_dict().items():
         assert torch.equal(again.state_dict()[name], value), name
+
+
+def test_a_skipped_frame_merges_nothing():
+    state = walk(UfMStarConfig(), 0, 4).state
+    config, kernels = UfMStarConfig(merge=MergeConfig(every=4)), select_merge("torch", "cpu")
+    assert merged(state, torch.tensor([False]), config, kernels) is state
+    assert merged(state, torch.tensor([True]), config, kernels) is not state

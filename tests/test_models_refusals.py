@@ -8,10 +8,12 @@ from functools import partial
 
 import pytest
 import torch
+import transformers
 from onnx_files import small_network
 from tiny_networks import Linear
 from torch import nn
 
+from ufmstar_torch import UncertainDepth
 from ufmstar_torch.models import (
     AleatoricNetwork,
     AlignedNetwork,
@@ -41,6 +43,9 @@ from ufmstar_torch.models.inference import Inference
 INF, NAN = float("inf"), float("nan")
 METRIC = {"kind": "metric"}
 MAPS, IMAGE = torch.ones(2, 6, 8), torch.zeros(1, 3, 64, 64)
+CAMERA = torch.tensor([[60.0, 0, 31.5], [0, 60, 31.5], [0, 0, 1]])
+GLPN = transformers.GLPNConfig(depths=[1] * 4, hidden_sizes=[8] * 4, num_attention_heads=[1] * 4, decoder_hidden_size=8)
+glpn = transformers.GLPNForDepthEstimation
 spec, onnx, preprocess = NetworkSpec.from_dict, OnnxSpec.from_dict, Preprocess.from_dict
 resnet = partial(MonodepthResNet, 18)
 named = wrap_network(lambda x: {"a": x[:, 0], "b": x[:, 1]})
@@ -104,7 +109,16 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: onnx({"outputs": METRIC, "preprocess": {"resize": 3}}), r"Preprocess has no \['resize'\]"),
     (lambda: OutputSpec("metric", focal=0.0), "focal"),
     (lambda: wrap_network(Linear(), inverse=True), "declared 'inverse', but UfM"),
-    (lambda: wrap_network("weights.pth"), "network .*got str"),
+    (lambda: wrap_network("weights.pth"), "network .*got str 'weights.pth': load it, as load_network"),
+    (lambda: wrap_network(nn.ReLU), r"got the class ReLU: give an instance, ReLU\(...\)"),
+    (lambda: wrap_network(nn.ReLU().state_dict()), "weights need their network"),
+    (lambda: wrap_network([nn.ReLU()]), "several networks are a list of wrapped ones"),
+    (lambda: wrap_network(nn.ReLU(), preprocess=(224, 224)), "preprocess must be a Preprocess"),
+    (lambda: wrap_network(transformers.GLPNModel(GLPN)), "a ...ForDepthEstimation .*got GLPNModel"),
+    (lambda: wrap_network(glpn(GLPN)), "has no preprocessor_config.json, .* declare it in a spec"),
+    (lambda: wrap_network(glpn(GLPN), focal=300.0), "only scale, takes_int"),
+    (lambda: wrap_network(glpn(GLPN), takes_intrinsics=True), "takes_intrinsics goes with Depth Pro"),
+    (lambda: UncertainDepth(glpn(GLPN).eval())(IMAGE, torch.eye(4), CAMERA), "got DepthEstimatorOutput: wrap it"),
     (lambda: wrap_network(lambda x: x[:, 0], "metric")(IMAGE), "no output 'metric'"),
     (lambda: named(IMAGE), r"returns \['a', 'b'\]; declare"),
     (lambda: wrap_network(lambda x: x[:, 0, :3])(IMAGE), "output 'depth' has"),
@@ -114,7 +128,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: load_network("fastdepth"), "'fastdepth' needs weights"),
     (lambda: load_network("fastdepth", "w.pth", strides=3), "strides"),
     (lambda: load_network("onnx", "n"), "needs a spec"),
-    (lambda: load_network("exported", "n", spec=METRIC), r"no \['kind'\]"),
+    (lambda: load_network("torchscript", "n", spec=METRIC), r"no \['kind'\]"),
     (lambda: small_network()(torch.zeros(1, 3, 240, 320)), "image .*multiples of 32"),
     (lambda: small_network()(torch.zeros(1, 1, 64, 64)), "image"),
     (lambda: small_network()(IMAGE.to(torch.uint8)), "image"),

@@ -233,7 +233,7 @@ def test_growth_by_doubling_keeps_everything():
 
 @pytest.mark.parametrize("limit", [5, 14])
 def test_max_components_drops_the_farthest_in_both_tiers(limit):
-    """As the mixture without a limit, less what is farthest from the camera; every component is counted."""
+    """The mixture is the one without a limit, less the components farthest from the camera; each is counted."""
     limited = CONFIG.replace(initial_capacity=2, max_components=limit)
     tiers = [UfMStar(limited.replace(backend=backend), dtype=torch.float64) for backend in ("torch", "numba")]
     free, dropped, before, earlier = UfMStar(CONFIG, dtype=torch.float64), 0, 0, []

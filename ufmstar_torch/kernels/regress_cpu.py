@@ -78,7 +78,8 @@ def look(
     more precise one of the ``others``."""
     epsilon = min(EPSILON[dtype] for dtype in (depth.dtype, *others))
     streams = zip(seen, _doubles(intrinsics)[0], array(depth), strict=True)
-    return [in_view(*one, K, z, config.prior_weight, config.prior_mean, epsilon) for one, K, z in streams]
+    prior = config.prior_weight, config.prior_mean
+    return [in_view(*one, K, z, float(z.max()), *prior, epsilon) for one, K, z in streams]
 
 
 def regress_maps(

@@ -27,9 +27,8 @@ import math
 import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
-from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, bounds, largest
+from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, bounds
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, WEIGHT, padded
-from ufmstar_torch.kernels.vectors_cpu import LANES
 
 HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 _PRIOR = 1e-3  # share of the prior in a threshold
@@ -41,13 +40,14 @@ WHITENED, PEAK, SQUARE = 8, 6, 7
 
 
 @kernel
-def in_view(components, m, features, K, depth, prior_weight, prior_mean, epsilon):
+def in_view(components, m, features, K, depth, farthest, prior_weight, prior_mean, epsilon):
     """The components that can matter in an image, as :func:`exact` takes them.
 
     Args:
         components: in the camera's frame by field [13, n and more] (``rigid_cpu``).
         m, features: of the n components [n], [n, F].
         depth: [H, W], not positive where there is none.
+        farthest: the largest of them.
 
     Returns:
         Indices [n], fields [n, 10], the same in the dtype of ``depth`` and by field [10, n and more], the terms of the
@@ -61,7 +61,7 @@ def in_view(components, m, features, K, depth, prior_weight, prior_mean, epsilon
     n = _visible(components, m.size, whitened, K, height, width, limit, index)
     packed = empty((FIELDS, padded(n)), depth.dtype)
     _pack(components, whitened, index, n, packed)
-    z = _farthest(depth, empty(1, depth.dtype))
+    z = farthest
     left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
     right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
     box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
@@ -104,19 +104,6 @@ def _terms(components, whitened, index, m, features, fields, constants):
         constants[i, 7] = m[k]
         for g in range(min(3, features.shape[1])):
             constants[i, 8 + g] = features[k, features.shape[1] - 1 - g]
-
-
-@leaf
-def _farthest(depth, work):
-    """The largest depth; ``work`` is scratch."""
-    flat = depth.reshape(-1)
-    n = flat.size - flat.size % (4 * LANES)
-    work[0] = 0
-    largest(flat, n, work)
-    most = work[0]
-    for i in range(n, flat.size):
-        most = flat[i] if flat[i] > most else most
-    return np.float64(most)
 
 
 @leaf

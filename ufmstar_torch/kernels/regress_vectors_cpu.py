@@ -174,19 +174,6 @@ def add_shares(code, fields, stride, n, point, row, density, added):
 
 
 @vectors
-def largest(code, values, n, most):
-    """The greatest of the first n values, a multiple of four vectors' lengths, or of what ``most`` [1] is; to ``most``.
-
-    In four chains of comparisons, which do not wait for each other.
-    """
-    chains = [code.variable(most.one(0)) for _ in range(4)]
-    with code.loop(n, 4 * code.lanes) as i:
-        for part, chain in enumerate(chains):
-            chain.value = values.load(i, part * code.lanes).at_least(chain.value)
-    most.put(functools.reduce(Lanes.at_least, (chain.value for chain in chains)).everywhere(Lanes.at_least), 0)
-
-
-@vectors
 def square_distances(code, u, v, more, first, n, point, out, at):
     """The squared distances of n points (u, v), from ``first`` on, from ``point`` [2], plus ``more``; to ``out`` from
     ``at`` on. Up to a vector's length more is read and written."""
