@@ -1,4 +1,4 @@
-"""What the GPU kernels have besides the steps' parts (``conftest.backend``): late growth, bits of matches, launches.
+"""What the GPU kernels have besides the steps' parts (``conftest.backend``): late growth, bits of matches, capture.
 
 In Triton's interpreter, on CPU tensors, with ``TRITON_INTERPRET=1``; on a GPU as they are (``pytest -m gpu``).
 """
@@ -77,19 +77,39 @@ def test_late_growth():
         close(getattr(modules[0].ufm.mixture, name)[:, :n], value[:, :n], 1e-5, 1e-7)
 
 
-@pytest.mark.skipif(not INTERPRETED, reason="the interpreter launches through ``__getitem__``")
-def test_a_frame_takes_twelve_launches(monkeypatch):
+@pytest.mark.skipif(not INTERPRETED, reason="on a GPU tests/test_gpu.py records a graph")
+def test_capture_keeps_the_state_in_place(monkeypatch):
+    """The bookkeeping of a capture, with a function in the place of the graph; and the launches of a step."""
     from triton.runtime.jit import KernelInterface
 
+    from ufmstar_torch.capture import Captured
+
+    monkeypatch.setattr("ufmstar_torch.capture._WARM_UP", 1)
     launched, launch = [], KernelInterface.__getitem__
     monkeypatch.setattr(
         KernelInterface, "__getitem__", lambda kernel, grid: launched.append(kernel.fn.__name__) or launch(kernel, grid)
     )
-    ufm = UfMStar(UfMStarConfig(segment=SPGF, backend="triton", initial_capacity=16, max_components=16))
-    for frame in walks(1, 2):
+
+    config = UfMStarConfig(segment=SPGF, backend="triton", on_bad_frame="skip", initial_capacity=16, max_components=16)
+    given = [frame[:3] for frame in walks(1, 2)]
+    ufm, plain = UfMStar(config), UfMStar(config)
+    captured = Captured(ufm, *given[0], record=lambda run: run)
+    memory = ufm.mean
+    for i, frame in enumerate(given):
+        if i == 1:
+            ufm.reset()
+            plain.reset()
         launched.clear()
-        ufm(*frame[:3])
+        out = captured(*frame)
         assert len(launched) == len(set(launched)) == 2 + 10, launched  # the check, the step
+        expected = plain(*frame)
+        close(out.variance, expected.variance, 0, 0)
+        assert ufm.mean is memory
+    assert torch.equal(ufm.frames, plain.frames)
+    with pytest.raises(ValueError, match="depth must be as at the capture"):
+        captured(given[0][0][:, :5], *given[0][1:])
+    with pytest.raises(ValueError, match=r"a capture needs on_bad_frame='skip'.*a mixture that grows"):
+        Captured(UfMStar(UfMStarConfig(backend="triton")), *given[0])
 
 
 def test_what_the_limit_leaves_without_a_slot_counts_as_dropped():
