@@ -25,8 +25,7 @@ from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction
 
-INITS = ("normal", "sign")
-# [1] Spread of the factors around 1 for init="normal", as in the published implementations. Less of it keeps
+# [1] Spread of the factors around 1, as in the published implementations. Less of it keeps
 # the members nearer to pretrained weights and to each other; random signs undo trained weights altogether.
 INIT_STD = 0.5
 _PLAIN = (nn.Conv2d, nn.Linear)
@@ -38,7 +37,6 @@ def convert(
     network: Network,
     members: int,
     *,
-    init: str = "normal",
     std: float = INIT_STD,
     generator: torch.Generator | None = None,
 ) -> Network:
@@ -50,8 +48,7 @@ def convert(
     Args:
         network: not changed.
         members: N.
-        init: of the factors: "normal" (1 +- ``std``) or "sign" (+1 or -1).
-        std: [1] of "normal"; 0 starts all members equal.
+        std: [1] of the factors, which begin at 1 +- ``std``; 0 starts all members equal.
         generator: of the random numbers, on the CPU; None = torch's.
 
     Raises:
@@ -61,8 +58,8 @@ def convert(
             computation is not known here.
         RuntimeError: not all of the layers were converted.
     """
-    if members < 2 or init not in INITS or not std >= 0:
-        raise ValueError(f"need members >= 2, init in {list(INITS)} and std >= 0, got {members}, {init!r}, {std}")
+    if members < 2 or not std >= 0:
+        raise ValueError(f"need members >= 2 and std >= 0, got {members} and {std}")
     if converted_layers(network):
         raise ValueError(f"{type(network).__name__} is converted already")
     expected = 0
@@ -80,8 +77,8 @@ def convert(
     if len(layers) != expected or left:
         raise RuntimeError(f"{len(layers)} of {expected} layers were converted, {left} stayed as they were")
     for layer in layers:
-        _draw(layer.r, init, std, generator)
-        _draw(layer.s, init, std, generator)
+        _draw(layer.r, std, generator)
+        _draw(layer.s, std, generator)
     return result
 
 
@@ -105,12 +102,11 @@ class BatchEnsemble(DepthNetwork):
         network: UncertaintyNetwork,
         members: int,
         *,
-        init: str = "normal",
         std: float = INIT_STD,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        self.network = convert(network, members, init=init, std=std, generator=generator)
+        self.network = convert(network, members, std=std, generator=generator)
         self.preprocess = network.preprocess
         self.members = members
 
@@ -211,12 +207,9 @@ def _require_plain(name: str, module: nn.Module) -> None:
         raise TypeError(f"{name or 'the network'} cannot be converted: it is a {type(module).__name__} of {held}")
 
 
-def _draw(factor: nn.Parameter, init: str, std: float, generator: torch.Generator | None) -> None:
+def _draw(factor: nn.Parameter, std: float, generator: torch.Generator | None) -> None:
     """Random values into a parameter; drawn on the CPU in float32, so that they depend on the seed alone."""
-    if init == "sign":
-        values = torch.randint(0, 2, factor.shape, generator=generator) * 2.0 - 1.0
-    else:
-        values = 1 + std * torch.randn(factor.shape, generator=generator)
+    values = 1 + std * torch.randn(factor.shape, generator=generator)
     with torch.no_grad():
         factor.copy_(values)
 

@@ -129,7 +129,7 @@ def build_backbone(spec: NetworkSpec, module: nn.Module | None = None) -> Backbo
 
 
 def build_network(
-    spec: NetworkSpec, backbone: Backbone | None = None, *, init: str = "normal", std: float = INIT_STD
+    spec: NetworkSpec, backbone: Backbone | None = None, *, std: float = INIT_STD
 ) -> UncertaintyNetwork | BatchEnsemble:
     """The network that ``spec`` describes, for training; "mc_dropout" does not sample by itself yet
     (``MonteCarloDropout`` makes it do so).
@@ -138,9 +138,9 @@ def build_network(
         spec: what to build.
         backbone: with pretrained weights, as :func:`build_backbone` makes it; it becomes part of the
             network (a "batch_ensemble" takes a copy). None: random weights.
-        init, std: how the factors of a "batch_ensemble" begin; see ``convert``.
+        std: spread of the first factors of a "batch_ensemble"; see ``convert``.
     """
     backbone = build_backbone(spec) if backbone is None else backbone
     network = with_head(backbone, spec.method if spec.method in HEADS else "aleatoric", spec.head_scales)
     several = spec.method == "batch_ensemble"
-    return BatchEnsemble(network, spec.members, init=init, std=std) if several else network
+    return BatchEnsemble(network, spec.members, std=std) if several else network

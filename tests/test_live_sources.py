@@ -219,6 +219,14 @@ def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):
     code, out, err = ufmstar("-", "--intrinsics", K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     assert code == 0, err
     assert "of 5 images" in out
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join([*lines, "no JSON"])))
+    intrinsics = ("--intrinsics", K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    code, out, err = ufmstar("-", *intrinsics, "--out", tmp_path / "out")
+    assert code == 1
+    assert "line 11: no JSON" in err
+    assert "of 5 images" in out, "the table of what was done"
+    summary = json.loads((tmp_path / "out" / "realtime.json").read_text())
+    assert (summary["state"], summary["reason"]) == ("failed", "line 11: no JSON: no JSON")
     monkeypatch.setattr(sys, "stdin", io.StringIO(lines[1]))
     code, _, err = ufmstar("-")
     assert code == 1

@@ -152,7 +152,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: convert(nn.Sequential(nn.BatchNorm2d(3)), 3), "nothing to convert"),
     (lambda: convert(convert(nn.Linear(3, 3), 3), 3), "converted already"),
     (lambda: convert(nn.Linear(3, 3), 1), "members"),
-    (lambda: convert(nn.Linear(3, 3), 3, init="zeros"), "init"),
     (lambda: convert(nn.Linear(3, 3), 3, std=NAN), "std"),
     (lambda: batch_ensemble().distribution(IMAGE, repeat=False), "batch of 1 cannot be split among 3"),
     (lambda: batch_ensemble().member(3), "member"),

@@ -6,6 +6,7 @@ import json
 import pickle
 import random
 import shutil
+from itertools import pairwise
 
 import layouts
 import layouts_calibrated as written
@@ -340,6 +341,17 @@ def test_euroc_without_truth_and_with_a_trajectory(tmp_path):
         np.testing.assert_allclose(
             open_sequence(place, trajectory=trajectory)[4].T_world_cam, truth.T_world_cam[4], atol=1e-9
         )
+
+
+def test_aliases_of_aliases_are_refused_before_they_are_expanded(tmp_path):
+    """Nine levels of nine are 400 million words where they are printed, from 500 bytes."""
+    path, _ = written.write_euroc(tmp_path)
+    file = path / "mav0" / "cam0" / "sensor.yaml"
+    levels = "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in pairwise("abcdefghij"))
+    kept = [line for line in file.read_text().splitlines() if not line.startswith(("%", "distortion_model"))]
+    file.write_text("\n".join(["a: &a [x]", levels + "distortion_model: *j", *kept]))
+    with pytest.raises(ValueError, match=r"sensor\.yaml: expected a sensor's YAML of names and values without aliases"):
+        open_sequence(path)
 
 
 def test_hostile_arkit_folders(tmp_path):

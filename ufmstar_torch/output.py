@@ -40,7 +40,7 @@ class FrameStatistics:
             they show an error, by which the variance is widened.
         pose_error: by how much poses and images disagree: standard deviation of tracked corners from their epipolar
             lines [px] of the image that was searched; NaN = not measured, None = no source of anchors measures it.
-            Without anchors no image is searched, which would cost more than the step: a run measures some pairs of
+            Without anchors no image is searched, which would cost as much as the step: a run measures some pairs of
             frames instead (``image_fit`` of its summary).
         calibration: with ``config.posterior``, mean z^2 of held-out anchors lately: 1 = the posterior is off by as much
             as it states, more = it is too certain. NaN before any; None without.

@@ -6,7 +6,7 @@ import json
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, fields
 from itertools import takewhile
 from pathlib import Path
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from ufmstar_torch.eval.engine.realtime import RealTime
     from ufmstar_torch.eval.sequences.live import LiveEvent
-    from ufmstar_torch.live import LiveDepth, LiveResult
+    from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
     from ufmstar_torch.pipeline import UncertainDepth
 
     _View = Callable[[LiveResult, dict[str, float]], None]
@@ -134,21 +134,25 @@ def main(options: LiveOptions) -> int:
             view = _view() if options.view else None
             if options.out is not None:
                 held.enter_context(OutputFolder.open(options.out, kind, started, overwrite=options.overwrite))
-        except (ImportError, OSError, RuntimeError, ValueError) as error:
+        except (ImportError, OSError, ValueError) as error:
             raise UsageError(error) from error
         times = RealTime(model)
-        live = _run(options, model, events, times, view)
-        summary = times.summary(live.statistics)
+        statistics, failure = _run(options, model, events, times, view)
+        summary = times.summary(statistics)
+        print(realtime_table(summary), file=sys.stderr if options.json else sys.stdout)
+        ending = {"state": "failed", "reason": str(failure)} if failure else {"state": "finished"}
         if options.out is not None:
-            write_json_atomic(options.out / _SUMMARY, {"program": kind.program, "state": "finished", **summary})
-    print(realtime_table(summary), file=sys.stderr if options.json else sys.stdout)
+            with suppress(OSError) if failure else nullcontext():  # the disk may be full
+                write_json_atomic(options.out / _SUMMARY, {"program": kind.program, **ending, **summary})
+    if failure is not None:
+        raise failure
     return 0 if summary["results"] else 1
 
 
 def _run(
     options: LiveOptions, model: UncertainDepth, events: Iterator[LiveEvent], times: RealTime, view: _View | None
-) -> LiveDepth:
-    """Push the events until they end, the time is over, or a signal comes."""
+) -> tuple[LiveStatistics, Exception | None]:
+    """Push the events until they end, the time is over, or a signal comes. Returns the counts, and what failed."""
     from ufmstar_torch.live import LiveDepth
 
     ends = monotonic() + options.seconds
@@ -167,18 +171,18 @@ def _run(
             print("  ".join(f"{name} {value}" for name, value in about.items()), file=sys.stderr, flush=True)
 
     how: dict[str, Any] = {"max_wait": options.max_wait, "max_gap": options.opening.max_pose_gap}
-    with (
-        _interrupted_by_sigterm(),
-        LiveDepth(model, on_result, K, state=options.state, save_every=options.save_every, **how) as live,
-        suppress(KeyboardInterrupt),
-    ):
-        for event in takewhile(lambda _: monotonic() < ends, events):
-            if event.T_world_cam is not None:
-                live.push_pose(event.stamp, event.T_world_cam)
-            if event.image is not None:
-                live.push_image(event.stamp, event.image, event.intrinsics)
-        live.wait_idle()
-    return live
+    live = LiveDepth(model, on_result, K, state=options.state, save_every=options.save_every, **how)
+    try:
+        with _interrupted_by_sigterm(), live, suppress(KeyboardInterrupt):
+            for event in takewhile(lambda _: monotonic() < ends, events):
+                if event.T_world_cam is not None:
+                    live.push_pose(event.stamp, event.T_world_cam)
+                if event.image is not None:
+                    live.push_image(event.stamp, event.image, event.intrinsics)
+            live.wait_idle()
+    except (OSError, RuntimeError, TypeError, ValueError) as error:
+        return live.statistics, error
+    return live.statistics, None
 
 
 def _events(options: LiveOptions) -> Iterator[LiveEvent]:
@@ -274,7 +278,7 @@ def _write(out: Path, result: LiveResult) -> None:
 
 
 def _view() -> _View:
-    """A function that shows results in a new viewer. Raises ModuleNotFoundError, RuntimeError: as ``open_viewer``."""
+    """A function that shows results in a new viewer. Errors as ``open_viewer``."""
     from itertools import count
 
     import numpy as np

@@ -125,7 +125,7 @@ def open_viewer() -> tuple[Any, subprocess.Popen[bytes]]:
 
     Raises:
         ModuleNotFoundError: rerun-sdk is not installed.
-        RuntimeError: the viewer does not start, as without a display.
+        ConnectionError: the viewer does not start, as without a display.
     """
     rr = rerun()
     with socket.socket() as free:
@@ -139,7 +139,7 @@ def open_viewer() -> tuple[Any, subprocess.Popen[bytes]]:
     while monotonic() < ready + _SETTLED or not ready:  # without a display it listens before it fails
         if viewer.poll() is not None or monotonic() > ends:
             viewer.terminate()
-            raise RuntimeError("rerun's viewer does not start: is there a display?")
+            raise ConnectionError("rerun's viewer does not start: is there a display?")
         ready = ready or (monotonic() if _listens(port) else 0.0)
         sleep(0.1)
     stream = rr.RecordingStream("ufmstar")

@@ -118,12 +118,15 @@ def _lens(file: Path, size: Size | None) -> Lens:
 def _yaml(file: Path) -> dict[str, Any]:
     import yaml
 
-    text = file.read_bytes()[: _LARGEST_YAML + 1]
+    raw, content = file.read_bytes()[: _LARGEST_YAML + 1], None
     try:
-        # "%YAML:1.0", as OpenCV writes it, is no directive of YAML
-        content = yaml.safe_load(text.decode().removeprefix("%YAML:1.0")) if len(text) <= _LARGEST_YAML else None
+        text = raw.decode().removeprefix("%YAML:1.0")  # as OpenCV writes it, which is no directive of YAML
+        # Aliases of aliases would become gigabytes where they are printed or made an array.
+        if len(raw) <= _LARGEST_YAML and not any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            content = yaml.safe_load(text)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{file}: expected YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
-        raise ValueError(f"{file}: expected a sensor's YAML of names and values, below {_LARGEST_YAML:,} bytes")
+        expected = f"a sensor's YAML of names and values without aliases, below {_LARGEST_YAML:,} bytes"
+        raise ValueError(f"{file}: expected {expected}")
     return content

@@ -109,7 +109,7 @@ def regress_maps(
         )  # fmt: skip
         calls: list[tuple[Any, ...]] = [
             (z[b], K[b], at[b], one.components, one.disagreement, one.features, settings, out[b].reshape(-1),
-             out_f[b].reshape(features, -1), i, shares)
+             out_f[b].reshape(features, at.shape[1]), i, shares)
             for b, one in enumerate(seen) for i in range(shares)
         ]  # fmt: skip
         each(near, calls)
