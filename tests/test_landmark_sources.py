@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 import torch
 from landmark_runs import long_walks, run, surprise, true_depth, walk
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors import landmark_source
-from ufmstar_torch.anchors.dense import DenseConfig, DenseEvidence
+from ufmstar_torch.anchors.dense import DenseConfig, DenseEvidence, _pixels
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences.open import open_sequence
+from ufmstar_torch.kernels.dense_cpu import LEAST_CONTRAST
 
 SMALL = {
     "corners": lambda: LandmarkTracker(TrackerConfig(max_points=40, window=4)),
@@ -266,3 +268,24 @@ def test_images_of_another_size_are_refused_however_small():
         streams.update(image[first], pose, camera)
         streams.undo()
         streams.update(image[other], pose, camera)
+
+
+def test_surfaces_without_fine_texture_are_measured_by_wider_windows():
+    """A plane whose shades change by less than a window's least contrast over 8 px, and by more over 16 px."""
+    texture = gaussian_filter(np.random.default_rng(0).standard_normal((700, 900)), 9)
+    texture, K = 127 + 3.5 * texture / texture.std(), np.array([[200.0, 0, 159.5], [0, 200, 119.5], [0, 0, 1]])
+    v, u = np.mgrid[:240, :320]
+    evidence, found, fine = DenseEvidence(), [], 0
+    for step in range(12):
+        T = np.eye(4)
+        T[0, 3] = 0.06 * step
+        where = [v + 150, u + 150 + 200 * T[0, 3] / 2]
+        image = np.rint(map_coordinates(texture, where, order=1)).astype(np.uint8)
+        found.append(evidence.update(image, T, K))
+        pixel = _pixels(image, 10, np.zeros((0, 2)))
+        patch = np.stack([image[y - 4 : y + 4, x - 4 : x + 4].std() for x, y in pixel.astype(int)])
+        fine += int((patch > LEAST_CONTRAST).sum())
+    depth, sigma = (np.concatenate(x) for x in zip(*((f.depth, np.sqrt(f.variance)) for f in found[4:]), strict=True))
+    assert len(depth) > 2 * fine, "most of these windows have no contrast of their own"
+    assert np.median(np.abs(depth / 2 - 1)) < 0.03
+    assert np.mean(np.abs(depth - 2) < 3 * sigma) > 0.95
