@@ -15,6 +15,8 @@ from torch import nn
 from ufmstar_torch import (
     AnchorConfig,
     ConfidenceConfig,
+    DepthPrediction,
+    Recalibration,
     UfMStar,
     UfMStarConfig,
     UncertainDepth,
@@ -24,10 +26,10 @@ from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
 from ufmstar_torch.eval.engine.networks import NetworkSource
-from ufmstar_torch.eval.engine.stream import FrameSink
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.metrics.recalibration import figures_of_samples, fit_confidence
 from ufmstar_torch.eval.suite.cache import PredictionCache
 from ufmstar_torch.eval.tour import tour_sequence
 from ufmstar_torch.models import Ensemble, OutputSpec, Preprocess, wrap_network
@@ -153,6 +155,33 @@ def test_streams_of_a_batch_are_independent_and_anchors_may_be_padded():
     torch.testing.assert_close(out.variance[1:], expected.variance)
 
 
+def test_offline_from_truth(tmp_path):
+    """The factor is found from samples in whatever unit, and applied with or without anchors; it is saved as JSON."""
+    rng = np.random.default_rng(0)
+    sigma, V = np.exp(rng.uniform(-3, 1, (2, 4000))), np.exp(rng.uniform(-2, 2, (2, 4000)))
+    e = (sigma * rng.standard_normal(sigma.shape)) ** 2 * V
+    samples = [np.stack([1 / (1 + s**2), v, error], -1) for s, v, error in zip(sigma, V, e, strict=True)]
+    fitted = fit_confidence(samples)
+    assert (fitted.covariate, len(fitted.variance)) == ("confidence", 16)
+    s = torch.linspace(0.06, 2.0, 30, dtype=torch.float64)
+    assert float((fitted.factor(1 / (1 + s**2)) / s**2).log().abs().mean()) < 0.2
+    before, after = (figures_of_samples(samples[0], one) for one in (None, fitted))
+    assert after["nll"] < before["nll"] - 0.3
+    assert after["coverage_error"] < 0.1 < before["coverage_error"]
+    fitted.save(tmp_path / "map.json")
+    loaded = Recalibration.from_json(tmp_path / "map.json")
+    depth, c = torch.full((1, *SIZE), 2.0), torch.rand(1, *SIZE, generator=torch.Generator().manual_seed(0))
+    c[0, 0, 0] = torch.nan
+    mapped, plain = UncertainDepth(None, recalibration=loaded), UncertainDepth(None)
+    outs = [m.update(DepthPrediction(depth, confidence=c), torch.eye(4), K).variance for m in (mapped, plain)]
+    torch.testing.assert_close(outs[0], outs[1] * fitted.factor(c).float())
+    assert float(outs[0][0, 0, 0]) == float(outs[1][0, 0, 0])
+    with pytest.raises(ValueError, match="one of the confidence, but the network states none"):
+        mapped.update(DepthPrediction(depth), torch.eye(4), K)
+    constant = fit_confidence([np.stack([np.ones(90), V[0, :90], 4 * V[0, :90]], -1)])
+    torch.testing.assert_close(constant.factor(torch.tensor([0.0, 1.0, 7.0])), torch.full((3,), 4.0).double())
+
+
 class Stated(nn.Module):
     """Depth, and an uncertainty in arbitrary units."""
 
@@ -180,18 +209,8 @@ def test_a_network_states_it():
     assert bool(model.ufm.confidence.any())
 
 
-class Learnt(FrameSink):
-    """Whether UfM* with anchors has counted confidences."""
-
-    def begin(self, stream):
-        self.estimators = [row.estimator for row in stream.rows]
-
-    def take(self, result):
-        self.learnt = bool(self.estimators[1].ufm.confidence.any())
-
-
 def test_the_engine_passes_it(tmp_path):
-    """Through predictions on disk into the rows."""
+    """Through predictions on disk into the rows, and out as samples for ``ufmstar recalibrate``."""
     network = wrap_network(Stated(), "depth", confidence="conf", preprocess=Preprocess(size=SIZE))
     source = NetworkSource(NetworksInTurn(network, preprocess=network.preprocess), CPU, {}, digest="a" * 64)
     method, sequence = Method.parse("UfM*-DepthOnly"), tour_sequence(seed=3, frames=3, size=(48, 64))
@@ -199,15 +218,17 @@ def test_the_engine_passes_it(tmp_path):
     assert make_estimator(rows[1], CPU, source).ufm.config.confidence == ConfidenceConfig()
     for _ in range(2):
         judge = Judge({"depth_only": source}, CPU, PredictionCache(tmp_path))
-        results = evaluate_sequence(sequence, rows, judge, sinks=[seen := Learnt()])
-        assert len(results) == 2
-        assert seen.learnt
+        for result in evaluate_sequence(sequence, rows, judge):
+            samples = result.sums["confidence"]["samples"]
+            assert samples.shape == (3 * 384, 3)
+            assert bool(((samples[:, 0] >= 0) & (samples[:, 0] <= 1)).all())
+    assert fit_confidence([samples.numpy()]).covariate == "confidence"
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.jit:FutureWarning", "ignore:`torch.jit:DeprecationWarning")
 def test_the_commands_pass_it(tmp_path, capsys):
-    """``ufmstar run`` counts the frames in which it is used."""
+    """``ufmstar run`` counts the frames in which it is used; ``eval`` and ``recalibrate`` fit a map of it to truth."""
     spec = {"outputs": {"kind": "metric", "depth": 0, "confidence": 1}, "preprocess": {"size": [48, 64]}}
     (tmp_path / "spec.json").write_text(json.dumps(spec))
     both = torch.jit.trace(Tuple(), torch.rand(1, 3, 48, 64))
@@ -218,6 +239,14 @@ def test_the_commands_pass_it(tmp_path, capsys):
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["anchors"]["frames_with_confidence"] == 0
     assert "confidence: used in 0 frames" in capsys.readouterr().out
+    suite = tmp_path / "s.toml"
+    suite.write_text('title = "s"\n[[rows]]\nmethods = ["UfM*-DepthOnly"]\n')
+    network = ["--network", f"depth_only=torchscript:{tmp_path / 'n.ts'}", *words]
+    assert cli.main(["eval", "--suite", str(suite), "--root", f"a={tour}", *network, "--out", str(tmp_path / "e")]) == 0
+    file = tmp_path / "m.json"
+    fit = ["recalibrate", str(tmp_path / "e"), "--row", "UfM*-DepthOnly", "--to", str(file)]
+    assert cli.main([*fit, "--covariate", "confidence"]) == 0
+    assert Recalibration.from_json(file).covariate == "confidence"
 
 
 class Tuple(nn.Module):

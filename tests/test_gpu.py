@@ -5,6 +5,8 @@ The kernels themselves are in the tests of ``conftest.backend``, which run on th
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from modules import same
@@ -12,6 +14,7 @@ from walks import SPGF, walks
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch.capture import Captured
 
 pytestmark = [
     pytest.mark.gpu,
@@ -61,6 +64,21 @@ def test_256_streams_equal_themselves_alone_and_leave_each_other_alone():
             assert same(out.variance[b], out_alone.variance[b % 4])
             if b != 1:
                 assert same(out.variance[b], out_broken.variance[b])
+
+
+def test_the_graph_equals_the_step():
+    ufm, given = UfMStar(UfMStarConfig(segment=SPGF, **FIXED)), frames(2, 12)
+    plain = copy.deepcopy(ufm)
+    captured = Captured(ufm, *given[0])
+    for i, frame in enumerate(given):
+        if i == 8:
+            ufm.reset([1])
+            plain.reset([1])
+        expected = plain(*frame)
+        out = captured(*frame)
+        assert same(out.variance, expected.variance)
+    for name, value in plain.state_dict().items():
+        assert same(ufm.state_dict()[name], value)
 
 
 @pytest.mark.parametrize("size", [(224, 224), (518, 518)])

@@ -25,7 +25,8 @@ pytestmark = pytest.mark.numerics
 
 KERNELS = (
     "_regress", "_prepare", "_project", "_match", "_fuse", "_floor", "_bins", "_scanline", "_join", "_label",
-    "_feature_means",
+    "_feature_means", "_cameras",
+    "_append", "_camera", "_maps",
 )  # fmt: skip
 
 

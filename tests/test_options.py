@@ -144,6 +144,30 @@ def test_a_file_that_is_no_configuration(text, tmp_path):
     assert "\n" not in str(refused.value)
 
 
+_BOMB = "a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 10)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("[" * 200_000, "nested deeper than 50 levels"),
+        ("out: " + "{a: " * 200_000, "nested deeper than 50 levels"),
+        (_BOMB, "more than 100,000 values"),
+        ("a: &a [*a]\n", "more than 100,000 values"),
+        ("out: " + "x" * 1_000_001, "larger than 1,000,000 bytes"),
+    ],
+)
+def test_a_configuration_has_limits(text, reason, tmp_path):
+    file = tmp_path / "bomb.yaml"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=rf"bomb\.yaml.* {reason}"):
+        _parse(f"seq --out o --config {file}")
+    with pytest.raises(ValueError, match=reason):
+        parse(_Options, ["seq", "--out", "o", "--config", text], "prog")
+
+
 def test_help_has_the_attributes_texts(capsys):
     with pytest.raises(SystemExit) as ended:
         _parse("--help-all")

@@ -45,6 +45,7 @@ from ufmstar_torch.eval.report.table import (
     Column,
     Line,
     Table,
+    csv_text,
     latex,
     markdown,
     markdown_text,
@@ -132,17 +133,27 @@ class TestTextOfUsers:
     """Names of folders and titles of suites never become markup, links or formulas."""
 
     def test_markdown(self):
-        assert markdown_text("a [b](c) *d* `e` <f> | g~~\nh $x$") == r"a \[b\](c) \*d\* \`e\` \<f> \| g\~\~ h \$x\$"
+        assert markdown_text("a [b](http://c) *d* `e` <f> | g~~\nh $x$") == (
+            r"a \[b\](http\u2060://c) \*d\* \`e\` \<f> \| g\~\~ h \$x\$".replace(r"\u2060", "\u2060")
+        )
+        assert markdown_text("see www.x.org or a@b.c") == "see www\u2060.x.org or a\u2060@b.c"
         assert markdown_text("plain: 3 x 4, 50 %") == "plain: 3 x 4, 50 %"
+
+    @pytest.mark.parametrize("text", ["=1+1", "+cmd|' /C calc'!A0", "-a", "@SUM(A1)", "\tx"])
+    def test_csv(self, text):
+        assert csv_text(text) == f"'{text}"
+        assert [csv_text(plain) for plain in ("-1.5", "+3", "a=b", "", None)] == ["-1.5", "+3", "a=b", "", ""]
 
     def test_in_the_files(self, tmp_path):
         sequences = [("d", "=HYPERLINK(1)"), ("d", "[x](https://y)")]
         out = write_evaluation(tmp_path / "o", ENSEMBLE[:1], sequences, title="[t](http://u)")
         write_report(out, figures=False)
         with (out / "results.csv").open() as file:
-            assert {line["sequence"] for line in csv.DictReader(file)} == {"=HYPERLINK(1)", "[x](https://y)"}
+            assert {line["sequence"] for line in csv.DictReader(file)} == {"'=HYPERLINK(1)", "[x](https://y)"}
         heading = (out / "tables" / "main.md").read_text().splitlines()[0]
-        assert heading.startswith("### \\[t\\](http://u), ")
+        assert heading.startswith("### \\[t\\](http\u2060://u), ")
+        first = (out / "tables" / "sequences-d.csv").read_text().splitlines()[1]
+        assert first.startswith('"d, =HYPERLINK(1): 40 frames",Ensemble,')
 
 
 class TestDifferences:
@@ -302,6 +313,7 @@ class TestCommand:
     def test_wrong_usage(self, tmp_path, capsys):
         assert cli.main(["report", str(tmp_path)]) == 2
         assert "no folder of `ufmstar eval`: it has no eval.json" in capsys.readouterr().err
+        assert cli.main(["report", str(tmp_path), "--format", "jpg"]) == 2
 
 
 PAPER_2 = [table for table in paper_tables() if table.number == 2]
@@ -368,7 +380,7 @@ class TestThePapersNumbers:
     def test_table_2_stands_below_what_was_measured(self, tmp_path):
         result = in_memory({(ALONE, ("d", "s")): {"nll": 1.0}}, efficiency=measured_line())
         written = write_tables(replace(result, out=tmp_path))
-        assert {tmp_path / "tables" / f"efficiency.{kind}" for kind in ("md", "tex")} <= set(written)
+        assert {tmp_path / "tables" / f"efficiency.{kind}" for kind in ("md", "tex", "csv")} <= set(written)
         text = (tmp_path / "tables" / "efficiency.md").read_text()
         ours, theirs = text.split("### ")[1:]
         assert ours.startswith("Efficiency of uncertainty, ResNet50-Monodepth2")

@@ -210,12 +210,13 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
         one, other = (read_frame(out / "frames" / f"{name}.npz") for out in (whole, parts))
         for key in ("posterior_depth", "posterior_variance"):
             np.testing.assert_array_equal(one[key], other[key])
-    assert cli.main(["export", str(whole), "--to", "depth"]) == 0
     for kind, values, unit in (
         ("depth", one["posterior_depth"], 1e-3),
         ("sigma", np.sqrt(one["posterior_variance"]), 1e-4),
+        ("network_depth", one["depth"], 1e-3),
+        ("network_sigma", np.sqrt(one["variance"]), 1e-4),
     ):
-        image = read_depth(whole / "export" / kind / f"{name}.png")
+        image = read_depth(whole / kind / f"{name}.png")
         expected = np.minimum(values, 65535 * unit)[one["valid"]]
         np.testing.assert_allclose(image[one["valid"]], expected, atol=unit)
     panel = Finished(whole, tour, records(whole), with_error=True).panel(7)

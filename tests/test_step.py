@@ -61,6 +61,8 @@ def test_a_walk_agrees_with_the_oracle(backend, variant):
     count = 2 if backend.slow else 20 if variant == "default" else 4
     depths, poses, camera, aleatoric, maps, matches, expected = oracle_walk(variant, count)
     config = VARIANTS[variant][0]
+    if backend.name == "triton":  # what finds no slot is in the next frame's map (test_triton.py)
+        config = config.replace(initial_capacity=256)
     ufm = backend.module(config, torch.float64)
 
     def batch(x):
@@ -159,6 +161,8 @@ def test_agrees_with_the_reference(compiled_backend, name, dtype, tolerance):
     slow, config = compiled_backend.slow, CONFIGS[name].replace(on_bad_frame="skip")
     if slow and (dtype == torch.float64) != (name in ("full", "anchored")):
         pytest.skip("in one precision")
+    if compiled_backend.name == "triton":  # as above
+        config = config.replace(initial_capacity=config.max_components or 64)
     fast, reference = compiled_backend.module(config, dtype), UfMStar(config.replace(backend="torch"), dtype=dtype)
     few = {"count": 2, "streams": 2, "size": (24, 32)} if slow else {"count": 4}
     for arguments, more in frames(config=config, dtype=dtype, **few):

@@ -51,9 +51,11 @@ class FrameExtension:
 
     Attributes:
         columns: C, how many columns it regresses.
+        changes_mixture: whether ``after_frame`` may change the mixture, which must be complete then.
     """
 
     columns: int = 0
+    changes_mixture: bool = False
 
     def before_regression(self, tensors: Tensors, mixture_cam: GaussianMixture, distribute: Distribute) -> Columns:
         """The columns of M_i [B, K] in the camera frame; only where ``columns`` is not 0.
@@ -151,6 +153,11 @@ class FrameExtensions:
     def columns(self) -> int:
         """Number of columns that all of them add."""
         return sum(one.columns for one in self.each)
+
+    @property
+    def changes_mixture(self) -> bool:
+        """True if any of them may change the mixture after the frame."""
+        return any(one.changes_mixture for one in self.each)
 
     def before_regression(
         self, tensors: Tensors, mixture_cam: GaussianMixture, distribute: Distribute

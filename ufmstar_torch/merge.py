@@ -85,6 +85,8 @@ class MergeExtension(Extension):
 class _MergeFrame(FrameExtension):
     """Merging after one frame."""
 
+    changes_mixture = True
+
     def __init__(self, frame: FrameInput, config: UfMStarConfig, kernels: MergeKernels) -> None:
         self._frame, self._config, self._kernels = frame, config, kernels
 

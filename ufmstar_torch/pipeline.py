@@ -17,7 +17,7 @@ from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.networks_in_turn import NetworksInTurn, Preprocess, modules_of
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty, UfMStarOutput
 from ufmstar_torch.prediction import DepthPrediction
-from ufmstar_torch.recalibrate import Recalibration
+from ufmstar_torch.recalibrate import CONFIDENCE, Recalibration
 from ufmstar_torch.stateful import outliving
 from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.ufmstar import UfMStar
@@ -152,6 +152,7 @@ class UncertainDepth(NetworksInTurn):
             config = config.replace(anchors=sections[0], posterior=sections[1])
             anchors = "dense" if anchors is None and networks is not None else anchors
         mapped = () if recalibration is None else (recalibration,)
+        self._maps_confidence = recalibration is not None and recalibration.covariate == CONFIDENCE
         self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), extensions=mapped)
         if anchors is not None and self.ufm.config.anchors is None:
             raise ValueError("anchors go with UfMStarConfig(anchors=AnchorConfig())")
@@ -281,7 +282,8 @@ class UncertainDepth(NetworksInTurn):
 
     def _confidence(self, prediction: DepthPrediction) -> Tensor | None:
         """The confidence, where UfM* uses one."""
-        return None if self.ufm.config.confidence is None else prediction.confidence
+        used = self.ufm.config.confidence is not None or self._maps_confidence
+        return prediction.confidence if used else None
 
     def _fused(
         self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None

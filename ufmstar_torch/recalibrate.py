@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Final, Literal
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.checked import Checked
+from ufmstar_torch.checked import Checked, choice
+from ufmstar_torch.confidence import as_confidence
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.extension import Extension
+from ufmstar_torch.extension import Chosen, Extension, FrameExtension
+from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.stateful import flat, plain
 
+VARIANCE: Final = "variance"
+CONFIDENCE: Final = "confidence"
 # Settings of UfM* that do not change what V means.
 _HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
 
@@ -29,9 +33,13 @@ class Recalibration(Checked, Extension):
     Between two knots log V' is linear in log V. Above the last knot V' / V is that of the last knot. Below the first
     one the map is constant, since no smaller variance was ever observed to hold: V = 0 gets the first knot's V'.
 
+    A map of the network's confidence c is V' = h(c) V, with log h linear in c between two knots and constant beyond;
+    h = 1 where c is NaN.
+
     Attributes:
-        variance: V at the knots [m^2], positive and increasing.
-        recalibrated: V' at the knots [m^2], positive and not decreasing.
+        variance: V at the knots [m^2], positive and increasing; or c, increasing.
+        recalibrated: V' at the knots [m^2], positive and not decreasing; or h, positive.
+        covariate: what the map is one of, "variance" or "confidence".
         row: name of the method that it was fitted to, as "UfM*-Anchored-DepthOnly".
         ufm: settings of UfM* that it was fitted to (``UfMStarConfig.to_dict``); {} = unknown.
         network: names of the files of its network's weights, separated by commas; "" = unknown.
@@ -43,21 +51,25 @@ class Recalibration(Checked, Extension):
 
     variance: tuple[float, ...]
     recalibrated: tuple[float, ...]
+    covariate: Literal["variance", "confidence"] = choice(VARIANCE, CONFIDENCE)
     row: str = ""
     ufm: Mapping[str, Any] = field(default_factory=dict)
     network: str = ""
     sequences: tuple[str, ...] = ()
+
+    argument: ClassVar[str] = CONFIDENCE  # what a frame brings for a map of it
 
     def __post_init__(self) -> None:
         super().__post_init__()
         v, r = self.variance, self.recalibrated
         if not v or len(v) != len(r):
             raise ValueError(f"Recalibration needs knots, got {len(v)} and {len(r)} values")
+        of_variance = self.covariate == VARIANCE
         numbers = all(isinstance(x, float | int) and math.isfinite(x) for x in (*v, *r))
-        numbers = numbers and min((*v, *r)) > 0
+        numbers = numbers and min((*v, *r) if of_variance else r) > 0
         if not numbers or any(b <= a for a, b in pairwise(v)):
             raise ValueError("Recalibration.variance must hold increasing positive numbers")
-        if any(b < a for a, b in pairwise(r)):
+        if of_variance and any(b < a for a, b in pairwise(r)):
             raise ValueError("Recalibration.recalibrated must hold positive numbers that do not decrease")
 
     def __call__(self, variance: Tensor) -> Tensor:
@@ -80,7 +92,25 @@ class Recalibration(Checked, Extension):
 
     def map_variance(self, variance: Tensor) -> Tensor:
         """V' of V."""
-        return self(variance)
+        return self(variance) if self.covariate == VARIANCE else variance
+
+    def factor(self, confidence: Tensor) -> Tensor:
+        """h(c) [...] of a map of the confidence, in double precision."""
+        c, h = (torch.tensor(x, dtype=torch.float64, device=confidence.device) for x in self._knots())
+        position = confidence.double().contiguous()
+        upper = torch.searchsorted(c, position).clamp(1, len(c) - 1)
+        share = ((position - c[upper - 1]) / (c[upper] - c[upper - 1])).clamp(0, 1)
+        return torch.lerp(h.log()[upper - 1], h.log()[upper], share).exp().nan_to_num(1.0)
+
+    def of_frame(
+        self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool
+    ) -> FrameExtension:
+        """A map of the confidence during a frame. Raises ValueError: it is one, and the frame brings no confidence."""
+        if self.covariate == VARIANCE:
+            return FrameExtension()
+        if given is None:
+            raise ValueError("the recalibration is one of the confidence, but the network states none")
+        return _Scaled(self.factor(as_confidence(given, frame)))
 
     def require(self, config: UfMStarConfig, network: str = "") -> None:
         """Check that V means what it meant when the map was fitted.
@@ -110,7 +140,18 @@ class Recalibration(Checked, Extension):
         v, r = self.variance, self.recalibrated
         if len(v) > 1:
             return v, r
-        return (v[0], 2 * v[0]), (r[0], 2 * r[0])
+        return ((v[0], 2 * v[0]), (r[0], 2 * r[0])) if self.covariate == VARIANCE else ((v[0], v[0] + 1), (r[0], r[0]))
+
+
+class _Scaled(FrameExtension):
+    """V times a factor [B, H, W] during a frame."""
+
+    def __init__(self, factor: Tensor) -> None:
+        self._factor = factor
+
+    def map_variance(self, variance: Tensor, chosen: Chosen) -> Tensor:
+        """V' = h(c) V."""
+        return variance * chosen(self._factor).to(variance.dtype)
 
 
 def beside(weights: str | Path) -> Path:

@@ -55,8 +55,16 @@ class StatefulModule(nn.Module):
         chosen[given if given.numel() else given.long()] = True
         return chosen
 
+    def _settle(self) -> None:
+        """Write what is pending into the buffers, before they are saved, loaded, copied or moved."""
+
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        self._settle()
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """``.to()`` and friends, with the exceptions that the class states."""
+        self._settle()
         before = {name: getattr(self, name) for name in self.STATE}
         super()._apply(fn, recurse)
         for name, old in before.items():
@@ -94,6 +102,7 @@ class StatefulModule(nn.Module):
         Raises:
             ValueError: tensors that do not fit together, or values that no run can produce.
         """
+        self._settle()
         try:
             saved = {
                 n: _fitting(n, state_dict[prefix + n], getattr(self, n)) for n in self.STATE if prefix + n in state_dict

@@ -4,7 +4,7 @@ The mixture is kept in the frame of each stream's first camera: poses are taken 
 float64, so large world coordinates never reach the float32 state, and what a frame does not update never changes.
 
 :class:`Step` is what ``UfMStar`` calls; :func:`step` is the reference. Its kernels can be replaced one by one
-(``step_parts``), as for GPUs; the CPU's compiled step (``kernels.step_cpu``) has the same signature.
+(``step_parts``); another implementation of the whole step has the same signature.
 """
 
 from __future__ import annotations
@@ -58,6 +58,7 @@ def step(
     extensions: FrameExtensions = NONE,
     observer: StepObserver | None = None,
     kernels: Kernels = REFERENCE,
+    grow: bool = True,
 ) -> tuple[UfMStarState, StepOutput]:
     """Segment, correspond, fuse, regress (section "Uncertainty from Motion*", steps 2 to 5).
 
@@ -70,6 +71,7 @@ def step(
         extensions: what they do during this frame.
         observer: is called after every stage.
         kernels: which implementation of each part.
+        grow: whether the mixture may get more slots; False: the caller has seen to it.
 
     Returns:
         The new state and the output. A stream whose frame is at fault keeps its state and gets NaN.
@@ -94,7 +96,7 @@ def step(
     far_enough = current_cam.mean[..., 2] > config.near_plane
     new = current_cam.valid & far_enough & ~matched
     current_first = current_cam.rigid(*relative_pose(frame.T_world_cam, first))
-    needed, rounds = _room(mixture, pairs, new, config)
+    needed, rounds = _room(mixture, pairs, new, config, grow)
     mixture = mixture.grown(needed, config.max_components)
     mixture = kernels.fuse(mixture, current_first, pairs.padded(mixture.capacity), config, rounds=rounds)
     stage("fuse")
@@ -186,7 +188,7 @@ def _segment(
 
 
 def _room(
-    mixture: GaussianMixture, pairs: Correspondence, new: Tensor, config: UfMStarConfig
+    mixture: GaussianMixture, pairs: Correspondence, new: Tensor, config: UfMStarConfig, grow: bool
 ) -> tuple[int, int | None]:
     """Slots that the frame needs, and a bound on the matches of any one component (None: the kernel reads it).
 
@@ -197,7 +199,7 @@ def _room(
         ValueError: growth on the meta device, which has no values.
     """
     device, limit = mixture.mean.device.type, config.max_components
-    if device != "cpu" and limit is not None and mixture.capacity >= limit:
+    if not grow or (device != "cpu" and limit is not None and mixture.capacity >= limit):
         return mixture.capacity, pairs.match.shape[1]
     if device == "meta":
         raise ValueError("device 'meta' needs max_components <= initial_capacity")

@@ -18,7 +18,7 @@ from ufmstar_torch.extension import Extension
 from ufmstar_torch.extensions import extensions_of
 from ufmstar_torch.fixed_order import apply
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import select_check, select_step
+from ufmstar_torch.kernels.select import LateStep, select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.network_variance import NetworkVariance
 from ufmstar_torch.output import MeanUncertainty, StepOutput, UfMStarOutput
@@ -26,6 +26,7 @@ from ufmstar_torch.regress import Regression, regress
 from ufmstar_torch.sample import mean_uncertainty, sample_pixels, sample_size
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
+from ufmstar_torch.step import Step
 from ufmstar_torch.step_parts import StepObserver
 from ufmstar_torch.stream_warnings import StreamWarnings
 from ufmstar_torch.warm_up import warm_up
@@ -61,6 +62,7 @@ class UfMStar(StatefulModule):
     STATE = UfMStarState.names()
     config: UfMStarConfig
     observer: StepObserver | None = None
+    _kept_step: tuple[tuple[str, str], Step] | None = None
 
     def __init__(
         self,
@@ -230,8 +232,8 @@ class UfMStar(StatefulModule):
     @property
     def state(self) -> UfMStarState:
         """The state as a step (``ufmstar_torch.step``) takes it."""
-        buffers = cast("dict[str, Tensor]", self._buffers)  # none is None; without the detour by ``__getattr__``
-        return self._empty.with_tensors(buffers)
+        self._settle()
+        return self._stored()
 
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget everything, or only some streams.
@@ -294,7 +296,7 @@ class UfMStar(StatefulModule):
                 raise_faults(frame)
             if self.observer is not None:
                 self.observer.stage("check")
-            step = select_step(self.config.backend, frame.depth.device.type)
+            step = self._step(frame.depth.device.type)
             state, out = step(
                 state, frame, self.config, pixels=pixels, smooth=average, extensions=extensions, observer=self.observer
             )
@@ -307,8 +309,31 @@ class UfMStar(StatefulModule):
         self._warnings.after_frame(frame, out.statistics, state.frames, self.config)
         return out, maps
 
+    def _stored(self) -> UfMStarState:
+        buffers = cast("dict[str, Tensor]", self._buffers)  # none is None; without the detour by ``__getattr__``
+        return self._empty.with_tensors(buffers)
+
+    def _step(self, device_type: str) -> Step:
+        """The step for a device, the same one as long as the state goes on."""
+        key = (self.config.backend, device_type)
+        if self._kept_step is None or self._kept_step[0] != key:
+            self._settle()
+            self._kept_step = key, select_step(*key)
+        return self._kept_step[1]
+
+    def _settle(self) -> None:
+        """Write the step's pending components into the state before it is saved, copied or moved."""
+        if self._kept_step is not None and isinstance(self._kept_step[1], LateStep):
+            with outliving(), torch.no_grad():
+                self._store(self._kept_step[1].settled(self._stored(), self.config).tensors())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy starts with a step of its own."""
+        self._settle()
+        return self.__dict__ | {"_kept_step": None}
+
     def _state_for(self, frame: FrameInput) -> UfMStarState:
-        state = self.state
+        state = self._stored()
         streams, device, mean = len(frame.depth), frame.depth.device, state.mean
         if len(mean) == 0:
             return self._extensions.initial(streams, self.config, mean.dtype, device)

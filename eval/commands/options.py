@@ -33,9 +33,11 @@ from __future__ import annotations
 import types
 from argparse import SUPPRESS, Action
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from functools import cache, reduce
 from operator import or_
+from os.path import isfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -43,6 +45,8 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
     from jsonargparse import ArgumentParser
 
+# Limits of a configuration file; the settings of all commands together are 3 levels deep and have 300 values.
+_CONFIG_BYTES, _CONFIG_DEPTH, _CONFIG_VALUES = 1_000_000, 50, 100_000
 _HELP_ALL = "--help-all"
 T = TypeVar("T", bound="DataclassInstance")
 
@@ -126,6 +130,13 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
     the options with a dot in their name (``--ufm.eta``) only if it is ``full``."""
     from jsonargparse import ActionConfigFile, ArgumentParser, DefaultHelpFormatter
 
+    class BoundedConfigFile(ActionConfigFile):
+        """Check the size and nesting of a configuration before it is parsed."""
+
+        def __call__(self, parser: Any, cfg: Any, values: Any, option_string: Any = None) -> None:
+            _require_bounded(values)
+            super().__call__(parser, cfg, values, option_string)
+
     class Formatter(DefaultHelpFormatter):
         """Leaves out the default of a flag, which would be the field's (--no-register: True), and None."""
 
@@ -138,10 +149,43 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
     parser = ArgumentParser(
         prog=prog, usage=usage, description=description, exit_on_error=False, formatter_class=Formatter
     )
-    parser.add_argument("--config", action=ActionConfigFile, help="JSON or YAML file with any of these options")
+    parser.add_argument("--config", action=BoundedConfigFile, help="JSON or YAML file with any of these options")
     parser.add_argument(_HELP_ALL, action="store_true", help="show every option, those of all settings included")
     _add_options(parser, parser, options, full)
     return parser
+
+
+def _require_bounded(config: str) -> None:
+    """Check a configuration, a file's name or the text itself, by YAML's events, which neither recurse nor expand.
+
+    Raises:
+        ValueError: it is larger than 1 MB, nested deeper than 50 levels, or has over 100,000 values with its aliases
+            expanded; the message names it.
+    """
+    import yaml
+
+    name, text = "--config", config
+    if isfile(config):
+        name = f"--config {config}"
+        with open(config, "rb") as opened:
+            text = opened.read(_CONFIG_BYTES + 1).decode(errors="replace")
+    if len(text) > _CONFIG_BYTES:
+        raise ValueError(f"{name} is larger than {_CONFIG_BYTES:,} bytes, which no configuration needs")
+    values, sizes, open_nodes = 0, dict[str, int](), list[tuple[str | None, int]]()
+    with suppress(yaml.YAMLError):  # reported by the parser
+        for event in yaml.parse(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+            if isinstance(event, yaml.CollectionStartEvent):
+                open_nodes.append((event.anchor, values))
+            elif isinstance(event, yaml.CollectionEndEvent):
+                anchor, before = open_nodes.pop()
+                sizes[anchor or ""] = values - before
+            elif isinstance(event, yaml.AliasEvent):  # of an unfinished collection: it would contain itself
+                values += sizes.get(event.anchor, _CONFIG_VALUES)
+            values += isinstance(event, yaml.NodeEvent)
+            if len(open_nodes) > _CONFIG_DEPTH:
+                raise ValueError(f"{name} is nested deeper than {_CONFIG_DEPTH} levels")
+            if values > _CONFIG_VALUES:
+                raise ValueError(f"{name} has more than {_CONFIG_VALUES:,} values with its aliases expanded")
 
 
 def as_dict(options: Any) -> dict[str, Any]:

@@ -128,6 +128,7 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     """Write scores.csv, the contact sheet and rank.json, and print the first images; the exit code."""
     import pandas as pd
 
+    from ufmstar_torch.eval.report.table import csv_text
     from ufmstar_torch.eval.report.text import aligned
     from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
     from ufmstar_torch.eval.run.panels import contact_sheet
@@ -137,7 +138,7 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     rest = sorted(set(range(len(scores.images))) - set(chosen))
     lines = [{"rank": n, **scores.images[i].line} for n, i in enumerate(chosen, start=1)]
     lines += [{"rank": None, **scores.images[i].line} for i in rest]
-    table = pd.DataFrame(lines, dtype=object).to_csv(index=False, lineterminator="\n")
+    table = pd.DataFrame(lines, dtype=object).map(csv_text).to_csv(index=False, lineterminator="\n")
     write_atomic(out / SCORES, lambda file: file.write(table.encode()))
     files = [SCORES]
     if panels := scores.panels():

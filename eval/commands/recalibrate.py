@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ufmstar_torch.eval.commands.options import UsageError, positional, reader
+from ufmstar_torch.eval.commands.options import UsageError, option, positional, reader
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.methods.row import Row
     from ufmstar_torch.eval.metrics.recalibration import Array
     from ufmstar_torch.eval.report.data import Results
     from ufmstar_torch.recalibrate import Recalibration
+
+
+CONFIDENCE = "confidence"  # as ``engine.judge`` names its samples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,12 +31,14 @@ class RecalibrateOptions:
         out: folder of `ufmstar eval`
         row: the row, as the table names it: UfM*-DepthOnly, say
         to: file of the map; WEIGHTS.recalibration.json beside the weights is used without being named
+        covariate: what it is a map of: the variance, or a factor of it by the network's confidence
         debug: show tracebacks
     """
 
     out: Path = positional()
     row: str
     to: Path
+    covariate: str = option("variance", choices=("variance", CONFIDENCE))
     debug: bool = False
 
 
@@ -43,7 +48,6 @@ read = reader(RecalibrateOptions, "ufmstar recalibrate")
 def main(options: RecalibrateOptions) -> int:
     """Fit, write the file, and print how well it fits sequences that it was not fitted to; the exit code."""
     from ufmstar_torch.eval.methods.method import UFM_STAR
-    from ufmstar_torch.eval.metrics.recalibration import fit
     from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import aligned
 
@@ -54,20 +58,27 @@ def main(options: RecalibrateOptions) -> int:
         if row is None:
             labels = ", ".join(row.label for row in rows) or "(none: no row of UfM*)"
             raise ValueError(f"--row must be one of {labels}, got {options.row!r}")
-        counts = _counts(results, row)
-        fitted = fit(list(counts.values()))
+        counts = _counts(results, row, options.covariate)
+        fitted = _fit(list(counts.values()), options.covariate)
         _about(fitted, results, row).save(options.to)
     except ValueError as error:
         raise UsageError(error) from error
-    print("\n".join(aligned(_table(counts))))
+    print("\n".join(aligned(_table(counts, options.covariate))))
     if len(counts) == 1:
         print("fitted to a single sequence, on which it is not judged: evaluate more of them")
     print(f"{options.to}: {len(fitted.variance)} knots, fitted to {len(counts)} sequences")
     return 0
 
 
-def _counts(results: Results, row: Row) -> dict[str, Array]:
-    """[V, e] pixels of every sequence by variance and squared error, by "DATASET/SEQUENCE"."""
+def _fit(counts: Sequence[Array], covariate: str) -> Recalibration:
+    from ufmstar_torch.eval.metrics.recalibration import fit, fit_confidence
+
+    return fit_confidence(counts) if covariate == CONFIDENCE else fit(counts)
+
+
+def _counts(results: Results, row: Row, covariate: str) -> dict[str, Array]:
+    """[V, e] pixels of every sequence by variance and squared error, by "DATASET/SEQUENCE"; for the confidence samples
+    [n, 3]. Raises ValueError: the network states none."""
     from ufmstar_torch.eval.engine.judge import METRICS
     from ufmstar_torch.eval.report.data import read_sums
     from ufmstar_torch.eval.suite.work_items import WorkItem
@@ -76,20 +87,26 @@ def _counts(results: Results, row: Row) -> dict[str, Array]:
     for record in results.of(row):
         item = WorkItem(record.dataset, record.sequence, path="", layout="")
         path = results.out / "records" / item.folder / f"{row.slug}.pt"
-        counts[item.label] = read_sums(path)[METRICS]["metrics.SpearmanCorrelation.joint"].double().numpy()
+        sums = read_sums(path)
+        if covariate == CONFIDENCE and CONFIDENCE not in sums:
+            raise ValueError(f"--covariate confidence needs a network that states one: {row.label} has none")
+        chosen = (CONFIDENCE, "samples") if covariate == CONFIDENCE else (METRICS, "metrics.SpearmanCorrelation.joint")
+        counts[item.label] = sums[chosen[0]][chosen[1]].double().numpy()
     return counts
 
 
-def _table(counts: Mapping[str, Array]) -> list[list[str]]:
+def _table(counts: Mapping[str, Array], covariate: str) -> list[list[str]]:
     """Figures of every sequence as it is, and under the map that was fitted to the others."""
-    from ufmstar_torch.eval.metrics.recalibration import figures, fit
+    from ufmstar_torch.eval.metrics.recalibration import figures, figures_of_samples
     from ufmstar_torch.eval.report.text import number
+
+    judged = figures_of_samples if covariate == CONFIDENCE else figures
 
     lines = [["", "coverage error", "recalibrated", "NLL", "recalibrated"]]
     for name, joint in counts.items():
         others = [other for label, other in counts.items() if label != name]
-        before = figures(joint, None)
-        after = figures(joint, fit(others)) if others else dict.fromkeys(before)
+        before = judged(joint, None)
+        after = judged(joint, _fit(others, covariate)) if others else dict.fromkeys(before)
         lines.append([name, *(number(of[key]) for key in ("coverage_error", "nll") for of in (before, after))])
     return lines
 

@@ -182,7 +182,7 @@ class Gaussians(Estimator):
         out = self.model.update(used, T_world_cam, predicted.intrinsics, anchors=anchors)
         anchors_used = out.statistics.anchors_used
         self._anchors = 0 if anchors_used is None else int(anchors_used[0])
-        answer = {name: getattr(out, name) for name in _OF_OUTPUT}
+        answer = {name: getattr(out, name) for name in _OF_OUTPUT} | {"confidence": used.confidence}
         if self._setting.posterior:
             answer["depth"], answer["variance"] = out.posterior()
         elif self._setting.corrected:

@@ -30,7 +30,8 @@ if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence with
 # Names of a run's figures: UfM*, beside it the network alone, and the posterior if there is one.
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Names of a row's sums.
-METRICS, BY_ERROR = "metrics", "nll_by_error"
+METRICS, BY_ERROR, CONFIDENCE = "metrics", "nll_by_error", "confidence"
+EACH = 512  # pixels of a frame, evenly, for ``ufmstar recalibrate --kind confidence``
 # Metrics of one's own by name (``sequences.plugins``).
 Own = Mapping[str, Any]
 NONE: Own = MappingProxyType({})
@@ -100,7 +101,7 @@ class RowFigures:
     state: dict[str, float]
     ms: dict[str, float]
     # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and "nll_by_error:REFERENCE"
-    # (``NLLByError``), to be added up over sequences.
+    # (``NLLByError``), to be added up over sequences; and "confidence", samples of pixels (``_samples``).
     sums: dict[str, dict[str, Tensor]]
 
 
@@ -112,6 +113,7 @@ class RowJudge:
         self.row, self.named, self._bins, self._own = row, named, bins, own
         self._metrics: dict[str, SequenceMetrics] = {}
         self._by_error: dict[str, NLLByError] = {}
+        self._samples: list[Tensor] = []
         self._judged, self.reasons, self._idle = 0, Counter[str](), Counter[str]()
         self._ms: list[Mapping[str, float]] = []
         self._memory: list[Mapping[str, float]] = []
@@ -142,6 +144,8 @@ class RowJudge:
         metrics_of(self._metrics, METRICS, **how).update(depth, variance, target)
         if variance is None:
             return
+        if result.confidence is not None:
+            self._samples.append(_samples(result.confidence, depth, variance, target))
         for other, name in self.named.items():
             by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
             by_error.update(depth, variance, target, masks[other])
@@ -159,6 +163,8 @@ class RowJudge:
         for name, by_error in self._by_error.items():
             curves[name] = by_error.compute()["nll_by_error"].tolist()
             sums[name] = by_error.state_dict()
+        if self._samples:
+            sums[CONFIDENCE] = {"samples": torch.cat(self._samples)}
         stages = ("network", "anchors", "uncertainty")
         times = {stage: [ms[stage] for ms in self._ms if stage in ms] for stage in stages}
         return RowFigures(
@@ -202,6 +208,13 @@ class RowJudges(FrameSink):
         masks = {other: confident_pixels(result.rows[other]) for other in expected}
         for key, row in result.rows.items():
             self._judges[key].add(row, self._rows[key].memory(), masks)
+
+
+def _samples(confidence: Tensor, depth: Tensor, variance: Tensor, target: Tensor) -> Tensor:
+    """[n, 3] float64 confidence, variance [m^2] and squared error [m^2] at ``EACH`` of the pixels with all of them."""
+    maps = torch.stack([confidence, variance, (target - depth).square()], -1).double()
+    known = maps[(target > 0) & maps.isfinite().all(-1) & (variance > 0)]
+    return known[:: max(1, -(-len(known) // EACH))]
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:

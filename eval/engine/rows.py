@@ -44,6 +44,7 @@ class RowResult:
     posterior_depth: Tensor | None = None  # of UfM* with anchors and a posterior [m], or None
     posterior_variance: Tensor | None = None  # likewise [m^2]
     statistics: FrameStatistics | None = None  # of UfM*, [1] per count, or None
+    confidence: Tensor | None = None  # of the prediction, in its own unit, where UfM* had it; or None
     network_variance: Tensor | None  # A + E of the prediction, whatever the row uses [m^2]; None if it states neither
     intrinsics: NDArray[np.float64]  # [3, 3] of the maps [px]
     # [h, w] ground truth at the maps' pixels [m], 0 = none; None without a depth map.

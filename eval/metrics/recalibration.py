@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.metrics.pixel_sums import HIGH, LOW
-from ufmstar_torch.recalibrate import Recalibration
+from ufmstar_torch.recalibrate import CONFIDENCE, Recalibration
 
 Array = NDArray[np.float64]
 # Levels of |z| of a standard normal variable at which errors are compared with it. The outer tenth is left out:
 # gross errors of the depth would set the variance of all other pixels.
 LEVELS = np.arange(0.1, 0.91, 0.1)
-GROUPS = 32
+GROUPS, CONFIDENCE_GROUPS = 32, 16
+LARGEST = 25.0  # squared error over the variance that counts, as of anchors (``ConfidenceConfig.largest``)
 
 
 def centres(bins: int) -> Array:
@@ -57,6 +58,52 @@ def fit(joints: Sequence[Array], groups: int = GROUPS) -> Recalibration:
     fitted = isotonic_regression(np.log(scales), weights=np.array(mass)).x
     rising = [0, *(i for i in range(1, len(knots)) if knots[i] > knots[i - 1] * 1.0001)]
     return Recalibration(tuple(knots[i] for i in rising), tuple(float(np.exp(fitted[i])) for i in rising))
+
+
+def fit_confidence(samples: Sequence[Array], groups: int = CONFIDENCE_GROUPS) -> Recalibration:
+    """The factor of the variance as a monotone function of the confidence that fits some sequences.
+
+    Every sequence has the same weight. Its pixels are divided by confidence into groups of one size; each group's
+    factor is the mean of the squared error over the variance, at most ``LARGEST``; an isotonic regression of its
+    logarithm, rising or falling, whichever fits better, makes it monotone.
+
+    Args:
+        samples: of each sequence, [n, 3] confidence, variance [m^2] and squared error [m^2].
+        groups: at most; fewer where many pixels have one confidence.
+
+    Raises:
+        ValueError: a sequence without a pixel.
+    """
+    from scipy.optimize import isotonic_regression
+
+    if not samples or any(not len(of_sequence) for of_sequence in samples):
+        raise ValueError("a recalibration needs pixels with ground truth of every sequence")
+    weight = np.concatenate([np.full(len(of_sequence), 1 / len(of_sequence)) for of_sequence in samples])
+    c, variance, error = np.concatenate(samples).T
+    ratio = np.minimum(error / variance, LARGEST)
+    _, at = np.unique(c, return_inverse=True)  # pixels of one confidence stay together
+    upto = np.cumsum(np.bincount(at, weight)) / weight.sum()
+    group = np.minimum((upto * groups - 1e-9).astype(int), groups - 1)[at]
+    mass = np.bincount(group, weight, minlength=groups)
+    full = np.flatnonzero(mass)
+    knots = [float(np.median(c[group == k])) for k in full]
+    scales = np.log(np.maximum(np.bincount(group, weight * ratio, minlength=groups)[full] / mass[full], 1 / LARGEST))
+    fits = [isotonic_regression(scales, weights=mass[full], increasing=rising).x for rising in (True, False)]
+    best = min(fits, key=lambda fitted: float((mass[full] * (scales - fitted) ** 2).sum()))
+    return Recalibration(tuple(knots), tuple(float(x) for x in np.exp(best)), CONFIDENCE)
+
+
+def figures_of_samples(samples: Array, recalibration: Recalibration | None) -> dict[str, float]:
+    """As :func:`figures`, from samples as :func:`fit_confidence` takes them."""
+    import torch
+
+    c, variance, error = samples.T
+    if recalibration is not None:
+        variance = variance * recalibration.factor(torch.from_numpy(np.ascontiguousarray(c))).numpy()
+    ratio = error / variance
+    inside = [(ratio <= z**2).mean() for z in _normal(LEVELS)]
+    nll = 0.5 * (ratio + np.log(2 * math.pi * variance))
+    return {"coverage_error": float(np.abs(np.array(inside) - LEVELS).mean()), "nll": float(nll.mean())}
 
 
 def figures(joint: Array, recalibration: Recalibration | None) -> dict[str, float]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.judge import METRICS
+from ufmstar_torch.eval.engine.judge import CONFIDENCE, METRICS
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.methods.setting import Setting
@@ -269,6 +269,8 @@ def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Merge
         total: Sums = {}  # added in the order of the files, which decides the last bits
         for path in files:
             for name, states in read_sums(path).items():
+                if name == CONFIDENCE:  # samples, no sums
+                    continue
                 mine = total.setdefault(name, {key: torch.zeros_like(value) for key, value in states.items()})
                 if {key: value.shape for key, value in mine.items()} != {k: v.shape for k, v in states.items()}:
                     raise ResultsError(f"{path} holds sums of other metrics than the sequences before it ({name})")

@@ -1,10 +1,10 @@
-"""A table of printed cells, and its files: LaTeX (booktabs) and Markdown; ``report.html.j2`` has its HTML."""
+"""A table of printed cells, and its files: LaTeX (booktabs), CSV and Markdown; ``report.html.j2`` has its HTML."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, NamedTuple
@@ -129,8 +129,13 @@ def markdown(table: Table) -> str:
 
 
 def markdown_text(text: str) -> str:
-    """Plain text for Markdown, on one line: nothing of it becomes emphasis, code, HTML, a formula or a link."""
-    return re.sub(r"([\\|*_<`\[\]~$])", r"\\\1", " ".join(text.split()))
+    """Plain text for Markdown, on one line: nothing of it becomes emphasis, code, HTML, a formula or a link.
+
+    Links without brackets ("https://...", "www...", addresses with an @) are known by letters alone, which cannot be
+    escaped: an invisible word joiner (U+2060) breaks them.
+    """
+    text = re.sub(r"([\\|*_<`\[\]~$])", r"\\\1", " ".join(text.split()))
+    return re.sub(r"(?i)://|(?<=\bwww)\.|(?<=\w)@(?=\w)", lambda mark: f"\u2060{mark[0]}", text)
 
 
 def _markdown_cell(cell: Cell) -> str:
@@ -196,3 +201,33 @@ def _latex_cell(cell: Cell) -> str:
     value = rf"\mathbf{{{cell.value}}}" if cell.bold else cell.value
     text = f"${value} \\pm {cell.half}$" if cell.half else f"${value}$"
     return f"{text} ({latex_text(cell.remark)})" if cell.remark else text
+
+
+# ---- CSV ----
+
+
+def table_csv(tables: Iterable[Table]) -> str:
+    """Tables below each other: title, label, and for each column its value and, where any has one, its half-width."""
+    frames = []
+    for table in tables:
+        columns: dict[str, list[str]] = {
+            "table": [table.title] * len(table.lines), table.first: [line.label for line in table.lines],
+        }  # fmt: skip
+        for column, cells in zip(table.columns, zip(*(line.cells for line in table.lines), strict=True), strict=True):
+            columns[column.label] = [cell.value for cell in cells]
+            if any(cell.half for cell in cells):
+                columns[f"{column.label} ±"] = [cell.half for cell in cells]
+        frames.append(pd.DataFrame(columns, dtype=object))
+    return pd.concat(frames).map(csv_text).to_csv(index=False, lineterminator="\n")
+
+
+def csv_text(value: Any) -> str:
+    """A CSV field: text that a spreadsheet would take for a formula gets an apostrophe, numbers do not."""
+    text = "" if value is None or value != value else str(value)
+    if text[:1] not in ("=", "+", "-", "@", "\t", "\r"):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text

@@ -34,7 +34,7 @@ from ufmstar_torch.eval.report.names import (
     shared_words,
 )
 from ufmstar_torch.eval.report.paper import PaperTable, paper_table_of
-from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, latex, mark_best, markdown
+from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, csv_text, latex, mark_best, markdown, table_csv
 from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.eval.suite.record import Record
 
@@ -224,7 +224,7 @@ def _cost_note(efficiency: Mapping[str, Any]) -> str:
 
 
 def write_tables(results: Results) -> list[Path]:
-    """Write ``tables/NAME.md`` and ``.tex``: those of :func:`overview`, ``sequences-DATASET`` for single
+    """Write ``tables/NAME.md``, ``.tex`` and ``.csv``: those of :func:`overview`, ``sequences-DATASET`` for single
     sequences, and ``efficiency`` with the paper's table 2 below ours where it was measured; their paths."""
     folder = results.out / "tables"
     folder.mkdir(exist_ok=True)
@@ -232,7 +232,11 @@ def write_tables(results: Results) -> list[Path]:
     for name, tables in _table_files(results):
         shown = [table for table in tables if not table.is_empty]
         if shown:
-            forms = {"md": "\n".join(map(markdown, shown)), "tex": "\n".join(map(latex, shown))}
+            forms = {
+                "md": "\n".join(map(markdown, shown)),
+                "tex": "\n".join(map(latex, shown)),
+                "csv": table_csv(shown),
+            }
             written += [_write_text(folder / f"{name}.{kind}", text) for kind, text in forms.items()]
     return written
 
@@ -279,7 +283,8 @@ def _values(record: Record) -> Iterator[tuple[str, float | None]]:
 
 def _tidy_csv(lines: Sequence[Mapping[str, Any]]) -> str:
     """Lines with a column for each setting; numbers in full, nothing for a missing value."""
-    rows = [{**line, **line["setting"]} for line in lines]
+    flat = ({**line, **line["setting"]} for line in lines)
+    rows = [{name: csv_text(v) if isinstance(v, str) else v for name, v in line.items()} for line in flat]
     return pd.DataFrame(rows, dtype=object).drop(columns="setting").to_csv(index=False, lineterminator="\n")
 
 

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.run_folder import Checkpoint, RunFolder
 from ufmstar_torch.eval.run.summary import GOING_ON, NEAR_ZERO, write_summary
-from ufmstar_torch.eval.run.writers import frame_file, write_frame
+from ufmstar_torch.eval.run.writers import frame_file, write_frame, write_pngs
 from ufmstar_torch.eval.sequences.frame import Frame
 
 _MAPS = ("depth", "variance", "disagreement", "measured", "anchored", "bias", "posterior_depth", "posterior_variance")
@@ -31,7 +31,7 @@ class FrameRecorder(FrameSink):
 
     def __init__(self, job: RunJob, folder: RunFolder, metrics: RunMetrics) -> None:
         self._job, self._folder, self._metrics = job, folder, metrics
-        self._earlier = list(folder.checkpoint.sessions)
+        self._earlier, self._unit = list(folder.checkpoint.sessions), folder.checkpoint.unit
         self._saving = 0.0
 
     def begin(self, stream: FrameStream) -> None:
@@ -45,6 +45,7 @@ class FrameRecorder(FrameSink):
         session = {"first": self._first, "frames": frames, "seconds": perf_counter() - self._started}
         checkpoint = Checkpoint(
             position=result.number + 1,
+            unit=self._unit,
             state=dict(result.state[UFM]),
             metrics=self._metrics.sums(),
             sessions=[*self._earlier, session],
@@ -75,7 +76,8 @@ class FrameRecorder(FrameSink):
             "intrinsics": row.intrinsics,
             **_anchor_array(result.frame, row),
         }
-        write_frame(frame_file(self._folder.path, result.name), row.valid, camera, **maps)
+        written = write_frame(frame_file(self._folder.path, result.name), row.valid, camera, **maps)
+        self._unit = write_pngs(self._folder.path, result.name, written, self._unit)
         times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
         return {**about, "state": "done", **_figures(row), **times, **_anchor_figures(row)}
 

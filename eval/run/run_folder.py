@@ -25,7 +25,7 @@ from torch import Tensor
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.files import to_json, write_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
-from ufmstar_torch.eval.run.writers import FRAMES, frame_file
+from ufmstar_torch.eval.run.writers import FRAMES, PNGS, frame_file
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
 from ufmstar_torch.models.checkpoints import read_tensors
 
@@ -38,7 +38,14 @@ RUN = FolderKind(
     manifest="resume/run.json",
     format=4,
     lock="resume/lock",
-    clear=remover(f"{FRAMES}/*.npz", "summary.json", RECORDS, "resume/state.pt", *_MADE_AT_END),
+    clear=remover(
+        f"{FRAMES}/*.npz",
+        *(f"{folder}/*.png" for folder in PNGS),
+        "summary.json",
+        RECORDS,
+        "resume/state.pt",
+        *_MADE_AT_END,
+    ),
     temporary=(".*.tmp", "*/.*.tmp", ".preview.*.tmp.mp4"),
 )
 
@@ -48,6 +55,7 @@ class Checkpoint:
     """The state of a run after a frame."""
 
     position: int = 0  # number of frames handled, skipped ones included
+    unit: float | None = None  # of the depth PNGs [m per count]; None: no frame is written yet
     state: dict[str, Tensor] = field(default_factory=dict)  # of the run's row: UfM*, alternation, tracks
     metrics: dict[str, dict[str, Tensor]] = field(default_factory=dict)  # sums of the metrics, by name
     # {"first", "frames", "seconds"} of every start of the program.

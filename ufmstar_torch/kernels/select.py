@@ -5,13 +5,14 @@ from __future__ import annotations
 import functools
 import warnings
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors.extension import REFERENCE as ANCHOR_REFERENCE
 from ufmstar_torch.anchors.extension import AnchorKernels
+from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import CheckKernel, check_values
 from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
 from ufmstar_torch.merge import MergeKernels
@@ -19,6 +20,7 @@ from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.posterior.update import PosteriorUpdate
 from ufmstar_torch.posterior.update import update as update_posterior
 from ufmstar_torch.segment_input import SegmentInput
+from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import Step, step
 from ufmstar_torch.step_parts import REFERENCE, Kernels, SegmentKernel
 
@@ -26,16 +28,24 @@ _TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
 _LEAST_CAPABILITY = (8, 0)  # of an NVIDIA GPU that triton supports
 
 
+@runtime_checkable
+class LateStep(Protocol):
+    """A step that keeps something of a frame for the next one."""
+
+    def settled(self, state: UfMStarState, config: UfMStarConfig, /) -> UfMStarState:
+        """The state that it returned last, with what it keeps."""
+        ...
+
+
 def select_step(name: str, device_type: str) -> Step:
-    """The step for a device.
+    """The step for a device. That of a GPU has a memory (``step_device``): one for every state.
 
     Args:
-        name: "torch": the reference on every device. "numba": compiled for the CPU, CPU tensors only. "triton": the
-            reference with kernels for a GPU; of CPU tensors only in Triton's interpreter (``TRITON_INTERPRET=1``).
-            "auto": numba on the CPU, Triton on CUDA, ROCm and XPU, each where it can be imported; on another
-            accelerator the torch reference, except that the segmentation, a long chain of tiny steps there, runs on
-            the host: the depth map is copied over, which waits for the device. Elsewhere than on the CPU a step waits
-            for the device where the mixture may have to grow.
+        name: "torch": the reference on every device; it waits for the device only where the mixture may
+            have to grow. "numba": compiled for the CPU, CPU tensors only. "triton": for a GPU; of CPU tensors only in
+            Triton's interpreter (``TRITON_INTERPRET=1``). "auto": numba on the CPU, Triton on CUDA, ROCm and XPU, each
+            where it can be imported; on another accelerator the torch reference, except that the segmentation, a long
+            chain of tiny steps there, runs on the host: the depth map is copied over, which waits for the device.
         device_type: ``torch.device.type`` of the depth.
 
     Raises:
@@ -46,6 +56,10 @@ def select_step(name: str, device_type: str) -> Step:
         from ufmstar_torch.kernels import step_cpu
 
         return step_cpu.step
+    if _on_gpu(name, device_type):
+        from ufmstar_torch.kernels.step_device import DeviceStep
+
+        return DeviceStep(_triton())
     return functools.partial(step, kernels=select_kernels(name, device_type))
 
 
@@ -55,6 +69,10 @@ def select_check(name: str, device_type: str) -> CheckKernel:
         from ufmstar_torch.kernels import check_cpu
 
         return check_cpu.check_values
+    if _on_gpu(name, device_type):
+        from ufmstar_torch.kernels.triton import check
+
+        return check.check_values
     return check_values
 
 

@@ -18,10 +18,10 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.triton.launch import launch
-from ufmstar_torch.kernels.triton.matrices import load_symmetric, lowest_bit
+from ufmstar_torch.kernels.triton.matrices import load_symmetric, lowest_bit, moved, turned
 from ufmstar_torch.mixture import GaussianMixture
 
-_AT_A_TIME = 32  # candidates that a program compares together
+WORD = 32  # candidates c in one entry of ``Pairs.bits``
 _CHUNK = 64
 
 
@@ -32,11 +32,13 @@ class Candidates:
     Attributes:
         image: [B, 6, N] float64 u, v [px], the projected covariance xx, xy, yy [px^2], z [m].
         index: [B, N] int32 into the mixture.
+        place: [B, N] int32 of a component in the list, -1 = not in view.
         count: [B] int32.
     """
 
     image: Tensor
     index: Tensor
+    place: Tensor
     count: Tensor
 
     @classmethod
@@ -45,12 +47,12 @@ class Candidates:
         b, n = mixture.weight.shape
         device = mixture.mean.device
         image = torch.empty(b, 6, n, dtype=torch.float64, device=device)
-        index = torch.empty(b, n, dtype=torch.int32, device=device)
-        return cls(image, index, torch.empty(b, dtype=torch.int32, device=device))
+        index, place = torch.empty(2, b, n, dtype=torch.int32, device=device).unbind(0)
+        return cls(image, index, place, torch.empty(b, dtype=torch.int32, device=device))
 
     def tensors(self) -> tuple[Tensor, ...]:
         """As kernels take them."""
-        return self.image, self.index, self.count
+        return self.image, self.index, self.place, self.count
 
 
 def correspond(
@@ -65,20 +67,77 @@ def correspond(
     shape = (b, current_cam.capacity, previous_cam.capacity)
     match = torch.zeros(shape, dtype=torch.bool, device=device)
     overlap = torch.zeros(shape, dtype=torch.float64, device=device)
+    still = torch.eye(3, dtype=torch.float64, device=device).repeat(b, 1, 1), match.new_zeros(b, 3, dtype=torch.float64)
     camera = intrinsics.to(torch.float64).contiguous()
-    previous, current = Candidates.room(previous_cam), Candidates.room(current_cam)
+    previous, current = candidates(previous_cam, still, current_cam, camera, size, config)
+    matched, pairs = match.new_zeros(b, 1), match.new_zeros(b, dtype=torch.int64)
+    _launch_match(
+        previous, current, config, match, overlap, match.new_zeros(1, dtype=torch.int64), matched, pairs, True
+    )
+    return Correspondence(match, overlap)
+
+
+def candidates(
+    previous: GaussianMixture,
+    motion: tuple[Tensor, Tensor],
+    current_cam: GaussianMixture,
+    camera: Tensor,
+    size: tuple[int, int],
+    config: UfMStarConfig,
+) -> tuple[Candidates, Candidates]:
+    """The components in view of the mixture, and of the image's own Gaussians.
+
+    Args:
+        previous: M_(i-1), [B, K].
+        motion: R [B, 3, 3] and t [B, 3] float64 that take ``previous`` into the camera frame.
+        current_cam: C_i in the camera frame, [B, C].
+        camera: [B, 3, 3] float64 [px].
+        size: H and W [px].
+        config: near_plane.
+    """
+    rooms = Candidates.room(previous), Candidates.room(current_cam)
     launch(
-        _project, (b, 2),
-        *_geometry(previous_cam), *_geometry(current_cam), camera, *previous.tensors(), *current.tensors(),
-        previous_cam.capacity, current_cam.capacity, *size, near_plane=config.near_plane, widening=PIXEL_VARIANCE,
+        _project, (previous.streams, 2),
+        *_geometry(previous), *motion, *_geometry(current_cam), camera, *rooms[0].tensors(), *rooms[1].tensors(),
+        previous.capacity, current_cam.capacity, *size, near_plane=config.near_plane, widening=PIXEL_VARIANCE,
         chunk=_CHUNK, warps=2,
     )  # fmt: skip
+    return rooms
+
+
+def match_bits(
+    previous: Candidates, current: Candidates, config: UfMStarConfig, pairs: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The matches of every candidate of the mixture.
+
+    Args:
+        previous, current: of :func:`candidates`.
+        config: eta, eta_occlusion.
+        pairs: [B] int64, to which the number of pairs is added.
+
+    Returns:
+        Bits [B, K, ceil(C/32)] int64: bit i of word w of the k-th listed candidate stands for the (32 w + i)-th listed
+        candidate of the image; only the words of listed candidates are written. Which of the image's Gaussians matched
+        [B, C] bool.
+    """
+    (b, k), c = previous.index.shape, current.index.shape[1]
+    bits = torch.empty(b, k, triton.cdiv(c, WORD), dtype=torch.int64, device=previous.index.device)
+    matched = torch.zeros(b, c, dtype=torch.bool, device=bits.device)
+    _launch_match(previous, current, config, matched, previous.image, bits, matched, pairs, False)
+    return bits, matched
+
+
+def _launch_match(
+    previous: Candidates, current: Candidates, config: UfMStarConfig,
+    match: Tensor, overlap: Tensor, bits: Tensor, matched: Tensor, pairs: Tensor, dense: bool,
+) -> None:  # fmt: skip
+    (b, k), c = previous.index.shape, current.index.shape[1]
     launch(
-        _match, (previous_cam.capacity, b),
-        *previous.tensors(), *current.tensors(), match, overlap, previous_cam.capacity, current_cam.capacity,
-        eta=config.eta, eta_occlusion=config.eta_occlusion, chunk=_AT_A_TIME, warps=1,
+        _match, (k, b),
+        previous.image, previous.index, previous.count, current.image, current.index, current.count,
+        match, overlap, bits, matched, pairs, k, c,
+        eta=config.eta, eta_occlusion=config.eta_occlusion, dense=dense, chunk=WORD, warps=1,
     )  # fmt: skip
-    return Correspondence(match, overlap)
 
 
 def _geometry(mixture: GaussianMixture) -> tuple[Tensor, Tensor, Tensor]:
@@ -87,10 +146,10 @@ def _geometry(mixture: GaussianMixture) -> tuple[Tensor, Tensor, Tensor]:
 
 @triton.jit
 def _project_listed(
-    mean, covariance, weight, camera, image, index, count, capacity, height, width, b,
-    near_plane: tl.constexpr, widening: tl.constexpr, chunk: tl.constexpr,
+    mean, covariance, weight, R, t, camera, image, index, place, count, capacity, height, width, b,
+    turn: tl.constexpr, near_plane: tl.constexpr, widening: tl.constexpr, chunk: tl.constexpr,
 ):  # fmt: skip
-    """Candidates of one stream of one mixture."""
+    """Candidates of one stream of one mixture; with ``turn`` it is moved by R and t first."""
     lane = tl.arange(0, chunk)
     fx, cx, fy, cy = tl.load(camera), tl.load(camera + 2), tl.load(camera + 4), tl.load(camera + 5)
     n = 0
@@ -102,12 +161,16 @@ def _project_listed(
         y = tl.load(mean + 3 * k + 1, mask=there, other=0.0).to(tl.float64)
         z = tl.load(mean + 3 * k + 2, mask=there, other=0.0).to(tl.float64)
         xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, there)
+        if turn:
+            x, y, z = moved(R, t, x, y, z)
+            xx, xy, xz, yy, yz, zz = turned(R, xx, xy, xz, yy, yz, zz)
         there = there & (z > near_plane)
         z = tl.where(there, z, 1.0)
         u, v = fx * x / z + cx, fy * y / z + cy
         seen = there & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
         p, q, r, s = fx / z, -fx * x / (z * z), fy / z, -fy * y / (z * z)  # J = [[p, 0, q], [0, r, s]]
         at = n + tl.cumsum(seen.to(tl.int32), 0) - 1
+        tl.store(place + k, tl.where(seen, at, -1), mask=first + lane < capacity)
         tl.store(index + b * capacity + at, (first + lane).to(tl.int32), mask=seen)
         out = image + 6 * b * capacity + at
         tl.store(out, u, mask=seen)
@@ -122,21 +185,21 @@ def _project_listed(
 
 @triton.jit
 def _project(
-    mean_k, covariance_k, weight_k, mean_c, covariance_c, weight_c, camera,
-    image_k, index_k, count_k, image_c, index_c, count_c, many_k, many_c, height, width,
+    mean_k, covariance_k, weight_k, R, t, mean_c, covariance_c, weight_c, camera,
+    image_k, index_k, place_k, count_k, image_c, index_c, place_c, count_c, many_k, many_c, height, width,
     near_plane: tl.constexpr, widening: tl.constexpr, chunk: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(0).to(tl.int64)
-    camera += 9 * b
+    R, t, camera = R + 9 * b, t + 3 * b, camera + 9 * b
     if tl.program_id(1) == 0:
         _project_listed(
-            mean_k, covariance_k, weight_k, camera, image_k, index_k, count_k, many_k, height, width, b,
-            near_plane, widening, chunk,
+            mean_k, covariance_k, weight_k, R, t, camera, image_k, index_k, place_k, count_k, many_k, height, width, b,
+            True, near_plane, widening, chunk,
         )  # fmt: skip
     else:
         _project_listed(
-            mean_c, covariance_c, weight_c, camera, image_c, index_c, count_c, many_c, height, width, b,
-            near_plane, widening, chunk,
+            mean_c, covariance_c, weight_c, R, t, camera, image_c, index_c, place_c, count_c, many_c, height, width, b,
+            False, near_plane, widening, chunk,
         )  # fmt: skip
 
 
@@ -164,8 +227,8 @@ def _listed(image, n, at, mask):
 
 @triton.jit
 def _match(
-    image_k, index_k, count_k, image_c, index_c, count_c, match, overlap, many_k, many_c,
-    eta: tl.constexpr, eta_occlusion: tl.constexpr, chunk: tl.constexpr,
+    image_k, index_k, count_k, image_c, index_c, count_c, match, overlap, bits, matched, pairs, many_k, many_c,
+    eta: tl.constexpr, eta_occlusion: tl.constexpr, dense: tl.constexpr, chunk: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(1).to(tl.int64)
     j = tl.program_id(0)
@@ -177,6 +240,7 @@ def _match(
         z = tl.load(image_k + 5 * many_k + j)
         lane = tl.arange(0, chunk)
         one = tl.full([chunk], 1, tl.int64)
+        found = 0
         for first in range(0, n_c, chunk):
             there = first + lane < n_c
             u_c, v_c, xx_c, xy_c, yy_c = _listed(image_c, many_c, first + lane, there)
@@ -197,7 +261,14 @@ def _match(
                         other = _overlap(u_c, v_c, xx_c, xy_c, yy_c, u_o, v_o, xx_o, xy_o, yy_o)
                         hidden = hidden | (other >= eta)
                 member = member & ~hidden
+            found += tl.sum(member.to(tl.int32), 0)
             c = tl.load(index_c + b * many_c + first + lane, mask=there, other=0)
-            at = (b * many_c + c) * many_k + k
-            tl.store(overlap + at, beta, mask=there)
-            tl.store(match + at, member, mask=there)
+            if dense:
+                at = (b * many_c + c) * many_k + k
+                tl.store(overlap + at, beta, mask=there)
+                tl.store(match + at, member, mask=there)
+            else:
+                word = tl.sum(tl.where(member, one << lane.to(tl.int64), 0), 0)
+                tl.store(bits + (b * many_k + j) * tl.cdiv(many_c, chunk) + first // chunk, word)
+                tl.store(matched + b * many_c + c, member, mask=member)
+        tl.atomic_add(pairs + b, found)

@@ -1,7 +1,7 @@
-"""Fusion on a GPU: a lane per (stream, component) fuses its matches in order, in one launch.
+"""Fusion on a GPU: a lane per (stream, component) walks its matches in order, with no rounds and no read.
 
-A program holds 32 components of a stream in registers and takes the image's Gaussians one after the other; a component
-without a match is copied as it is.
+A program holds 32 components of a stream in registers. As long as one of them has a match left, each takes its next
+one; a component without any is copied as it is.
 """
 
 from __future__ import annotations
@@ -10,11 +10,21 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
+from ufmstar_torch.kernels.triton.correspond import WORD
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
-from ufmstar_torch.kernels.triton.matrices import floored, geodesic, load_symmetric, store_symmetric
+from ufmstar_torch.kernels.triton.matrices import (
+    floored,
+    geodesic,
+    load_symmetric,
+    lowest_bit,
+    moved,
+    store_symmetric,
+    turned,
+)
 from ufmstar_torch.mixture import GaussianMixture
 
 _LANES = 32
@@ -29,16 +39,52 @@ def fuse(
     rounds: int | None = None,
 ) -> GaussianMixture:
     """As :func:`ufmstar_torch.fuse.fuse`; ``rounds`` is not needed."""
+    b, c, k = pairs.match.shape
+    device = pairs.match.device
+    words = triton.cdiv(c, WORD)
+    flags = pad(pairs.match, (0, 0, 0, words * WORD - c)).mT.reshape(b, k, words, WORD).to(torch.int64)
+    bits = (flags << torch.arange(WORD, device=device)).sum(-1)
+    index = torch.arange(c, dtype=torch.int32, device=device).repeat(b, 1)
+    place = torch.arange(k, dtype=torch.int32, device=device).repeat(b, 1)
+    count = torch.full((b,), c, dtype=torch.int32, device=device)
+    still = torch.eye(3, dtype=torch.float64, device=device).repeat(b, 1, 1), index.new_zeros(b, 3, dtype=torch.float64)
+    return fuse_bits(mixture, current, still, (bits, index, place, count), config, pairs)
+
+
+def fuse_bits(
+    mixture: GaussianMixture,
+    current: GaussianMixture,
+    motion: tuple[Tensor, Tensor],
+    matches: tuple[Tensor, Tensor, Tensor, Tensor],
+    config: UfMStarConfig,
+    pairs: Correspondence | None = None,
+) -> GaussianMixture:
+    """Fuse the matches of ``correspond.match_bits`` into a new mixture.
+
+    Args:
+        mixture: M_(i-1), [B, K].
+        current: C_i, [B, C] float64.
+        motion: R [B, 3, 3] and t [B, 3] float64 that take ``current`` into the mixture's frame.
+        matches: bits [B, K, words], the listed c's [B, C], each k's place in the bits [B, K], the number of c's [B].
+        config: of UfM*.
+        pairs: overlaps and distances where the config needs them; None = W2^2, not weighted by overlap.
+    """
     b, k = mixture.weight.shape
     out = GaussianMixture(**{name: torch.empty_like(value.contiguous()) for name, value in mixture.tensors().items()})
-    given, channels = pairs.distance is not None, mixture.features.shape[2]
-    distance = pairs.overlap if pairs.distance is None else pairs.distance
+    bits, index, place, count = matches
+    given = pairs is not None and pairs.distance is not None
+    weighted = pairs is not None and config.overlap_weighted
+    nothing = current.weight
+    overlap = pairs.overlap.contiguous() if pairs is not None and weighted else nothing
+    distance = pairs.distance.contiguous() if pairs is not None and pairs.distance is not None else nothing
+    channels = mixture.features.shape[2]
     launch(
         _fuse, (triton.cdiv(k, _LANES), b),
         *(v.contiguous() for v in mixture.tensors().values()), *(v.contiguous() for v in current.tensors().values()),
-        pairs.match.contiguous(), pairs.overlap.contiguous(), distance.contiguous(), *out.tensors().values(),
-        k, current.capacity, epsilon=8 * torch.finfo(mixture.covariance.dtype).eps, weighted=config.overlap_weighted,
-        given=given, channels=channels, padded=power_of_two(channels), lanes=_LANES, warps=1,
+        *motion, bits, index, place, count, overlap, distance, *out.tensors().values(),
+        k, current.capacity, bits.shape[2], epsilon=8 * torch.finfo(mixture.covariance.dtype).eps,
+        weighted=weighted, given=given, channels=channels, padded=power_of_two(channels), word=WORD, lanes=_LANES,
+        warps=1,
     )  # fmt: skip
     return out
 
@@ -67,21 +113,26 @@ def _floor(covariance, floor, lifted, count, chunk: tl.constexpr):
 def _fuse(
     mean, covariance, weight, disagreement, count, features,
     mean_c, covariance_c, weight_c, disagreement_c, count_c, features_c,
-    match, overlap, distances,
-    mean_o, covariance_o, weight_o, disagreement_o, count_o, features_o, many_k, many_c,
+    R, t, bits, index_c, place, listed_c, overlap, distances,
+    mean_o, covariance_o, weight_o, disagreement_o, count_o, features_o, many_k, many_c, words,
     epsilon: tl.constexpr, weighted: tl.constexpr, given: tl.constexpr, channels: tl.constexpr, padded: tl.constexpr,
-    lanes: tl.constexpr,
+    word: tl.constexpr, lanes: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(1).to(tl.int64)
     stored = mean.dtype.element_ty
     slot = tl.program_id(0) * lanes + tl.arange(0, lanes)
     there = slot < many_k
     k = b * many_k + slot
+    R, t = R + 9 * b, t + 3 * b
     f = tl.arange(0, padded)
     x = tl.load(mean + 3 * k, mask=there, other=0.0).to(tl.float64)
     y = tl.load(mean + 3 * k + 1, mask=there, other=0.0).to(tl.float64)
     z = tl.load(mean + 3 * k + 2, mask=there, other=0.0).to(tl.float64)
     xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, there)
+    # A rotation leaves the rounding of one entry and its mirror image apart; where nothing is fused both stay.
+    yx = tl.load(covariance + 9 * k + 3, mask=there, other=0.0).to(tl.float64)
+    zx = tl.load(covariance + 9 * k + 6, mask=there, other=0.0).to(tl.float64)
+    zy = tl.load(covariance + 9 * k + 7, mask=there, other=0.0).to(tl.float64)
     pi = tl.load(weight + k, mask=there, other=0.0).to(tl.float64)
     m = tl.load(disagreement + k, mask=there, other=0.0).to(tl.float64)
     seen = tl.load(count + k, mask=there, other=0)
@@ -89,15 +140,23 @@ def _fuse(
     h = tl.zeros([lanes, padded], tl.float64)
     if channels > 0:
         h = tl.load(features + k[:, None] * channels + f[None, :], mask=in_f, other=0.0).to(tl.float64)
-    for c in range(many_c):
-        at_c = b * many_c + c
-        use = tl.load(match + at_c * many_k + slot, mask=there, other=0) != 0
-        if tl.sum(use.to(tl.int32), 0) > 0:
-            cx = tl.load(mean_c + 3 * at_c).to(tl.float64)
-            cy = tl.load(mean_c + 3 * at_c + 1).to(tl.float64)
-            cz = tl.load(mean_c + 3 * at_c + 2).to(tl.float64)
-            c0, c1, c2, c3, c4, c5 = load_symmetric(covariance_c + 9 * (at_c + 0 * slot), 1, use)
-            pi_c = tl.load(weight_c + at_c).to(tl.float64)
+    at = tl.load(place + k, mask=there, other=-1)
+    n = tl.load(listed_c + b)
+    for w in range(tl.cdiv(n, word)):
+        left = tl.load(bits + (b * many_k + at) * words + w, mask=at >= 0, other=0)
+        while tl.max(left, 0) > 0:
+            use = left != 0
+            bit, rest = lowest_bit(tl.where(use, left, 1))
+            left = tl.where(use, rest, 0)
+            c = tl.load(index_c + b * many_c + w * word + bit, mask=use, other=0)
+            at_c = b * many_c + c
+            cx = tl.load(mean_c + 3 * at_c, mask=use, other=0.0).to(tl.float64)
+            cy = tl.load(mean_c + 3 * at_c + 1, mask=use, other=0.0).to(tl.float64)
+            cz = tl.load(mean_c + 3 * at_c + 2, mask=use, other=0.0).to(tl.float64)
+            c0, c1, c2, c3, c4, c5 = load_symmetric(covariance_c + 9 * at_c, 1, use)
+            cx, cy, cz = moved(R, t, cx, cy, cz)
+            c0, c1, c2, c3, c4, c5 = turned(R, c0, c1, c2, c3, c4, c5)
+            pi_c = tl.load(weight_c + at_c, mask=use, other=0.0).to(tl.float64)
             if weighted:
                 pi_c = pi_c * tl.load(overlap + at_c * many_k + slot, mask=use, other=0.0).to(tl.float64)
             lam = pi_c / tl.where(use, pi + pi_c, 1.0)
@@ -120,22 +179,22 @@ def _fuse(
             yy = tl.where(use, n3.to(stored).to(tl.float64), yy)
             yz = tl.where(use, n4.to(stored).to(tl.float64), yz)
             zz = tl.where(use, n5.to(stored).to(tl.float64), zz)
+            yx, zx, zy = tl.where(use, xy, yx), tl.where(use, xz, zx), tl.where(use, yz, zy)
             pi = tl.where(use, (pi + pi_c).to(stored).to(tl.float64), pi)
             m = tl.where(use, ((1 - lam) * m + lam * d).to(stored).to(tl.float64), m)
             seen = tl.where(use, seen + 1, seen)
             if channels > 0:
-                new = tl.load(features_c + at_c * channels + f, mask=f < channels, other=0.0).to(tl.float64)
-                mixed = ((1 - lam)[:, None] * h + lam[:, None] * new[None, :]).to(stored).to(tl.float64)
+                from_c = features_c + at_c[:, None] * channels + f[None, :]
+                new = tl.load(from_c, mask=in_f & use[:, None], other=0.0).to(tl.float64)
+                mixed = ((1 - lam)[:, None] * h + lam[:, None] * new).to(stored).to(tl.float64)
                 h = tl.where(use[:, None], mixed, h)
     tl.store(mean_o + 3 * k, x, mask=there)
     tl.store(mean_o + 3 * k + 1, y, mask=there)
     tl.store(mean_o + 3 * k + 2, z, mask=there)
     store_symmetric(covariance_o + 9 * k, xx, xy, xz, yy, yz, zz, there)
-    # A rotation leaves the rounding of one entry and its mirror image apart; where nothing is fused both stay.
-    same = there & (seen == tl.load(count + k, mask=there, other=0))
-    tl.store(covariance_o + 9 * k + 3, tl.load(covariance + 9 * k + 3, mask=same), mask=same)
-    tl.store(covariance_o + 9 * k + 6, tl.load(covariance + 9 * k + 6, mask=same), mask=same)
-    tl.store(covariance_o + 9 * k + 7, tl.load(covariance + 9 * k + 7, mask=same), mask=same)
+    tl.store(covariance_o + 9 * k + 3, yx, mask=there)
+    tl.store(covariance_o + 9 * k + 6, zx, mask=there)
+    tl.store(covariance_o + 9 * k + 7, zy, mask=there)
     tl.store(weight_o + k, pi, mask=there)
     tl.store(disagreement_o + k, m, mask=there)
     tl.store(count_o + k, seen, mask=there)

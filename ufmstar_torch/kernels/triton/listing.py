@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.triton.launch import launch
-from ufmstar_torch.kernels.triton.matrices import load_symmetric
+from ufmstar_torch.kernels.triton.matrices import load_symmetric, moved, turned
 from ufmstar_torch.mixture import GaussianMixture
 
 # As the CPU's: share of the denominator that culling may leave out, and that of the prior in a threshold.
@@ -31,28 +31,33 @@ def prepare(
     size: tuple[int, int],
     dtype: torch.dtype,
     config: UfMStarConfig,
+    motion: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The components that can matter in the image, listed in their order.
 
     Args:
-        mixture: [B, K] in the camera frame.
+        mixture: [B, K].
         camera: [B, 3, 3] float64 [px].
         size: H and W [px].
         dtype: of the regression.
         config: of UfM*.
+        motion: R [B, 3, 3] and t [B, 3] float64 from the mixture's frame into the camera's; None = it is there.
 
     Returns:
         Means [B, 3, K] float64 [m]; whitening and log2 of the peak [B, 7, K] in ``dtype``; index [B, K] int32 into the
         mixture; their number [B] int32.
     """
     b, capacity, device = mixture.streams, mixture.capacity, mixture.mean.device
+    if motion is None:
+        eye = torch.eye(3, dtype=torch.float64, device=device).repeat(b, 1, 1)
+        motion = eye, torch.zeros(b, 3, dtype=torch.float64, device=device)
     means = torch.empty(b, 3, capacity, dtype=torch.float64, device=device)
     fields = torch.empty(b, 7, capacity, dtype=dtype, device=device)
     index = torch.empty(b, capacity, dtype=torch.int32, device=device)
     count = torch.empty(b, dtype=torch.int32, device=device)
     launch(
         _prepare, (b,),
-        mixture.mean.contiguous(), mixture.covariance.contiguous(), mixture.weight.contiguous(), camera,
+        mixture.mean.contiguous(), mixture.covariance.contiguous(), mixture.weight.contiguous(), *motion, camera,
         means, fields, index, count, capacity, *size,
         share=math.log2(EPSILON[dtype] / 3) - 0.01 + math.log2(PRIOR * config.prior_weight), chunk=_SLOTS,
     )  # fmt: skip
@@ -85,12 +90,12 @@ def _outside(m, z, smm, smz, square, a, focal, centre, size):
 
 @triton.jit
 def _prepare(
-    mean, covariance, weight, camera, means, fields, index, count, capacity, height, width,
+    mean, covariance, weight, R, t, camera, means, fields, index, count, capacity, height, width,
     share: tl.constexpr, chunk: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(0).to(tl.int64)
     lane = tl.arange(0, chunk)
-    camera += 9 * b
+    R, t, camera = R + 9 * b, t + 3 * b, camera + 9 * b
     occupied = 0
     for first in range(0, capacity, chunk):
         k = first + lane
@@ -105,8 +110,10 @@ def _prepare(
         x = tl.load(mean + 3 * k, mask=there, other=0.0).to(tl.float64)
         y = tl.load(mean + 3 * k + 1, mask=there, other=0.0).to(tl.float64)
         z = tl.load(mean + 3 * k + 2, mask=there, other=0.0).to(tl.float64)
+        x, y, z = moved(R, t, x, y, z)
         xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, there)
         xx, yy, zz = tl.where(there, xx, 1.0), tl.where(there, yy, 1.0), tl.where(there, zz, 1.0)
+        xx, xy, xz, yy, yz, zz = turned(R, xx, xy, xz, yy, yz, zz)
         i00, i10, i11, i20, i21, i22, det = whitened(xx, xy, xz, yy, yz, zz)
         peak = tl.log(tl.where(there, w, 1.0) / det) - _HALF_LOG_TWO_PI_CUBED
 

@@ -46,6 +46,30 @@ def store_symmetric(pointer, xx, xy, xz, yy, yz, zz, mask):
 
 
 @triton.jit
+def moved(R, t, x, y, z):
+    """R (x, y, z) + t for R [3, 3] and t [3] in memory, summed in the order of ``fixed_order.apply``."""
+    u = tl.load(R) * x + tl.load(R + 1) * y + tl.load(R + 2) * z + tl.load(t)
+    v = tl.load(R + 3) * x + tl.load(R + 4) * y + tl.load(R + 5) * z + tl.load(t + 1)
+    w = tl.load(R + 6) * x + tl.load(R + 7) * y + tl.load(R + 8) * z + tl.load(t + 2)
+    return u, v, w
+
+
+@triton.jit
+def turned(R, xx, xy, xz, yy, yz, zz):
+    """R S R^T for R [3, 3] in memory, in the order of ``fixed_order.congruence``."""
+    a, b, c = tl.load(R), tl.load(R + 1), tl.load(R + 2)
+    d, e, f = tl.load(R + 3), tl.load(R + 4), tl.load(R + 5)
+    g, h, i = tl.load(R + 6), tl.load(R + 7), tl.load(R + 8)
+    p0, p1, p2 = a * xx + b * xy + c * xz, a * xy + b * yy + c * yz, a * xz + b * yz + c * zz
+    q0, q1, q2 = d * xx + e * xy + f * xz, d * xy + e * yy + f * yz, d * xz + e * yz + f * zz
+    r0, r1, r2 = g * xx + h * xy + i * xz, g * xy + h * yy + i * yz, g * xz + h * yz + i * zz
+    return (
+        p0 * a + p1 * b + p2 * c, p0 * d + p1 * e + p2 * f, p0 * g + p1 * h + p2 * i,
+        q0 * d + q1 * e + q2 * f, q0 * g + q1 * h + q2 * i, r0 * g + r1 * h + r2 * i,
+    )  # fmt: skip
+
+
+@triton.jit
 def cholesky(xx, xy, xz, yy, yz, zz):
     """Lower Cholesky factor of a positive semidefinite matrix; a pivot at rounding ends its column with zeros."""
     negligible = 16 * 2.220446049250313e-16 * tl.maximum(xx, tl.maximum(yy, zz))

@@ -9,13 +9,16 @@ pixels, 256 in their order take the place of a tile.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from ufmstar_torch import unmeasured
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
 from ufmstar_torch.kernels.triton.listing import EPSILON, PRIOR, prepare
 from ufmstar_torch.kernels.triton.matrices import lowest_bit
@@ -25,6 +28,61 @@ from ufmstar_torch.regress import regress_image as reference
 
 _SIDE = 16  # pixels of a tile
 _CHUNK = 32  # components bounded at a time: the bits of a mask
+_UNMEASURED = {"paper": 0, "relative": 1, "nan": 2}
+
+
+@dataclass(frozen=True)
+class FrameRegression:
+    """Step 5 and what follows it in a step.
+
+    Attributes:
+        disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid.
+        features: [B, H, W, F].
+        measured: [B, H, W], see ``unmeasured``.
+        memory: [B, H, W] of the moving average.
+    """
+
+    disagreement: Tensor
+    features: Tensor
+    measured: Tensor
+    memory: Tensor
+
+
+def regress_frame(
+    mixture: GaussianMixture,
+    to_camera: tuple[Tensor, Tensor],
+    frame: FrameInput,
+    memory: Tensor,
+    config: UfMStarConfig,
+    counts: Tensor,
+    *,
+    smooth: bool,
+) -> FrameRegression:
+    """Regression, what was not measured, and the moving average at every pixel, in two launches.
+
+    Args:
+        mixture: M_i, [B, K].
+        to_camera: R and t that take it into the camera frame.
+        frame: of B streams.
+        memory: of the moving average.
+        config: exact regression, no anchors.
+        counts: [8, B] int64 (``append``), to which valid and unmeasured pixels are added.
+        smooth: whether to average.
+    """
+    depth, average = frame.depth.contiguous(), smooth and config.ema_alpha < 1.0
+    if average and memory.shape != depth.shape:
+        memory = memory.new_full(depth.shape, torch.nan)
+    updated = torch.empty_like(memory) if average else memory
+    channels = mixture.features.shape[2]
+    maps, measured = torch.empty_like(depth), torch.empty_like(depth)
+    features = depth.new_empty(*depth.shape, channels)
+    camera = frame.intrinsics.to(torch.float64).contiguous()
+    listed = prepare(mixture, camera, frame.size, depth.dtype, config, to_camera)
+    _launch(
+        mixture, listed, depth, frame.valid, camera, depth, maps, features, config, subset=False,
+        stepped=(mixture.count, memory, updated, measured, counts), alpha=config.ema_alpha if average else 1.0,
+    )  # fmt: skip
+    return FrameRegression(maps, features, measured, updated)
 
 
 def regress_image(
@@ -50,7 +108,8 @@ def regress_image(
 
 def _launch(
     mixture: GaussianMixture, listed: tuple[Tensor, ...], depth: Tensor, valid: Tensor, camera: Tensor, pixels: Tensor,
-    maps: Tensor, features: Tensor, config: UfMStarConfig, *, subset: bool,
+    maps: Tensor, features: Tensor, config: UfMStarConfig, *, subset: bool, stepped: tuple[Tensor, ...] | None = None,
+    alpha: float = 1.0,
 ) -> None:  # fmt: skip
     b, height, width = depth.shape
     chosen = pixels.shape[1] if subset else 0
@@ -59,13 +118,21 @@ def _launch(
     launch(
         _regress, (triton.cdiv(chosen, _SIDE * _SIDE) if subset else tiles, b),
         depth, valid.contiguous(), camera, pixels, *listed, mixture.disagreement.contiguous(),
-        mixture.features.contiguous(), maps, features, height, width, chosen, mixture.capacity,
-        fused=True,
+        mixture.features.contiguous(), maps, features, *(stepped or (mixture.count, *4 * [depth])),
+        height, width, chosen, mixture.capacity, b, fused=True,
         prior=config.prior_weight, prior_total=config.prior_weight * config.prior_mean,
         least=math.log2(PRIOR * config.prior_weight), share=math.log2(EPSILON[depth.dtype] / 3) - 0.01,
         slack=16 * torch.finfo(depth.dtype).eps, channels=channels, padded=power_of_two(channels), side=_SIDE,
-        chunk=_CHUNK, subset=subset,
+        chunk=_CHUNK, subset=subset, stepped=stepped is not None, alpha=alpha, mode=_UNMEASURED[config.unmeasured],
+        relative=config.unmeasured_relative, half=unmeasured.HALF,
     )  # fmt: skip
+
+
+@triton.jit
+def mixed(before, now, alpha: tl.constexpr):
+    """The new memory of the moving average; NaN is no value."""
+    both = (1 - alpha) * before + alpha * now
+    return tl.where(now != now, before, tl.where(before != before, now, both))
 
 
 @triton.jit
@@ -98,9 +165,11 @@ def _bounds(means, fields, capacity, j, there, cx, cy, cz, hx, hy, hz, slack: tl
 @triton.jit
 def _regress(
     depth, valid, camera, pixels, means, fields, index, count, m, features, out, out_f,
-    height, width, chosen, capacity,
+    compared, before, memory, measured, counts, height, width, chosen, capacity, streams,
     prior: tl.constexpr, prior_total: tl.constexpr, least: tl.constexpr, share: tl.constexpr, slack: tl.constexpr,
     channels: tl.constexpr, padded: tl.constexpr, side: tl.constexpr, chunk: tl.constexpr, subset: tl.constexpr,
+    stepped: tl.constexpr, alpha: tl.constexpr, mode: tl.constexpr, relative: tl.constexpr,
+    half: tl.constexpr,
 ):  # fmt: skip
     real = depth.dtype.element_ty
     b = tl.program_id(1).to(tl.int64)
@@ -153,6 +222,7 @@ def _regress(
 
     evidence = tl.full([side * side], prior, real)
     total = tl.full([side * side], prior_total, real)
+    seen = tl.zeros([side * side], real)
     f = tl.arange(0, padded)
     sums = tl.zeros([side * side, padded], real)
     for first in range(0, n, chunk):
@@ -173,12 +243,31 @@ def _regress(
             w = tl.exp2(tl.load(fields + 6 * capacity + j) - (y0 * y0 + y1 * y1 + y2 * y2))
             k = b * capacity + tl.load(index + j)
             evidence += w
+            if stepped:
+                seen += tl.where(tl.load(compared + k) > 1, w, 0.0)
             total += w * tl.load(m + k).to(real)
             if channels > 0:
                 value = tl.load(features + k * channels + f, mask=f < channels, other=0.0).to(real)
                 sums += w[:, None] * value[None, :]
     nan = float("nan")
-    tl.store(out + target, tl.where(ok, total / evidence, nan), mask=inside)
+    value = total / evidence
+    if stepped:
+        known = seen / evidence
+        if mode == 1:
+            size = relative * tl.load(depth + source, mask=ok, other=0.0)
+            value += tl.maximum(1 - known, 0.0) * (size * size)
+        if mode == 2:
+            value = tl.where(known < half, nan, value)
+        tl.store(measured + target, tl.where(ok, known, nan), mask=inside)
+        tl.atomic_add(counts + 6 * streams + b, tl.sum(ok.to(tl.int32), 0))
+        tl.atomic_add(counts + 7 * streams + b, tl.sum((ok & (known < half)).to(tl.int32), 0))
+        value = tl.where(ok, value, nan)
+        if alpha < 1.0:
+            now = value.to(memory.dtype.element_ty)
+            kept = mixed(tl.load(before + target, mask=inside, other=0.0), now, alpha)
+            tl.store(memory + target, kept, mask=inside)
+            value = tl.where(now != now, now, kept).to(real)
+    tl.store(out + target, tl.where(ok, value, nan), mask=inside)
     if channels > 0:
         values = tl.where(ok[:, None], sums / evidence[:, None], nan)
         tl.store(

@@ -7,13 +7,18 @@ what is kept goes straight to its slot of the mixture.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
-from ufmstar_torch.kernels.triton.matrices import store_symmetric
+from ufmstar_torch.kernels.triton.matrices import floored, store_symmetric
 from ufmstar_torch.kernels.triton.scanline import Rows, scanlines, slope_of
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment import most_kept
@@ -22,8 +27,38 @@ from ufmstar_torch.segment_input import SegmentInput
 _PRUNE = {"none": 0, "both": 1, "either": 2}
 
 
+@dataclass(frozen=True)
+class Floor:
+    """Lifts the eigenvalues of what is segmented, as ``step._segment`` does.
+
+    Attributes:
+        near_plane: [m].
+        epsilon: share of the trace, 8 eps of the dtype in which the mixture is stored.
+    """
+
+    near_plane: float
+    epsilon: float
+
+
 def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.segment.segment`, float64 inside, with its capacity on an accelerator."""
+    mixture, read_labels = fit(given, before_pruning=before_pruning)
+    return mixture, read_labels()
+
+
+def fit(
+    given: SegmentInput, *, before_pruning: bool = False, floor: Floor | None = None
+) -> tuple[GaussianMixture, Callable[[], Tensor]]:
+    """The Gaussians of B depth maps.
+
+    Args:
+        given: checked.
+        before_pruning: keep every Gaussian.
+        floor: of the covariances; the mixture is float64 then. None = none, in the dtype that ``given`` states.
+
+    Returns:
+        The mixture [B, C], and a function that writes and returns the labels [B, H, W] int64.
+    """
     b, height, _ = given.depth.shape
     device = given.depth.device
     most = given.segments_per_row
@@ -31,7 +66,8 @@ def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[Gauss
     capacity = total if before_pruning else min(total, most_kept(given))
     channels = 0 if given.features is None else given.features.shape[1]
     rows = scanlines(given)
-    mixture = GaussianMixture.empty(b, capacity, features=channels, dtype=given.dtype, device=device)
+    dtype = given.dtype if floor is None else torch.float64
+    mixture = GaussianMixture.empty(b, capacity, features=channels, dtype=dtype, device=device)
     member = torch.empty(b * height, most, dtype=torch.int32, device=device)
     slot_of = torch.empty(b, total, dtype=torch.int32, device=device)
     limits = given.config
@@ -40,16 +76,17 @@ def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[Gauss
         _join, (b,),
         rows.camera, rows.lengths2, rows.moments, rows.whole, rows.count,
         mixture.mean, mixture.covariance, mixture.weight, mixture.count, member, slot_of, height, most, capacity, total,
-        scale=float(limits.adaptive_thresh_scale),
+        rounded=given.dtype == torch.float32, scale=float(limits.adaptive_thresh_scale),
         reference=float(limits.reference_focal), scaled=limits.scale_with_image, noise_floor=float(limits.noise_floor),
         angle2=float(limits.angle_cosine) ** 2, min_pixels=limits.min_pixels, min_rows=limits.min_rows,
-        prune=0 if before_pruning else _PRUNE[limits.prune], number=given.depth_bins,
-        lanes=lanes, warps=max(1, min(8, lanes // 32)),
+        prune=0 if before_pruning else _PRUNE[limits.prune], number=given.depth_bins, lifted=floor is not None,
+        near_plane=floor.near_plane if floor else 0.0, epsilon=floor.epsilon if floor else 0.0,
+        pixel_variance=PIXEL_VARIANCE, lanes=lanes, warps=max(1, min(8, lanes // 32)),
     )  # fmt: skip
-    labels = _labelled(rows, member, slot_of, given.depth.shape)
+    read_labels = partial(_labelled, rows, member, slot_of, given.depth.shape)
     if given.features is not None:
-        _average(given.features, labels, mixture)
-    return mixture, labels
+        _average(given.features, read_labels(), mixture)
+    return mixture, read_labels
 
 
 def _labelled(rows: Rows, member: Tensor, slot_of: Tensor, shape: torch.Size) -> Tensor:
@@ -103,12 +140,19 @@ def _feature_means(features, slots, weight, out, pixels, capacity, channels, chu
 
 
 @triton.jit
+def _stored(x, single: tl.constexpr):
+    """x with the precision of float32, if it is to be stored so."""
+    return x.to(tl.float32).to(tl.float64) if single else x
+
+
+@triton.jit
 def _join(
     camera, lengths2, moments, whole, counts, mean_o, covariance_o, weight_o, count_o, member, slot_of,
     height, most, capacity, total,
-    scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr,
+    rounded: tl.constexpr, scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr,
     noise_floor: tl.constexpr, angle2: tl.constexpr, min_pixels: tl.constexpr, min_rows: tl.constexpr,
-    prune: tl.constexpr, number: tl.constexpr, lanes: tl.constexpr,
+    prune: tl.constexpr, number: tl.constexpr, lifted: tl.constexpr, near_plane: tl.constexpr, epsilon: tl.constexpr,
+    pixel_variance: tl.constexpr, lanes: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(0).to(tl.int64)
     fx, fy, cy = tl.load(camera + 9 * b), tl.load(camera + 9 * b + 4), tl.load(camera + 9 * b + 5)
@@ -221,9 +265,17 @@ def _join(
             cxx, cxy = tl.where(some, sxx / ratio, 0.0), tl.where(some, sxy / ratio, 0.0)
             cxz, cyy = tl.where(some, sxz / ratio, 0.0), tl.where(some, syy / ratio, 0.0)
             cyz, czz = tl.where(some, syz / ratio, 0.0), tl.where(some, szz / ratio, 0.0)
-            tl.store(mean_o + 3 * out, mx, mask=keep)
-            tl.store(mean_o + 3 * out + 1, my, mask=keep)
-            tl.store(mean_o + 3 * out + 2, mz, mask=keep)
+            ax, ay, az = mx, my, mz
+            if lifted:
+                ax, ay, az = _stored(ax, rounded), _stored(ay, rounded), _stored(az, rounded)
+                cxx, cxy, cxz = _stored(cxx, rounded), _stored(cxy, rounded), _stored(cxz, rounded)
+                cyy, cyz, czz = _stored(cyy, rounded), _stored(cyz, rounded), _stored(czz, rounded)
+                across = tl.maximum(az, near_plane) / focal
+                least = tl.maximum(across * across * pixel_variance, epsilon * (cxx + cyy + czz))
+                cxx, cxy, cxz, cyy, cyz, czz = floored(cxx, cxy, cxz, cyy, cyz, czz, least)
+            tl.store(mean_o + 3 * out, ax, mask=keep)
+            tl.store(mean_o + 3 * out + 1, ay, mask=keep)
+            tl.store(mean_o + 3 * out + 2, az, mask=keep)
             store_symmetric(covariance_o + 9 * out, cxx, cxy, cxz, cyy, cyz, czz, keep)
             tl.store(weight_o + out, n.to(tl.float64), mask=keep)
             tl.store(count_o + out, (n * 0 + 1).to(tl.int64), mask=keep)

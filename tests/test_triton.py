@@ -1,0 +1,146 @@
+"""What the GPU kernels have besides the steps' parts (``conftest.backend``): late growth, bits of matches, capture.
+
+In Triton's interpreter, on CPU tensors, with ``TRITON_INTERPRET=1``; on a GPU as they are (``pytest -m gpu``).
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import fields
+from unittest.mock import Mock
+
+import pytest
+import torch
+from backends import INTERPRETED, make_backend, moved
+from random_gaussians import mixture
+from walks import SPGF, walks
+
+import scenes
+from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.correspond import correspond
+
+DEVICE = "cpu" if INTERPRETED else "cuda"
+
+pytestmark = [
+    pytest.mark.interpreter,
+    pytest.mark.gpu,
+    pytest.mark.skipif(
+        not INTERPRETED and not torch.cuda.is_available(), reason="needs TRITON_INTERPRET=1 or a CUDA device"
+    ),
+    pytest.mark.filterwarnings("ignore::RuntimeWarning:triton"),
+]
+
+
+def close(actual, expected, rtol, atol):
+    torch.testing.assert_close(actual.cpu(), expected.cpu(), rtol=rtol, atol=atol, equal_nan=True)
+
+
+def test_bits_of_matches():
+    from ufmstar_torch.kernels.triton.correspond import candidates, match_bits
+
+    size, config = (37, 52), UfMStarConfig(eta=0.3, eta_occlusion=0.4)
+    K = torch.tensor(scenes.intrinsics(*size)).expand(2, 3, 3)
+    previous, current = mixture(2, 70, 0), mixture(2, 40, 50)
+    expected = correspond(previous, current, K, size, config)
+    assert (expected.overlap >= 0.3).sum() > expected.match.sum() > 50, "some must be hidden"
+    still = torch.eye(3).double().repeat(2, 1, 1), torch.zeros(2, 3).double()
+    listed = candidates(*moved((previous, still, current, K.contiguous(), size, config), DEVICE))
+    pairs = torch.zeros(2, dtype=torch.int64, device=DEVICE)
+    bits, matched = match_bits(*listed, config, pairs)
+    assert torch.equal(matched.cpu(), expected.match.any(2))
+    assert pairs.tolist() == expected.match.sum((1, 2)).tolist()
+    set_bits = sum(int(w).bit_count() for b in range(2) for w in bits[b, : int(listed[0].count[b]), :2].flatten())
+    assert set_bits == expected.match.sum()
+
+
+def test_late_growth():
+    """Every output is the CPU's, except for the map that was regressed while components waited for slots."""
+    config = UfMStarConfig(segment=SPGF, unmeasured="paper", initial_capacity=2)
+    modules = [make_backend(name).module(config) for name in ("triton", "numba")]
+    late = []
+    for i, (depth, pose, K, _) in enumerate(walks(1, 4)):
+        given = torch.full_like(depth, torch.nan) if i == 1 else depth
+        a, e = (module(given, pose, K, (given / 100).nan_to_num()) for module in modules)
+        assert torch.equal(a.labels.cpu(), e.labels)
+        late.append(bool((a.statistics.components < e.statistics.components).any()))
+        if not late[-1]:
+            close(a.variance, e.variance, 1e-8, 1e-10)
+            close(a.measured, e.measured, 1e-8, 1e-10)
+        for name in {f.name for f in fields(e.statistics)} - (
+            {"components", "unmeasured", "single_view"} if late[-1] else set()
+        ):
+            torch.testing.assert_close(getattr(a.statistics, name), getattr(e.statistics, name))
+    assert any(late)
+    n = int(modules[1].ufm.mixture.components)
+    assert n > 2, "the mixture must have grown"
+    for name, value in modules[1].ufm.mixture.tensors().items():
+        close(getattr(modules[0].ufm.mixture, name)[:, :n], value[:, :n], 1e-5, 1e-7)
+
+
+@pytest.mark.skipif(not INTERPRETED, reason="on a GPU tests/test_gpu.py records a graph")
+def test_capture_keeps_the_state_in_place(monkeypatch):
+    """The bookkeeping of a capture, with a function in the place of the graph; and the launches of a step."""
+    from triton.runtime.jit import KernelInterface
+
+    from ufmstar_torch.capture import Captured
+
+    monkeypatch.setattr("ufmstar_torch.capture._WARM_UP", 1)
+    launched, launch = [], KernelInterface.__getitem__
+    monkeypatch.setattr(
+        KernelInterface, "__getitem__", lambda kernel, grid: launched.append(kernel.fn.__name__) or launch(kernel, grid)
+    )
+
+    config = UfMStarConfig(segment=SPGF, backend="triton", on_bad_frame="skip", initial_capacity=16, max_components=16)
+    given = [frame[:3] for frame in walks(1, 2)]
+    ufm, plain = UfMStar(config), UfMStar(config)
+    captured = Captured(ufm, *given[0], record=lambda run: run)
+    memory = ufm.mean
+    for i, frame in enumerate(given):
+        if i == 1:
+            ufm.reset()
+            plain.reset()
+        launched.clear()
+        out = captured(*frame)
+        assert len(launched) == len(set(launched)) == 2 + 10, launched  # the check, the step
+        expected = plain(*frame)
+        close(out.variance, expected.variance, 0, 0)
+        assert ufm.mean is memory
+    assert torch.equal(ufm.frames, plain.frames)
+    with pytest.raises(ValueError, match="depth must be as at the capture"):
+        captured(given[0][0][:, :5], *given[0][1:])
+    with pytest.raises(ValueError, match=r"a capture needs on_bad_frame='skip'.*a mixture that grows"):
+        Captured(UfMStar(UfMStarConfig(backend="triton")), *given[0])
+
+
+def test_what_the_limit_leaves_without_a_slot_counts_as_dropped():
+    """The CPU counts it in its own frame; here it may have waited for the next one."""
+    dropped = {}
+    for backend, device in (("numba", "cpu"), ("triton", DEVICE)):
+        ufm = UfMStar(UfMStarConfig(segment=SPGF, backend=backend, initial_capacity=2, max_components=3))
+        outputs = [ufm(*(v.to(device) for v in frame[:3])) for frame in walks(1, 2)]
+        dropped[backend] = [int(out.statistics.dropped) for out in outputs]
+        assert int(ufm.mixture.components) == 3
+    assert dropped["triton"][0] == 0 < dropped["numba"][0], "the first frame was to wait"
+    assert sum(dropped["triton"]) == sum(dropped["numba"])
+
+
+def test_what_waits_for_a_slot_is_in_whatever_is_saved_or_copied(monkeypatch):
+    config = UfMStarConfig(segment=SPGF, backend="triton", initial_capacity=2)
+    first, second = (moved(frame[:3], DEVICE) for frame in walks(1, 2))
+    ufm = UfMStar(config)
+    new = int(ufm(*first).statistics.new)
+    assert new > 2 == ufm.mean.shape[1], "some must wait"
+    with monkeypatch.context() as broken:
+        broken.setattr("ufmstar_torch.kernels.step_device.fuse_bits", Mock(side_effect=RuntimeError("out of memory")))
+        with pytest.raises(RuntimeError, match="out of memory"):
+            ufm(*second)
+    twin = copy.deepcopy(ufm)
+    assert int((twin.mean[0, :, 2] != 0).sum()) == new
+    assert int(ufm.state_dict()["count"].sum()) == new
+    restored = UfMStar(config, device=DEVICE)
+    restored.load_state_dict(ufm.state_dict())
+    outputs = [module(*second) for module in (ufm, restored)]
+    close(outputs[1].variance, outputs[0].variance, 0, 0)
+    assert torch.equal(outputs[0].statistics.components, outputs[1].statistics.components)
+    ufm.reset()
+    assert ufm.state.mixture.streams == 0

@@ -1,0 +1,156 @@
+"""UfM* as a CUDA graph: the check of a frame, the step and the sum of the variances in one launch."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.output import UfMStarOutput
+from ufmstar_torch.ufmstar import UfMStar
+
+_WARM_UP = 3  # frames before the capture: kernels are compiled by then
+
+
+class Captured:
+    """A module's step for frames of one shape, recorded once and replayed.
+
+    The module's state stays its own: it is read, saved and reset there, as ever. What a call returns is overwritten by
+    the next call.
+
+    Args:
+        ufm: with a state of its own or none, in the dtype and with the streams of the frame.
+        depth, pose, intrinsics, aleatoric, epistemic, valid: a frame as :meth:`UfMStar.forward` takes it; its shapes
+            are those of all frames, its values do not matter.
+        record: turns a function into its recording. None = a CUDA graph.
+
+    Raises:
+        ValueError: tensors that are not on CUDA (without ``record``), or a config with which a step reads from the
+            device, or does not have one shape.
+    """
+
+    def __init__(
+        self,
+        ufm: UfMStar,
+        depth: Tensor,
+        pose: Tensor,
+        intrinsics: Tensor,
+        aleatoric: Tensor | None = None,
+        epistemic: Tensor | None = None,
+        valid: Tensor | None = None,
+        *,
+        record: Callable[[Callable[[], None]], Callable[[], None]] | None = None,
+    ) -> None:
+        _require_fixed(ufm)
+        if record is None and depth.device.type != "cuda":
+            raise ValueError(f"depth must lie on a CUDA device to be captured, got {depth.device}")
+        given = (depth, pose, intrinsics, aleatoric, epistemic, valid)
+        self._inputs = tuple(None if v is None else v.detach().to(depth.device, copy=True) for v in given)
+        self._ufm = ufm
+        shape = (depth.shape[0], *depth.shape[-2:])
+        with torch.no_grad():
+            warm = copy.deepcopy(ufm)
+            for _ in range(_WARM_UP):
+                self._run(warm)
+            state = {n: v.clone() for n, v in (ufm if ufm.mean.shape[0] else warm).state.tensors().items()}
+            if state["smoothed"].shape != shape:
+                state["smoothed"] = state["smoothed"].new_full(shape, torch.nan)
+            self._state = state
+            if not ufm.mean.shape[0]:
+                self._restart()
+            ufm._store(state)
+            self._replay = (record or _as_graph)(self._frame)
+            ufm._store(state)
+
+    def __call__(self, *frame: Tensor | None) -> UfMStarOutput:
+        """Process the next frame, given as at the capture.
+
+        Raises:
+            ValueError: another number of arguments, or a shape or dtype other than at the capture.
+        """
+        absent = (None,) * (len(self._inputs) - len(frame))
+        for name, own, new in zip(_NAMES, self._inputs, (*frame, *absent), strict=True):
+            if (own is None) != (new is None) or (own is not None and new is not None and own.shape != new.shape):
+                raise ValueError(f"{name} must be as at the capture, {_shape(own)}, got {_shape(new)}")
+        if self._ufm.mean is not self._state["mean"]:
+            self._take_over()
+        for own, new in zip(self._inputs, frame, strict=False):
+            if own is not None and new is not None:
+                own.copy_(new, non_blocking=True)
+        self._replay()
+        return self._out
+
+    def _run(self, ufm: UfMStar) -> UfMStarOutput:
+        depth, pose, intrinsics, *optional = self._inputs
+        assert depth is not None
+        assert pose is not None
+        assert intrinsics is not None
+        return ufm(depth, pose, intrinsics, *optional)
+
+    def _frame(self) -> None:
+        """The recorded work: a step from the state's memory back into it."""
+        self._out = self._run(self._ufm)
+        for name, value in self._ufm._stored().tensors().items():
+            self._state[name].copy_(value)
+        self._ufm._store(self._state)
+
+    def _take_over(self) -> None:
+        """The state of a module that was reset or loaded since the last call.
+
+        Raises:
+            ValueError: it has another shape than at the capture.
+        """
+        if not self._ufm.mean.shape[0]:
+            self._restart()
+        else:
+            new = self._ufm.state.tensors()
+            if any(new[n].shape != own.shape for n, own in self._state.items()):
+                raise ValueError("the module's state has another shape than at the capture: capture again")
+            for name, value in new.items():
+                self._state[name].copy_(value)
+        self._ufm._store(self._state)
+
+    def _restart(self) -> None:
+        """The state as before the first frame."""
+        for name, value in self._state.items():
+            value.fill_(torch.nan if name == "smoothed" else 0)
+        self._state["T_world_first"].copy_(torch.eye(4, dtype=torch.float64))
+
+
+_NAMES = ("depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid")
+
+
+def _shape(value: Tensor | None) -> str:
+    return "None" if value is None else str(tuple(value.shape))
+
+
+def _require_fixed(ufm: UfMStar) -> None:
+    """Raises a ValueError unless a step has one shape and reads nothing."""
+    config = ufm.config
+    limit = config.max_components
+    slots = ufm.mean.shape[1] if ufm.mean.shape[0] else config.initial_capacity
+    wrong = {
+        "on_bad_frame='skip', since 'raise' reads from the device": config.on_bad_frame != "skip",
+        "max_components of at most initial_capacity, since a mixture that grows has no one shape": (
+            limit is None or slots < limit
+        ),
+        "no anchors, overlap weights, neighbourhood or merging": (
+            config.anchors is not None
+            or config.overlap_weighted
+            or config.regression != "exact"
+            or config.merge is not None
+        ),
+        "disagreement='w2'": config.disagreement != "w2",
+        "no features": bool(config.entries),
+    }
+    if missing := [text for text, bad in wrong.items() if bad]:
+        raise ValueError(f"a capture needs {'; '.join(missing)}")
+
+
+def _as_graph(run: Callable[[], None]) -> Callable[[], None]:
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        run()
+    return graph.replay

@@ -1,0 +1,226 @@
+"""A step on a GPU in about ten launches that waits for nothing.
+
+The mixture has a fixed number of slots. What a frame adds is counted on the device, and the counts are copied to the
+host behind the frame's last change of the mixture. The host reads them when the next frame comes, so it waits only
+where it is more than a frame ahead of the device. Where slots ran short, it then doubles them and appends what had
+found none, before anything else: the next frame matches what it would have matched had the mixture grown in time, and
+only the map of the frame before was regressed without it. Growth starts before the last slot is taken, so that this is
+rare.
+
+What the paper's step does not have (columns of extensions, a subset of pixels, ``config.disagreement == "overlap"``,
+``config.overlap_weighted``, the neighbourhood) runs as ``step.step`` with the GPU's kernels. It grows one frame ahead
+instead: to slots for all that a frame can segment, so that it reads nothing but the count of the frame before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.extension import NONE, FrameExtensions
+from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.fuse import make_room
+from ufmstar_torch.kernels.triton import append as ends
+from ufmstar_torch.kernels.triton.append import append, cameras
+from ufmstar_torch.kernels.triton.correspond import candidates, match_bits
+from ufmstar_torch.kernels.triton.fuse import fuse_bits
+from ufmstar_torch.kernels.triton.regress import regress_frame
+from ufmstar_torch.kernels.triton.segment import Floor, fit
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.output import FrameStatistics, StepOutput
+from ufmstar_torch.segment import most_kept
+from ufmstar_torch.segment_input import SegmentInput
+from ufmstar_torch.state import UfMStarState
+from ufmstar_torch.step import step
+from ufmstar_torch.step_parts import Kernels, StepObserver
+
+_ROOM = 4 / 3  # slots for each that is needed, below which the mixture grows ahead of need
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Gaussians of a frame for which the mixture had no slot.
+
+    Attributes:
+        current: C_i in the camera frame, [B, C].
+        to_first: R and t into the mixture's frame.
+        left: [B, C] bool, which of them.
+    """
+
+    current: GaussianMixture
+    to_first: tuple[Tensor, Tensor]
+    left: Tensor
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A frame whose counts the host has not read yet.
+
+    Attributes:
+        needed: [B] integers on the host, slots that would hold everything, once ``copied``.
+        copied: the end of the copy; None on the CPU.
+        rest: what found no slot; None where everything did.
+    """
+
+    needed: Tensor
+    copied: torch.cuda.Event | None
+    rest: Rest | None
+
+    @classmethod
+    def after(cls, needed: Tensor, rest: Rest | None = None) -> Waiting:
+        """Queue the copy of the counts [B]."""
+        if needed.device.type != "cuda":
+            return cls(needed.cpu(), None, rest)
+        on_host = torch.empty(needed.shape, dtype=needed.dtype, pin_memory=True)
+        on_host.copy_(needed, non_blocking=True)
+        copied = torch.cuda.Event()
+        copied.record(torch.cuda.current_stream(needed.device))
+        return cls(on_host, copied, rest)
+
+    def slots(self) -> int:
+        """The slots that the fullest stream needs; waits until they are known."""
+        if self.copied is not None:
+            self.copied.synchronize()
+        return int(self.needed.max())
+
+
+class DeviceStep:
+    """:class:`ufmstar_torch.step.Step` with the memory that late growth needs.
+
+    The memory belongs to the state that was returned last. A caller that takes this state elsewhere (to save it, say)
+    asks :meth:`settled` for it first; another state makes the step forget what was waiting.
+
+    Args:
+        kernels: for what is not run here.
+    """
+
+    def __init__(self, kernels: Kernels) -> None:
+        self._kernels = kernels
+        self._waiting: Waiting | None = None
+        self._of: Tensor | None = None
+        self._lost: Tensor | None = None
+
+    def __call__(
+        self,
+        state: UfMStarState,
+        frame: FrameInput,
+        config: UfMStarConfig,
+        *,
+        pixels: Tensor | None = None,
+        smooth: bool = True,
+        extensions: FrameExtensions = NONE,
+        observer: StepObserver | None = None,
+    ) -> tuple[UfMStarState, StepOutput]:
+        plain = config.disagreement == "w2" and config.regression == "exact"
+        if extensions.columns or config.overlap_weighted or not plain or pixels is not None or observer is not None:
+            state = self._with_room(state, config, ahead=most_kept(SegmentInput.of_frame(frame, config)))
+            updated, out = step(
+                state, frame, config, pixels=pixels, smooth=smooth, extensions=extensions, observer=observer,
+                kernels=self._kernels, grow=False,
+            )  # fmt: skip
+            waiting = None if _full(state.mixture.capacity, config) else Waiting.after(out.statistics.components)
+        else:
+            state = self._with_room(state, config)
+            updated, out, waiting = device_step(state, frame, config, smooth=smooth)
+        if self._lost is not None:
+            dropped = out.statistics.dropped + self._lost
+            out = replace(out, statistics=replace(out.statistics, dropped=dropped))
+        self._waiting, self._of, self._lost = waiting, updated.mean, None
+        return self.settled(updated, config) if extensions.changes_mixture else updated, out
+
+    def settled(self, state: UfMStarState, config: UfMStarConfig) -> UfMStarState:
+        """The state with everything appended that was waiting; waits for the device."""
+        state = self._with_room(state, config, ahead=0)
+        self._waiting, self._of = None, state.mean
+        return state
+
+    def _with_room(self, state: UfMStarState, config: UfMStarConfig, ahead: int | None = None) -> UfMStarState:
+        """The state with what was waiting for a slot, and with slots for the next frame.
+
+        It is still waiting afterwards: a step that raises loses nothing. What finds no slot even so, because of
+        ``config.max_components``, counts as dropped by the next frame.
+
+        Args:
+            state: the step's argument.
+            config: of UfM*.
+            ahead: slots that are free afterwards, as far as the limit allows; None = a third of those in use.
+        """
+        if state.mean is not self._of:
+            self._waiting = self._lost = None
+        mixture, waiting = state.mixture, self._waiting
+        if waiting is None:
+            if not ahead or _full(mixture.capacity, config):
+                return state
+            needed = int(mixture.components.max())  # a state from elsewhere: the one read
+        else:
+            needed = waiting.slots()
+        room = int(needed * _ROOM) if ahead is None else needed + ahead
+        grown = mixture.grown(room, config.max_components)
+        if waiting is not None and waiting.rest is not None and needed > mixture.capacity:
+            rest = waiting.rest
+            lost, _ = append(
+                grown, rest.current, rest.to_first, rest.left, state.frames, near_plane=config.near_plane, again=True,
+                last=False,
+            )  # fmt: skip
+            self._lost = lost.sum(1)
+        return state.with_tensors(grown.tensors())
+
+
+def device_step(
+    state: UfMStarState, frame: FrameInput, config: UfMStarConfig, *, smooth: bool = True
+) -> tuple[UfMStarState, StepOutput, Waiting | None]:
+    """One image through steps 2 to 5 with the slots that the state has; see :func:`ufmstar_torch.step.step`.
+
+    Returns:
+        The new state, the output, and what may be waiting for slots; None where the mixture cannot grow.
+    """
+    b = frame.depth.shape[0]
+    stored = state.covariance.dtype
+    eps = 8 * torch.finfo(stored).eps
+    given = SegmentInput.of_frame(frame, config)
+    current, read_labels = fit(given, floor=Floor(config.near_plane, eps))
+    here = cameras(state, frame)
+    camera = frame.intrinsics.contiguous()
+    previous, new = candidates(state.mixture, here.to_camera, current, camera, frame.size, config)
+    counts = torch.zeros(ends.COUNTS, b, dtype=torch.int64, device=frame.depth.device)
+    bits, matched = match_bits(previous, new, config, counts[ends.PAIRS])
+    mixture = fuse_bits(state.mixture, current, here.to_first, (bits, new.index, previous.place, new.count), config)
+    full, gone = _full(mixture.capacity, config), torch.zeros_like(frame.fault)
+    if full and config.max_components is not None:
+        coming = (current.valid & (current.mean[..., 2] > config.near_plane) & ~matched).sum(1)
+        position = here.to_first[1]
+        room = make_room(mixture, {}, mixture.components, coming, position, config.max_components)
+        mixture, gone = room.mixture, room.dropped
+    left, needed = append(
+        mixture, current, here.to_first, matched, counts, near_plane=config.near_plane, again=False, last=full
+    )
+    waiting = None if full else Waiting.after(needed, Rest(current, here.to_first, left))
+    result = regress_frame(mixture, here.to_camera, frame, state.smoothed, config, counts, smooth=smooth)
+    statistics = FrameStatistics(
+        components=counts[ends.COMPONENTS],
+        segments=counts[ends.SEGMENTS],
+        matched=counts[ends.MATCHED],
+        pairs=counts[ends.PAIRS],
+        new=counts[ends.NEW],
+        dropped=counts[ends.DROPPED] + gone,
+        valid_pixels=counts[ends.VALID],
+        beyond=frame.beyond,
+        out_of_range=frame.out_of_range,
+        unmeasured=counts[ends.UNMEASURED],
+        fault=frame.fault,
+        rotation_deviation=frame.rotation_deviation,
+    )
+    updated = state.with_tensors({
+        **mixture.tensors(), "T_world_first": here.first, "started": here.started, "frames": here.frames,
+        "skipped": here.skipped, "smoothed": result.memory,
+    })  # fmt: skip
+    out = StepOutput(result.disagreement, result.features, result.measured, read_labels, current, statistics)
+    return updated, out, waiting
+
+
+def _full(capacity: int, config: UfMStarConfig) -> bool:
+    """True if a mixture of so many slots may not grow."""
+    return config.max_components is not None and capacity >= config.max_components

@@ -1,0 +1,169 @@
+"""The check of a frame's values on a GPU in two launches: a program per stream for the camera, one per 1,024 pixels."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from ufmstar_torch.camera import POLAR_STEPS, rotation_deviation
+from ufmstar_torch.frame import (
+    DEPTH_RANGE,
+    FARTHEST,
+    FOCAL_RANGE,
+    LARGEST,
+    FrameInput,
+    FrameMaps,
+    intrinsics_fault,
+    of_streams,
+    pose_fault,
+)
+from ufmstar_torch.kernels.triton.launch import launch
+
+
+def check_values(
+    maps: FrameMaps, pose: Tensor, intrinsics: Tensor, *, rotation_tolerance: float, max_depth: float
+) -> FrameInput:
+    """As :func:`ufmstar_torch.frame.check_values`."""
+    depth = maps.depth.contiguous()
+    b, height, width = depth.shape
+    device = depth.device
+    pose, intrinsics = (of_streams(camera, b) for camera in (pose, intrinsics))
+    known = None
+    if pose.device.type == intrinsics.device.type == "cpu" != device.type:
+        first = pose_fault(pose, rotation_deviation(pose[..., :3, :3]), rotation_tolerance)
+        known = torch.where(first > 0, first, intrinsics_fault(intrinsics, (height, width)))
+    T, K = (v.to(device, non_blocking=True).contiguous() for v in (pose, intrinsics))
+    T_safe, K_safe, deviation = torch.empty_like(T), torch.empty_like(K), T.new_empty(b)
+    counts = torch.zeros(2, b, dtype=torch.int64, device=device)
+    fault = torch.empty(b, dtype=torch.int64, device=device)
+    launch(
+        _camera, (b,), T, K, T_safe, K_safe, deviation, fault, height, width, tolerance=float(rotation_tolerance),
+        farthest=FARTHEST, shortest=FOCAL_RANGE[0], longest=FOCAL_RANGE[1], steps=POLAR_STEPS, warps=1,
+    )  # fmt: skip
+    safe, valid = torch.empty_like(depth), torch.empty_like(depth, dtype=torch.bool)
+    optional = (maps.mask, maps.aleatoric, maps.epistemic, maps.features)
+    launch(
+        _maps, (triton.cdiv(height * width, 1024), b), depth,
+        *(depth if v is None else v.detach().contiguous() for v in optional), fault, safe, valid, counts,
+        height * width, b, masked=maps.mask is not None, a_given=maps.aleatoric is not None,
+        e_given=maps.epistemic is not None, channels=0 if maps.features is None else maps.features.shape[1],
+        nearest=DEPTH_RANGE[0], deepest=DEPTH_RANGE[1], max_depth=float(max_depth), largest=LARGEST, chunk=1024,
+    )  # fmt: skip
+    return FrameInput(
+        safe, T_safe, K_safe, maps.aleatoric, maps.epistemic, maps.features, valid, fault, deviation, counts[0],
+        counts[1], known,
+    )  # fmt: skip
+
+
+@triton.jit
+def _gram(a, b, c, d, e, f, g, h, i):
+    """The upper triangle of R^T R."""
+    return (
+        a * a + d * d + g * g, a * b + d * e + g * h, a * c + d * f + g * i,
+        b * b + e * e + h * h, b * c + e * f + h * i, c * c + f * f + i * i,
+    )  # fmt: skip
+
+
+@triton.jit
+def _some(bad):
+    """True if any of a block of flags is set."""
+    return tl.sum(bad.to(tl.int32), 0) > 0
+
+
+@triton.jit
+def _camera(
+    T, K, T_safe, K_safe, deviation, faults, height, width,
+    tolerance: tl.constexpr, farthest: tl.constexpr, shortest: tl.constexpr, longest: tl.constexpr,
+    steps: tl.constexpr,
+):  # fmt: skip
+    stream = tl.program_id(0).to(tl.int64)
+    T, K = T + 16 * stream, K + 9 * stream
+    entry = tl.arange(0, 16)
+    t = tl.load(T + entry)
+    k = tl.load(K + entry, mask=entry < 9, other=0.0)
+    a, b, c = tl.load(T), tl.load(T + 1), tl.load(T + 2)
+    d, e, f = tl.load(T + 4), tl.load(T + 5), tl.load(T + 6)
+    g, h, i = tl.load(T + 8), tl.load(T + 9), tl.load(T + 10)
+    g0, g1, g2, g3, g4, g5 = _gram(a, b, c, d, e, f, g, h, i)
+    diagonal = tl.maximum(tl.abs(g0 - 1), tl.maximum(tl.abs(g3 - 1), tl.abs(g5 - 1)))
+    off = tl.maximum(tl.abs(g1), tl.maximum(tl.abs(g2), tl.abs(g4)))
+    total = g0 + g1 + g2 + g3 + g4 + g5
+    apart = tl.where(total != total, float("nan"), tl.maximum(diagonal, off))
+    tl.store(deviation + stream, apart)
+
+    focal_x, focal_y, cx, cy = tl.load(K), tl.load(K + 4), tl.load(K + 2), tl.load(K + 5)
+    determinant = (b * f - c * e) * g + (c * d - a * f) * h + (a * e - b * d) * i
+    last = tl.abs(t - tl.where(entry == 15, 1.0, 0.0))
+    shift = (entry == 3) | (entry == 7) | (entry == 11)
+    zeros = (entry == 1) | (entry == 3) | (entry == 6) | (entry == 7)
+    least, most = tl.minimum(focal_x, focal_y), tl.maximum(focal_x, focal_y)
+    fault = 0
+    # From the last check to the first: the first that fails is the fault.
+    fault = tl.where((tl.minimum(cx, cy) < -0.5) | (cx > width - 0.5) | (cy > height - 0.5), 9, fault)
+    fault = tl.where((least < shortest) | (most > longest), 8, fault)
+    fault = tl.where(_some(zeros & (k != 0)) | (tl.load(K + 8) != 1) | (focal_x <= 0) | (focal_y <= 0), 6, fault)
+    fault = tl.where(_some(k - k != 0), 5, fault)
+    fault = tl.where(_some(shift & (tl.abs(t) > farthest)), 7, fault)
+    fault = tl.where(determinant < 0, 4, fault)
+    fault = tl.where(apart > tolerance, 3, fault)
+    fault = tl.where(_some((entry >= 12) & (last > tolerance)), 2, fault)
+    fault = tl.where(_some(t - t != 0), 1, fault)
+    tl.store(faults + stream, fault)
+
+    fine = fault == 0
+    a, b, c = tl.where(fine, a, 1.0), tl.where(fine, b, 0.0), tl.where(fine, c, 0.0)
+    d, e, f = tl.where(fine, d, 0.0), tl.where(fine, e, 1.0), tl.where(fine, f, 0.0)
+    g, h, i = tl.where(fine, g, 0.0), tl.where(fine, h, 0.0), tl.where(fine, i, 1.0)
+    for _ in range(steps):  # Newton-Schulz (``camera.nearest_rotation``)
+        g0, g1, g2, g3, g4, g5 = _gram(a, b, c, d, e, f, g, h, i)
+        s0, s1, s2, s3, s4, s5 = 1.5 - 0.5 * g0, -0.5 * g1, -0.5 * g2, 1.5 - 0.5 * g3, -0.5 * g4, 1.5 - 0.5 * g5
+        a, b, c = a * s0 + b * s1 + c * s2, a * s1 + b * s3 + c * s4, a * s2 + b * s4 + c * s5
+        d, e, f = d * s0 + e * s1 + f * s2, d * s1 + e * s3 + f * s4, d * s2 + e * s4 + f * s5
+        g, h, i = g * s0 + h * s1 + i * s2, g * s1 + h * s3 + i * s4, g * s2 + h * s4 + i * s5
+    out = T_safe + 16 * stream
+    tl.store(out + entry, tl.where(fine & shift, t, tl.where(entry == 15, 1.0, 0.0)), mask=shift | (entry >= 12))
+    tl.store(out, a)
+    tl.store(out + 1, b)
+    tl.store(out + 2, c)
+    tl.store(out + 4, d)
+    tl.store(out + 5, e)
+    tl.store(out + 6, f)
+    tl.store(out + 8, g)
+    tl.store(out + 9, h)
+    tl.store(out + 10, i)
+    unit = (entry == 0) | (entry == 4) | (entry == 8)
+    tl.store(K_safe + 9 * stream + entry, tl.where(fine, k, tl.where(unit, 1.0, 0.0)), mask=entry < 9)
+
+
+@triton.jit
+def _maps(
+    depth, mask, aleatoric, epistemic, features, faults, safe, valid, counts, pixels, streams,
+    masked: tl.constexpr, a_given: tl.constexpr, e_given: tl.constexpr, channels: tl.constexpr, nearest: tl.constexpr,
+    deepest: tl.constexpr, max_depth: tl.constexpr, largest: tl.constexpr, chunk: tl.constexpr,
+):  # fmt: skip
+    b = tl.program_id(1).to(tl.int64)
+    i = tl.program_id(0) * chunk + tl.arange(0, chunk)
+    inside = i < pixels
+    at = b * pixels + i
+    z = tl.load(depth + at, mask=inside, other=0.0)
+    given = inside & (z > 0) & (z < float("inf")) & (tl.load(faults + b) == 0)
+    if masked:
+        given = given & (tl.load(mask + at, mask=inside, other=0) != 0)
+    beyond = given & (z > max_depth)
+    near = given & (z <= max_depth)
+    use = near & (z >= nearest) & (z <= deepest)
+    if a_given:
+        own = tl.load(aleatoric + at, mask=inside, other=0.0)
+        use = use & (own >= 0) & (own <= largest)
+    if e_given:
+        own = tl.load(epistemic + at, mask=inside, other=0.0)
+        use = use & (own >= 0) & (own <= largest)
+    for channel in tl.static_range(channels):
+        value = tl.load(features + (b * channels + channel) * pixels + i, mask=inside, other=0.0)
+        use = use & (tl.abs(value) <= largest)
+    tl.store(safe + at, tl.where(use, z, 0.0), mask=inside)
+    tl.store(valid + at, use, mask=inside)
+    tl.atomic_add(counts + b, tl.sum(beyond.to(tl.int32), 0))
+    tl.atomic_add(counts + streams + b, tl.sum((near & ~use).to(tl.int32), 0))
