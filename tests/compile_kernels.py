@@ -10,7 +10,7 @@ import torch
 
 from ufmstar_torch import AnchorConfig, MergeConfig, PosteriorConfig, UfMStar, UfMStarConfig, kernels
 from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.eval.engine.warm_up import dense_anchors, preprocessing
+from ufmstar_torch.eval.engine.warm_up import dense_anchors
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.kernels.select import compile_triangulation
 
@@ -41,7 +41,6 @@ if __name__ == "__main__":
     if sys.argv[1] == "float32":
         two_frames(NEAR, torch.float32)
         two_frames(EXACT, torch.float32)
-        preprocessing()
         compile_triangulation()
         dense_anchors()
     else:  # anchors first: what does not depend on the dtype is compiled by one of the two processes

@@ -10,7 +10,6 @@ import torch
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.models import Preprocess
 from ufmstar_torch.ufmstar import UfMStar
 from ufmstar_torch.warm_up import warm_up
 
@@ -23,7 +22,6 @@ def warm_up_command(
     device: torch.device,
     progress: Callable[[int, int], object],
     *,
-    images: bool = True,
     dense: bool = False,
 ) -> None:
     """Compile UfM*, the metrics and what else is asked for, or load it from disk.
@@ -31,10 +29,9 @@ def warm_up_command(
     Args:
         config, device: of UfM*.
         progress: as ``UfMStar.warm_up`` takes it.
-        images: networks predict from images.
         dense: anchors are :class:`DenseEvidence`.
     """
-    also = [metrics, *([preprocessing] if images else []), *([dense_anchors] if dense else [])]
+    also = [metrics, *([dense_anchors] if dense else [])]
     warm_up(UfMStar(config, device=device), (32, 32), 1, progress, also)
 
 
@@ -42,11 +39,6 @@ def metrics() -> None:
     """The metrics of single-precision maps."""
     maps = torch.ones(1, 8, 8)
     SequenceMetrics().update(maps, maps, maps)
-
-
-def preprocessing() -> None:
-    """The resizing of images."""
-    Preprocess(size=(8, 8)).apply_image(torch.zeros(1, 3, 16, 16, dtype=torch.uint8))
 
 
 def dense_anchors() -> None:

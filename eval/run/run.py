@@ -90,7 +90,7 @@ def warm_up_job(job: RunJob, progress: Callable[[Progress], None]) -> None:
         progress(Progress("kernels", done, total))
 
     dense = job.config.anchors is not None and isinstance(job.landmarks(), DenseEvidence)
-    warm_up_command(job.config, job.device, compiling, images=job.source.needs_image, dense=dense)
+    warm_up_command(job.config, job.device, compiling, dense=dense)
 
 
 def _ending(job: RunJob, folder: RunFolder) -> tuple[str, str]:
