@@ -1,10 +1,11 @@
 """Dense anchors from the images themselves: in every cell of the image one pixel, measured against earlier keyframes.
 
 Where :class:`~ufmstar_torch.anchors.tracker.LandmarkTracker` follows corners, this searches along epipolar lines: edges
-give depths too, on most surfaces, and what has little parallax is kept with a large variance. Inverse depth is what is
-measured, rho = 1/depth with a standard deviation sigma: an anchor has the depth 1/rho and the variance sigma^2 depth^4.
-Some corners are followed too. They measure how far poses and images disagree, which a search along lines of these poses
-cannot, and are anchors where no other lies near.
+give depths too, on most surfaces, and what has little parallax is kept with a large variance. Cells in which that finds
+nothing are searched again by windows of twice the width, which surfaces without fine texture need. Inverse depth is
+what is measured, rho = 1/depth with a standard deviation sigma: an anchor has the depth 1/rho and the variance
+sigma^2 depth^4. Some corners are followed too. They measure how far poses and images disagree, which a search along
+lines of these poses cannot, and are anchors where no other lies near.
 
 Needs OpenCV and numba, on the CPU. One a camera; what it keeps is of fixed size: the keyframes and some numbers.
 """
@@ -40,6 +41,8 @@ _AGREE, _ENOUGH = 2, 10
 _JUMPED = 3
 # Standard deviation of an inverse depth, as a share, by what no image shows: the scale of the poses.
 _SCALE = 0.005
+# Variance of a match of the wide windows, over that which its residual states; on tours, 2 to 4.
+_COARSE_NOISE = 4.0
 _CORNERS = "corners_"  # before the names of the tracker's state
 
 
@@ -60,7 +63,6 @@ class DenseConfig(Checked):
         rival: a match is unique where the best other one has this many times its 1 - ZNCC at least.
         sigmas: standard deviations by which measurements may differ, and half width of the search in them.
         match_noise: variance of a match, over that which its residual would make of independent pixels.
-        coarse_noise: the same factor again for windows of twice the width, which surfaces without fine texture need.
         min_share: least share of the pixels with a match on which the views agree. Where fewer do, poses and images
             contradict each other, and none is used.
         memory: share of the running estimates that remains after a frame.
@@ -80,7 +82,6 @@ class DenseConfig(Checked):
     rival: float = number(1.5, "", "1", 1)
     sigmas: float = number(3.5, "", "1", 0, open_low=True)
     match_noise: float = number(1.0, "", "1", 0, open_low=True)
-    coarse_noise: float = number(4.0, "", "1", 0, open_low=True)
     min_share: float = number(0.2, "", "1", 0, 1)
     memory: float = number(0.8, "", "1", 0, 1, open_high=True)
 
@@ -246,7 +247,7 @@ class DenseEvidence(SavedState):
         inside = ((taken >= 0) & (taken < half.shape[::-1])).all(1)
         pixel = _pixels(half, cell // 2, taken[inside])
         found = measure(half, pixel, reduced, self._search())
-        variance = self.config.coarse_noise * found.variance + np.square(_SCALE * found.rho)
+        variance = _COARSE_NOISE * found.variance + np.square(_SCALE * found.rho)
         fine = (found.agreed >= _AGREE) & (found.contradicted == 0) & (found.rho > np.sqrt(variance))
         return 2 * pixel[fine] + 0.5, found.rho[fine], variance[fine]
 
