@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import io
+import json
+import re
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
+from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ufmstar_torch.arguments import as_tensor
+from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.models.hugging_face import from_hugging_face, of_transformers
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import METRIC, OutputSpec, ProgramSpec, Spread
@@ -18,6 +23,9 @@ from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction, infer, states_confidence
 from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
 
+# Files of a torch.export archive: those of a word or a number, and tensors as raw bytes.
+_TEXTS = ("archive_format", "archive_version", "byteorder", "version", "serialization_id")
+_RAW = re.compile(r"[^/]+/data/(weights/weight|constants/tensor)_\d+")
 Spec = ProgramSpec | Mapping[str, Any] | str | Path
 
 
@@ -137,14 +145,93 @@ def load_torchscript(path: str | Path, spec: Spec | None = None) -> WrappedNetwo
     values or a JSON file. Such a file is a program: load only what you trust. Raises FileNotFoundError: there is no
     such file; ValueError: it is not a TorchScript file, or the spec is missing or impossible."""
     declared = ProgramSpec.required(spec)
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"no network file {path}")
     try:
-        program = torch.jit.load(str(path), map_location="cpu")
+        program = torch.jit.load(_existing(path), map_location="cpu")
     except RuntimeError as error:
         raise ValueError(f"{path} is not a readable TorchScript file: {error}") from error
-    preprocess = declared.preprocess or Preprocess()
-    return WrappedNetwork(program.eval(), declared.outputs, preprocess, declared.takes_intrinsics)
+    return _wrapped(program.eval(), declared)
+
+
+def load_exported(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
+    """A ``torch.export`` file (``torch.export.save``, .pt2) as a network; arguments, trust and errors as
+    :func:`load_torchscript`. ``torch.export.load`` would unpickle any object in the archive, so one that holds more
+    than tensors beside its graph is refused."""
+    declared = ProgramSpec.required(spec)
+    try:
+        program = torch.export.load(_checked_copy(_existing(path))).module()
+    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, BadZipFile) as error:
+        raise ValueError(
+            f"{path} is not a readable torch.export file: {error}; expected what torch.export.save of a compatible "
+            f"torch writes (this one is {torch.__version__}): export the network again"
+        ) from error
+    return _wrapped(_Exported(program, str(path)), declared)
+
+
+def _wrapped(program: nn.Module, spec: ProgramSpec) -> WrappedNetwork:
+    return WrappedNetwork(program, spec.outputs, spec.preprocess or Preprocess(), spec.takes_intrinsics)
+
+
+def _checked_copy(path: str) -> io.BytesIO:
+    """An archive in memory of the members that were checked: JSON, short texts, tensors and plain values. A file can
+    have two directories, of which Python's reader sees one and torch's the other. Raises ValueError (CheckpointError):
+    the file holds anything else."""
+    copied = io.BytesIO()
+    with ZipFile(path) as archive, ZipFile(copied, "w") as copy:
+        names = archive.namelist()
+        if any(entry.compress_type != ZIP_STORED for entry in archive.infolist()):
+            raise ValueError(
+                "it has compressed files, which may expand without limit; torch.export.save compresses none"
+            )
+        if len({name.casefold() for name in names}) != len(names):
+            raise ValueError("it has two files of one name")
+        configs = [name for name in names if name.endswith("_config.json")]
+        payloads = [p for name in configs for p in json.loads(archive.read(name))["config"].values()]
+        pickled = {payload["path_name"] for payload in payloads if payload["use_pickle"]}
+        for name in names:
+            last, content = PurePosixPath(name).name, archive.read(name)
+            raw = _RAW.fullmatch(name) and last not in pickled
+            if last not in _TEXTS and not raw and not _is_json(content):
+                read_tensors(io.BytesIO(content), name)
+            copy.writestr(name, content)
+    copied.seek(0)
+    return copied
+
+
+def _is_json(content: bytes) -> bool:
+    """True if the content is empty or JSON, neither of which can be unpickled."""
+    try:
+        json.loads(content or b"0")
+    except (ValueError, RecursionError):
+        return False
+    return True
+
+
+class _Exported(nn.Module):
+    """An exported program, which keeps the mode it was exported in; torch's own refuses even ``eval()``."""
+
+    def __init__(self, program: nn.Module, path: str) -> None:
+        super().__init__()
+        self.program, self.path = program, path
+        self.training = False
+
+    def forward(self, *inputs: Tensor) -> Any:
+        try:
+            return self.program(*inputs)
+        except AssertionError as error:  # how an exported program refuses an input
+            shapes = ", ".join(f"{value.dtype} {tuple(value.shape)}" for value in inputs)
+            raise ValueError(
+                f"{self.path} was exported for another input than {shapes}: {error}; declare its size in the spec's "
+                "preprocess, or export it with dynamic shapes"
+            ) from error
+
+    def train(self, mode: bool = True) -> _Exported:
+        return self
+
+
+def _existing(path: str | Path) -> str:
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no network file {path}")
+    return str(path)
 
 
 def _named(result: Any) -> dict[str | int, Tensor]:

@@ -11,6 +11,7 @@ from ufmstar_torch.models.network import DepthNetwork
 # Name -> module and function of its loader.
 _LOADERS = {
     "depth_anything": ("depth_anything", "load_depth_anything"),
+    "exported": ("any_network", "load_exported"),
     "fastdepth": ("fastdepth", "load_fastdepth"),
     "huggingface": ("hugging_face", "load_hugging_face"),
     "litert": ("litert_network", "load_litert"),
@@ -48,7 +49,7 @@ def load_network(name: str, weights: str | Path | None = None, **options: Any) -
             depth_anything: ``spec`` with "size", "keep_aspect" and, for a relative checkpoint, "alignment" (a dict or
                 a JSON file). ``weights``: a directory or hub name of ``transformers``.
             huggingface: ``spec`` with "kind" and what else ``from_hugging_face`` takes. ``weights`` as above.
-            torchscript: ``spec`` with "outputs" and, if needed, "preprocess" (a dict or a JSON file).
+            torchscript, exported: ``spec`` with "outputs" and, if needed, "preprocess" (a dict or a JSON file).
 
     Raises:
         ValueError: no such network, no weights, or a file or declaration that does not fit.

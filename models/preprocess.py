@@ -170,8 +170,20 @@ class Preprocess(Checked):
         return depth[..., rows.to(depth.device)[:, None], columns.to(depth.device)]
 
     def _resampled(self, image: Tensor) -> Tensor:
-        """[B, 3, h, w] in [0, 1], resized, cropped and resized."""
+        """[B, 3, h, w] in [0, 1]; bytes on the processor by a kernel, linearly (``preprocess_cpu``)."""
         _check(image)
+        g = self.geometry(*image.shape[-2:])
+        single = torch.get_default_dtype() == torch.float32
+        if image.dtype == torch.uint8 and image.is_cpu and self.antialias and not self.cubic and single and len(image):
+            from ufmstar_torch.models.preprocess_cpu import resample
+
+            steps = (g.resized, g.top, g.left, g.cropped, g.final)
+            pixels = image.permute(0, 2, 3, 1).contiguous().numpy()
+            return torch.stack([torch.from_numpy(resample(one, *steps)) for one in pixels])
+        return self.resampled(image)
+
+    def resampled(self, image: Tensor) -> Tensor:
+        """[B, 3, h, w] in [0, 1], resized, cropped and resized: the reference for every device, type and filter."""
         x = image.to(torch.get_default_dtype()) / 255 if image.dtype == torch.uint8 else image
         g = self.geometry(*x.shape[-2:])
         x = self._resize(x, g.resized)

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import json
+import os
+import pickle
+import struct
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +33,7 @@ from ufmstar_torch.models import (
     save_checkpoint,
     wrap_network,
 )
-from ufmstar_torch.models.any_network import load_torchscript
+from ufmstar_torch.models.any_network import load_exported, load_torchscript
 from ufmstar_torch.models.outputs import ProgramSpec
 from ufmstar_torch.prediction import DepthPrediction, infer
 
@@ -181,6 +187,131 @@ def test_torchscript(tmp_path: Path, image: Tensor) -> None:
         load_torchscript(tmp_path / "broken.ts", METRIC)
     with pytest.raises(FileNotFoundError, match="none"):
         load_torchscript(tmp_path / "none", METRIC)
+
+
+def test_exported_program(tmp_path: Path, image: Tensor) -> None:
+    program = torch.export.export(nn.Sequential(Sum(), nn.Dropout(0.5)).eval(), (image,))
+    torch.export.save(program, str(tmp_path / "n.pt2"))
+    network = load_exported(tmp_path / "n.pt2", METRIC)
+    torch.testing.assert_close(network.eval()(image).depth, Sum()(image)[:, 0])
+    torch.testing.assert_close(network.train()(image).depth, Sum()(image)[:, 0])  # exported without dropout
+    spec = tmp_path / "spec.json"
+    spec.write_text(json.dumps({"outputs": {"kind": "metric"}, "preprocess": {"size": [6, 8]}}))
+    loaded = load_network("exported", tmp_path / "n.pt2", spec=spec)
+    assert loaded.preprocess == Preprocess(size=(6, 8))
+    (tmp_path / "broken.pt2").write_bytes((tmp_path / "n.pt2").read_bytes()[:200])
+    with pytest.raises(ValueError, match=r"broken.pt2 is not a readable torch.export file"):
+        load_exported(tmp_path / "broken.pt2", METRIC)
+
+
+class Malice:
+    """Unpickling it creates a folder."""
+
+    def __init__(self, trap: Path) -> None:
+        self.trap = str(trap)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (self.trap,)
+
+
+@pytest.mark.parametrize("attack", ["weight", "constant", "sample input", "object", "legacy", "old format"])
+def test_an_archive_that_would_be_unpickled_is_refused(tmp_path: Path, image: Tensor, attack: str) -> None:
+    """``torch.export.load`` alone unpickles what stands in these places, whatever it is."""
+    torch.export.save(torch.export.export(Sum().eval(), (image,)), tmp_path / "n.pt2")
+    trap = tmp_path / "trap"
+    evil, bad = io.BytesIO(), tmp_path / "bad.pt2"
+    torch.save((Malice(trap), {}), evil)
+    folder = "constants" if attack in ("constant", "object") else "weights"
+    names = {"object": "opaque_obj_0", "constant": "tensor_0", "weight": "weight_0"}
+    name = names.get(attack, "model.pt")
+    with zipfile.ZipFile(tmp_path / "n.pt2") as source, zipfile.ZipFile(bad, "w") as target:
+        root = source.namelist()[0].split("/")[0]
+        for entry in source.namelist():
+            content = source.read(entry)
+            if attack in (*names, "legacy") and entry.endswith(f"model_{folder}_config.json"):
+                payload = {
+                    "tensor_meta": None,
+                    "path_name": name,
+                    "is_param": False,
+                    "use_pickle": attack in ("weight", "constant"),
+                }
+                content = json.dumps({"config": {"factor": payload}}).encode()
+            if attack == "sample input" and "sample_inputs" in entry:
+                content = evil.getvalue()
+            if not (attack == "weight" and entry.endswith("weight_0")):
+                target.writestr(entry, content)
+        if attack == "old format":
+            target.writestr("serialized_state_dict.pt", evil.getvalue())
+        elif attack != "sample input":
+            plain = pickle.dumps(Malice(trap)) if attack == "object" else evil.getvalue()
+            target.writestr(f"{root}/data/{folder}/{name}", plain)
+    with pytest.raises(ValueError, match=r"bad.pt2 is not a readable torch.export file: .* (holds pickled|begins)"):
+        load_exported(bad, METRIC)
+    assert not trap.exists()
+
+
+def two_directories(seen: bytes, hidden: bytes) -> bytes:
+    """One file of two archives whose members have the same names: Python's reader takes the directory before the end
+    record, torch's the one at the offset that the record states."""
+    parts = []
+    for content in (hidden, seen):
+        size, offset = struct.unpack("<LL", content[-10:-2])
+        parts.append((content[:offset], bytearray(content[offset : offset + size])))
+    (hidden_files, hidden_list), (seen_files, seen_list) = parts
+    assert len(hidden_list) == len(seen_list)
+    hidden_files = hidden_files.ljust(len(seen_files), b"\0")
+    at = 0
+    while at < len(seen_list):
+        name, extra, comment = struct.unpack("<HHH", seen_list[at + 28 : at + 34])
+        # Python adds the gap between the two directories to every offset.
+        (place,) = struct.unpack("<L", seen_list[at + 42 : at + 46])
+        gap = len(hidden_list) + len(seen_files)
+        moved = place + len(hidden_files) + len(hidden_list) - gap
+        seen_list[at + 42 : at + 46] = struct.pack("<L", moved)
+        at += 46 + name + extra + comment
+    end = struct.pack("<LL", len(hidden_list), len(hidden_files))
+    before = b"".join((hidden_files, bytes(hidden_list), seen_files, bytes(seen_list)))
+    return before + seen[-22:-10] + end + b"\0\0"
+
+
+def test_a_file_with_two_directories_runs_nothing(tmp_path: Path, image: Tensor) -> None:
+    """The loaded archive is the checked one, although torch's reader by itself would unpickle the other."""
+    torch.export.save(torch.export.export(Sum().eval(), (image,)), tmp_path / "n.pt2")
+    trap, evil = tmp_path / "trap", io.BytesIO()
+    torch.save((Malice(trap), {}), evil)
+    archives = []
+    for hidden in (False, True):
+        archive = io.BytesIO()
+        with zipfile.ZipFile(tmp_path / "n.pt2") as source, zipfile.ZipFile(archive, "w") as target:
+            for entry in source.namelist():
+                content = source.read(entry)
+                if hidden and entry.endswith("model_weights_config.json"):
+                    content = content.replace(b'"use_pickle": false', b'"use_pickle": true')
+                target.writestr(entry, evil.getvalue() if hidden and entry.endswith("weight_0") else content)
+        archives.append(archive.getvalue())
+    both = tmp_path / "both.pt2"
+    both.write_bytes(two_directories(*archives))
+    with zipfile.ZipFile(both) as seen, zipfile.ZipFile(tmp_path / "n.pt2") as good:
+        assert all(seen.read(entry) == good.read(entry) for entry in good.namelist())
+    reader = torch._C.PyTorchFileReader(str(both))
+    assert 'use_pickle": true' in reader.get_record("data/weights/model_weights_config.json").decode()
+    network, expected = load_exported(both, METRIC), load_exported(tmp_path / "n.pt2", METRIC)
+    assert torch.equal(network(image).depth, expected(image).depth)
+    assert not trap.exists()
+
+
+def test_compressed_archives_and_other_inputs_are_refused(tmp_path: Path, image: Tensor) -> None:
+    torch.export.save(torch.export.export(Sum().eval(), (image,)), tmp_path / "n.pt2")
+    with pytest.raises(ValueError, match=r"n.pt2 was exported for another input than torch.float32 .*declare its size"):
+        load_exported(tmp_path / "n.pt2", METRIC)(torch.rand(1, 3, 8, 8))
+    with (
+        zipfile.ZipFile(tmp_path / "n.pt2") as source,
+        zipfile.ZipFile(tmp_path / "small.pt2", "w", zipfile.ZIP_DEFLATED) as target,
+    ):
+        for entry in source.namelist():
+            target.writestr(entry, source.read(entry))
+    with pytest.raises(ValueError, match=r"small.pt2 is not a readable torch.export file: it has compressed files"):
+        load_exported(tmp_path / "small.pt2", METRIC)
 
 
 @pytest.mark.parametrize("suffix", ["pth", "safetensors"])

@@ -95,7 +95,8 @@ def of_size(sequence, factor):
     """Intrinsics for images ``factor`` times as large; raises ValueError as opening such a sequence does."""
     K = sequence.intrinsics * np.array([[factor], [factor], [1]])
     check_intrinsics("intrinsics", K, sequence.image_size)
-    return replace(sequence, intrinsics=K)
+    entries = tuple(replace(entry, intrinsics=None) for entry in sequence.entries)
+    return replace(sequence, entries=entries, intrinsics=K)
 
 
 def same(x):

@@ -128,7 +128,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: load_network("fastdepth"), "'fastdepth' needs weights"),
     (lambda: load_network("fastdepth", "w.pth", strides=3), "strides"),
     (lambda: load_network("onnx", "n"), "needs a spec"),
-    (lambda: load_network("torchscript", "n", spec=METRIC), r"no \['kind'\]"),
+    (lambda: load_network("exported", "n", spec=METRIC), r"no \['kind'\]"),
     (lambda: small_network()(torch.zeros(1, 3, 240, 320)), "image .*multiples of 32"),
     (lambda: small_network()(torch.zeros(1, 1, 64, 64)), "image"),
     (lambda: small_network()(IMAGE.to(torch.uint8)), "image"),

@@ -47,6 +47,7 @@ def write_files(folder: Path) -> None:
     write_published(folder, classifier_weights(18), published_decoder((64, 64, 128, 256, 512), DECODER_WIDTHS))
     network, image = nn.Conv2d(3, 1, 3, padding=1).eval(), torch.rand(1, 3, 64, 64)
     torch.jit.save(torch.jit.trace(network, image), str(folder / "network.ts"))
+    torch.export.save(torch.export.export(network, (image,)), folder / "network.pt2")
     write_fastdepth(folder / "network.onnx", small_network())
     write_glpn(folder / "glpn-nyu")
     write_depth_anything(folder / "Depth-Anything-V2-Metric-Indoor-Small-hf", "metric")

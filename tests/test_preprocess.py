@@ -147,3 +147,14 @@ def test_bytes_and_floats_agree_and_are_scaled() -> None:
     got = Preprocess.nyu(value_range=255.0, mean=mean, std=std).apply_image(image)
     for channel in range(3):
         torch.testing.assert_close(got[:, channel], (255 * unit[:, channel] - mean[channel]) / std[channel])
+
+
+@pytest.mark.parametrize("size", [(480, 640), (375, 1242), (100, 120)])
+@pytest.mark.parametrize("preprocess", [NYU, Preprocess(size=(224, 224)), Preprocess(crop=(64, 96)), Preprocess()])
+def test_the_kernel_equals_the_reference(size, preprocess):
+    image = torch.randint(0, 256, (2, *size, 3), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
+    image = image.permute(0, 3, 1, 2)
+    fast, slow = preprocess.apply_image(image), preprocess.resampled(image)
+    assert fast.is_contiguous()
+    torch.testing.assert_close(fast, slow, rtol=0, atol=1e-6)
+    torch.testing.assert_close(fast, preprocess.apply_image(image.contiguous()), rtol=0, atol=0)

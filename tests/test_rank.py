@@ -115,7 +115,7 @@ def test_a_pool_of_two_sequences(ufmstar, tmp_path, weights):
 
 
 def test_a_ranking_that_fails_is_no_earlier_one(ufmstar, tmp_path, weights, monkeypatch):
-    """Where the disk is full at its last file, rank.json does not state that there is a ranking."""
+    """A disk that is full at the last file leaves no rank.json that states a ranking."""
     words = ("rank", TOURS[0], "--depth", "self", "--measured", "0", "--out", tmp_path / "out")
 
     def full(*_, **__):

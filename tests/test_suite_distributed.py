@@ -77,7 +77,7 @@ def part(folder, ends, number):
 
 
 def in_parts(folder, *ends, stop=lambda: False):
-    """Whether all of some processes finished, and what was reported."""
+    """True if all of some processes finished, and their report."""
     folder.mkdir()
     lines: list[str] = []
     return shards.in_processes(partial(part, folder, ends), len(ends), stop, lines.append), lines

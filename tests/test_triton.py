@@ -1,4 +1,4 @@
-"""What the GPU kernels have besides the steps' parts (``conftest.backend``): late growth, bits of matches, capture.
+"""Properties of the GPU kernels besides the parts of a step (``conftest.backend``): late growth, bits of matches.
 
 In Triton's interpreter, on CPU tensors, with ``TRITON_INTERPRET=1``; on a GPU as they are (``pytest -m gpu``).
 """

@@ -118,7 +118,7 @@ def as_intrinsics(intrinsics: CameraLike) -> Tensor:
 
 
 def _of_intrinsics(values: Tensor) -> bool:
-    """Whether the shape is that of intrinsics and of no pose."""
+    """True if the shape is that of intrinsics and of no pose."""
     return values.shape == (4,) or values.shape[-2:] == (3, 3)
 
 

@@ -12,7 +12,7 @@ from ufmstar_torch.eval.commands.options import UsageError, positional, reader
 class ReportOptions:
     """Tables, figures and a page from the results of an evaluation.
 
-    Draws tables (Markdown and LaTeX), figures, one page (report.html) and tidy results (CSV) from what
+    Draws tables (Markdown, LaTeX and CSV), figures, one page (report.html) and tidy results (CSV) from what
     `ufmstar eval` has left in a folder, finished or not, and prints the main table.
 
     Attributes:

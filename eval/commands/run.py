@@ -31,8 +31,8 @@ class NetworkOptions:
     """Depth from networks.
 
     Attributes:
-        model: kind of network: fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, litert or
-            torchscript
+        model: kind of network: fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, litert, torchscript
+            or exported
         weights: file (depth_anything, huggingface: directory); several are the members of an ensemble
         mode: of an ensemble: one member per image in turn, or all on every image
         samples: passes per image of an mc_dropout network in mode full; default: 10
