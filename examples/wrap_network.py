@@ -1,0 +1,43 @@
+"""A depth network of your own behind UfM*: what are its variance and its corrected depth worth in a rendered hall?
+
+`network` stands for yours: any function or module that takes images and returns depth, here by name.
+"""
+
+from importlib.resources import files
+from typing import Any
+
+import torch
+from jsonargparse import auto_cli
+from torch import Tensor
+
+from ufmstar_torch import UncertainDepth
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.tour import tour_sequence
+from ufmstar_torch.models import load_trained, wrap_network
+
+
+def main(tour: int = 5, frames: int = 40) -> dict[str, SequenceMetrics]:
+    """The figures of depth and variance, by row."""
+    own: Any = load_trained(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))[0]
+
+    def network(image: Tensor) -> dict[str, Tensor]:
+        return {"metric_depth": own(image).depth}
+
+    wrapped = wrap_network(network, "metric_depth", preprocess=own.preprocess)
+    model = UncertainDepth(wrapped, preprocess=wrapped.preprocess, posterior=True)
+    rows = {"UfM*": SequenceMetrics(), "posterior": SequenceMetrics()}
+    walk = tour_sequence(tour, frames=150, style="hall")
+    for frame in (walk[i] for i in range(frames)):
+        out = model(frame.image, frame.T_world_cam, frame.intrinsics)  # NumPy arrays, PIL images or tensors
+        truth = wrapped.preprocess.apply_depth(torch.from_numpy(frame.depth))
+        rows["UfM*"].update(out.depth[0], out.variance[0], truth)
+        depth, variance = out.ufm.posterior()
+        rows["posterior"].update(depth[0], variance[0], truth)
+    for name, metrics in rows.items():
+        figures = metrics.compute()
+        print(f"{name:10}", *(f"{key} {figures[key]:.3f}" for key in ("delta1", "rmse", "nll", "ece_delta", "ece_q")))
+    return rows
+
+
+if __name__ == "__main__":
+    auto_cli(main)
