@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from process_parts import at_work, in_parts
 from tiny_suite import NAMES, Stub, go, job_on, kept
 from trainings import SPEC
 
@@ -21,7 +20,6 @@ from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.run import machine
 from ufmstar_torch.eval.run.folder import FolderError
-from ufmstar_torch.eval.suite import shards
 from ufmstar_torch.eval.suite.shards import KILLED, evaluate_suite, rank_of
 from ufmstar_torch.eval.suite.work_items import Shard
 from ufmstar_torch.models.spec import build_network
@@ -65,29 +63,6 @@ def test_one_process_and_two_give_the_same_bits(rooms, tmp_path, capfd):
     assert kept(one.out) == kept(two.out)
 
 
-def part(folder, ends, number):
-    """Stands for the work of a process; ``ends`` says what becomes of each."""
-    (folder / f"{number}-{os.getpid()}").touch()
-    if ends[number] == "kill":
-        os.kill(os.getpid(), signal.SIGKILL)
-    if ends[number] == "fail":
-        raise OSError("disk full")
-    while ends[number] == "wait":
-        time.sleep(0.02)
-
-
-def in_parts(folder, *ends, stop=lambda: False):
-    """True if all of some processes finished, and their report."""
-    folder.mkdir()
-    lines: list[str] = []
-    return shards.in_processes(partial(part, folder, ends), len(ends), stop, lines.append), lines
-
-
-def at_work(folder):
-    """The numbers of the processes that have begun."""
-    return [int(path.name.rpartition("-")[2]) for path in folder.glob("*-*")]
-
-
 def is_alive(number):
     try:
         return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
@@ -108,7 +83,7 @@ def test_processes_end_in_good_order_by_a_stop_by_an_error_and_by_a_kill(tmp_pat
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="torch's processes learn of their parent's end on Linux")
 def test_processes_end_with_a_parent_that_is_killed(tmp_path):
-    code = f"from test_suite_distributed import *; in_parts(Path({str(tmp_path / 'a')!r}), 'wait', 'wait')"
+    code = f"from process_parts import *; in_parts(Path({str(tmp_path / 'a')!r}), 'wait', 'wait')"
     parent = subprocess.Popen(
         [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     )
