@@ -93,7 +93,8 @@ def _of_frames(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator
         bases = dict.fromkeys(row.method.base for row in shown)
         frame = f"{e.sequence}, frame {e.frame}"
         for base in bases:
-            of_base = [row.slug for row in strip_rows(shown, base)]
+            corrected = [row for row in shown if row.method.base == base and row.setting.posterior]
+            of_base = [row.slug for row in (*strip_rows(shown, base), *corrected)]
             if of_base:
                 yield f"{frame}: strip of {base}", partial(draw_strip, folder, e, of_base, base)
         parts = [row for base in _BREAKDOWN_BASES for row in strip_rows(shown, base) if row.method.fusion != UFM]
