@@ -24,7 +24,7 @@ _CONTAINERS = ("state_dict", "model_state_dict", "model")
 _PREFIXES = ("module.", "_orig_mod.", "state_dict.", "model.", "network.")
 _TORCH_SUFFIXES = (".pth", ".pt", ".ckpt", ".bin", ".tar")
 _UNKNOWN_SUFFIX = f"{{}} must end in .safetensors or one of {', '.join(_TORCH_SUFFIXES)}"
-# First bytes of the files of torch.save: an archive, or (before 1.6) the pickled magic number of its own format.
+# Files of torch.save begin with these bytes: a zip archive, or (before torch 1.6) a pickled magic number.
 _BEGINNINGS = (b"PK\x03\x04", b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.")
 # Exceptions that the restricted unpickler raises on damaged bytes; it does not document them.
 DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, AttributeError, AssertionError)

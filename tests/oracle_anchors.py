@@ -30,7 +30,7 @@ def believed(anchors):
 
 
 def weight(claim, others):
-    """Weight of an anchor with the relative variance ``claim`` beside others with the errors ``others``."""
+    """Weight of an anchor whose relative variance is ``claim``; its neighbours have the errors ``others``."""
     limit = min(CLAIM, len(others)) * max(LEAST**2, np.mean(np.square(others))) if others else 1.0
     return min(1.0, limit / claim) ** 2 if claim > 0 else 1.0
 

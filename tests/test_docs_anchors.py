@@ -39,7 +39,7 @@ def video():
 
 
 def two_cameras():
-    """The inputs of the page: a map of 30 landmarks for one camera, a lidar of 20 beams beside the other."""
+    """The inputs of the page: a map of 30 landmarks for one camera, and a lidar of 20 beams for the other."""
     depths, poses, K = scenes.sequence(2, H, W, 0.0)
     rng = np.random.default_rng(0)
     v, u = rng.permutation(np.argwhere(depths[0] > 0))[:30].T

@@ -166,7 +166,7 @@ def test_stated_variances_are_those_of_the_errors(kind):
 
 
 def test_after_a_jump_of_the_poses_landmarks_from_before_are_not_believed(tour):
-    """A loop closure moves all later poses: they are 15 cm and 4 degrees beside those before."""
+    """A loop closure moves all later poses: they are off from the earlier ones by 15 cm and 4 degrees."""
     frames, jump = [*tour, *tour[::-1], *tour], np.eye(4)
     jump[:3, :3], jump[:3, 3] = Rotation.from_rotvec([0, 0, np.deg2rad(4)]).as_matrix(), [0.1, -0.1, 0.05]
     poses = [jump @ f.T_world_cam if i >= 14 else f.T_world_cam for i, f in enumerate(frames)]

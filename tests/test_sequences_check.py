@@ -69,7 +69,7 @@ def test_every_generated_layout_is_consistent(tmp_path, writer):
         assert own.registration is None  # the sequence does not claim that depth lies on the images
 
 
-# ---- the real recordings beside the project: depth warped with the poses agrees between frames ----
+# ---- real recordings (shared material): depth warped with the poses agrees between frames ----
 
 # folder, layout, frames, K (fx, fy, cx, cy), a depth scale that is wrong, and by how much
 RECORDINGS = {

@@ -107,7 +107,7 @@ def figures_of_samples(samples: Array, recalibration: Recalibration | None) -> d
 
 
 def figures(joint: Array, recalibration: Recalibration | None) -> dict[str, float]:
-    """Judge the fit of N(d, V) to a sequence, under a map or as it is (None), from its counts.
+    """Compute the figures of N(d, V) on a sequence from its counts, with a recalibration or without one (None).
 
     Returns:
         "coverage_error": mean over nine central intervals of |share of errors inside - the interval's level|;

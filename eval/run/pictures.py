@@ -86,7 +86,7 @@ class Finished:
 
 
 def panel_of(name: str, note: str, frame: Frame, row: RowResult) -> FramePanel:
-    """A row's maps of a frame beside its image: depth, sigma and, with ground truth, the absolute error."""
+    """The image of a frame and a row's maps of it: depth, sigma and, with ground truth, the absolute error."""
     if frame.image is None or row.variance is None:
         raise ValueError(f"frame {name} has no image or no variance to show")
     maps = {"depth": row.depth.float().numpy(), "sigma": row.variance.float().sqrt().numpy()}

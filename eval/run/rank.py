@@ -30,7 +30,7 @@ PARTS = {
 }  # fmt: skip
 _COMPARED = ("total", "disagreement")  # they rest on other views
 _PICTURES = 3  # at each end of the ranking
-_LETTERS = 20  # longest name of a sequence beside a picture
+_LETTERS = 20  # largest number of letters of a sequence's name next to a picture
 _UNITS = {"mean": "m2", "variance": "m4", "median": "m2", "maximum": "m2"}
 
 

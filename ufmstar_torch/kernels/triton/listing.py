@@ -80,7 +80,7 @@ def whitened(xx, xy, xz, yy, yz, zz):
 
 @triton.jit
 def _outside(m, z, smm, smz, square, a, focal, centre, size):
-    """True if the ellipsoid's silhouette lies beside the image along one axis; see ``regress_cull_cpu._meets``."""
+    """True if the ellipsoid's silhouette lies outside the image along one axis; see ``regress_cull_cpu._meets``."""
     half_b = m * z - square * smz
     root = tl.sqrt(tl.maximum(half_b * half_b - a * (m * m - square * smm), 0.0))
     root += 1e-9 * (tl.abs(half_b) + root)
