@@ -257,7 +257,7 @@ def _report(summary: Mapping[str, Any], out: str) -> int:
     for name, reason in summary["outputs"].items():
         if reason is not None:
             print(f"no {name}: {reason}")
-    print(f"{out}: {', '.join(['summary.json', 'frames.jsonl', 'frames/', *made])}")
+    print(f"{out}: {', '.join(['summary.json', 'frames.jsonl', 'frames/', 'depth/', 'sigma/', *made])}")
     state = f"ufmstar run: {summary['state']}: {summary['reason']}"
     if summary["state"] == FINISHED:
         print(state)

@@ -1,4 +1,4 @@
-"""Depth and sigma as 16-bit PNGs, as exports have them: 0 = none; metres per count in the PNG's text."""
+"""Depth and sigma as 16-bit PNGs, of runs and exports: 0 = none; metres per count in the PNG's text."""
 
 from __future__ import annotations
 
