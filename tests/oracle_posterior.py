@@ -13,6 +13,7 @@ START = {
     "roughness": (0.0025, 20.0, 1e-4, 0.04),
     "noise": (1.0, 20.0, 0.25, 16.0),
     "unseen": (0.1, 20.0, 0.0, 16.0),
+    "wrong": (0.03, 20.0, 0.003, 0.3),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
 PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
@@ -153,7 +154,7 @@ def update(state, depth, claimed, pixel, g, variance):
         residual, var = (y - fit) / left, var / left
         total = var + noise
         if round_ < 1:
-            weight = 1 / (noise + np.maximum(residual**2 / total - 1, 0) * total / 20)
+            weight = 1 / (noise + np.maximum(residual**2 / total - 1, 0) * total / 5)
     away = distances(logs, set(node[weight * WEAK >= 1]))
     count = np.bincount(node, minlength=n)[node]
     square = np.minimum(residual**2, CLIP * total)
@@ -176,7 +177,8 @@ def update(state, depth, claimed, pixel, g, variance):
     spread = spread + away * ratio(state, "unseen")
     offset, share = HX[:, 4:] @ mean[4:], away / REACH
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
-    spread = [second_moment(*each) for each in zip(spread, share, offset, around, strict=True)]
+    wrong = ratio(state, "wrong")
+    spread = [second_moment(wrong, *each) for each in zip(spread, share, offset, around, strict=True)]
     return after, *read(depth, counted, logs, mean[:4], offset, spread, share)
 
 
@@ -197,9 +199,9 @@ def y_variance(shape, node, y, noise, used, centre):
     return out.ravel()
 
 
-def second_moment(variance, share, offset, around):
-    """E[(e^n - 1)^2], n normal, or with the probability .03 + .06 share of n - offset; e^-offset at most 100."""
-    p, moments = 0.03 + 0.06 * share, []
+def second_moment(wrong, variance, share, offset, around):
+    """E[(e^n - 1)^2], n normal, or with the probability wrong (1 + 2 share) of n - offset; e^-offset at most 100."""
+    p, moments = min(wrong * (1 + 2 * share), 0.5), []
     for v, q in ((variance, 1), (2 * around, min(math.exp(-offset), 100))):
         v = min(v, 2)
         moments.append(q * q * math.exp(2 * v) - 2 * q * math.exp(v / 2) + 1)
@@ -218,19 +220,43 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
     mean, C = condition(mean0, Q, H, y, weight * rest)
     fit, var = H @ mean, np.einsum("ij,jk,ik->i", H, C, H)
     away = distances(logs, set(node[rest]))[node]
-    total, error = var + noise, (y - fit) ** 2
-    square = np.minimum(error, CLIP * total)
+    error, wrong = y - fit, ratio(state, "wrong")
     believed = np.where(held, 1 / (1 + noise / WEAK), 0.0)
     area = believed / np.maximum(np.bincount(node, believed, minlength=logs.size)[node], 1e-12)
     share, around = away / REACH, y_variance(logs.shape, node, y, noise, rest, mean[0])[node]
     offset = H[:, FEATURES:] @ mean[FEATURES:]
-    final = total + away * ratio(state, "unseen")
-    final = [second_moment(*each) for each in zip(final, share, offset, around, strict=True)] + share * claimed
-    return {
-        "amplitude": ((area * (square - noise) / total).sum(), (area * var / total).sum() / ratio(state, "amplitude")),
-        "unseen": ((area * (error - total)).sum(), (area * away).sum()),
-        "calibration": ((area * error / final).sum(), area.sum()),
+    own, wide = var + noise + away * ratio(state, "unseen"), noise + np.minimum(2 * around, 2)
+    final = [second_moment(wrong, *each) for each in zip(own, share, offset, around, strict=True)] + share * claimed
+    p = np.minimum(wrong * (1 + 2 * share), 0.5)
+    here, elsewhere = (1 - p) * normal(error, own), p * normal(error + offset, wide)
+    return pairs(state, logs, held, node, error, var, away, noise) | {
+        "wrong": ((area * elsewhere / (here + elsewhere)).sum(), (area * (1 + 2 * share)).sum()),
+        "calibration": ((area * error**2 / final).sum(), area.sum()),
     }
+
+
+def normal(x, variance):
+    return np.exp(-(x**2) / variance / 2) / np.sqrt(2 * math.pi * variance)
+
+
+def pairs(state, logs, held, node, error, var, away, noise):
+    """Sums over neighbouring cells that both hold anchors, and over cells without such a neighbour."""
+    amplitude, sums = ratio(state, "amplitude"), np.zeros(4)
+    inside = {i: held & (node == i) for i in set(node[held])}
+    alone, count = set(inside), 0
+    for i, j, variance, _ in links(logs):
+        if i in inside and j in inside:
+            e, v, a, n = ([x[inside[k]].mean() for k in (i, j)] for x in (error, var, away, noise))
+            common, far = max((sum(v) - amplitude * variance) / 2, 0), sum(a) / 2
+            weight, product = 2 / (sum(v) + sum(n)), e[0] * e[1]
+            sums += weight * product, weight * common / amplitude, far * (product - common), far**2
+            alone, count = alone - {i, j}, count + 1
+    for i in alone:
+        e, v, far, n = (x[inside[i]].mean() for x in (error, var, away, noise))
+        product = e * e - n / inside[i].sum()
+        terms = np.array([product / (v + n), v / (v + n) / amplitude, far * (product - v), far**2])
+        sums += terms * len(alone) / (len(alone) + count)
+    return {"amplitude": (sums[0], sums[1]), "unseen": (sums[2], sums[3])}
 
 
 def read(depth, claimed, logs, b, offset, spread, share):

@@ -14,7 +14,7 @@ from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.anchors.anchors import check_anchors
 from ufmstar_torch.frame import check_frame
-from ufmstar_torch.kernels import field_cpu, posterior_cpu
+from ufmstar_torch.kernels import field_cpu, posterior_cpu, posterior_scene_cpu
 from ufmstar_torch.posterior.distance import distance
 from ufmstar_torch.posterior.field import solve
 from ufmstar_torch.posterior.grid import SIDE
@@ -158,15 +158,45 @@ def test_an_error_that_held_out_anchors_show_makes_what_is_unseen_less_certain()
         assert least <= float(out.unseen) < most
 
 
+def wall(error):
+    """Learnt of a flat wall in twelve frames; the anchor of a cell is off by a factor e^error [28, 28]."""
+    depth, packed = np.full((56, 56), 2.0), None
+    rows, cols = (x.ravel() for x in np.mgrid[0:56:2, 0:56:2])
+    for frame in range(12):
+        g = 2 * np.exp(error(np.random.default_rng(frame))[rows // 2, cols // 2])
+        packed, out = updated(depth, (np.stack([cols, rows], -1) + 0.5, g, np.full(len(g), 1e-4)), packed=packed)
+    return Running.of(packed, MODEL), out
+
+
+def test_errors_that_neighbouring_anchors_do_not_share_are_not_taken_for_the_networks():
+    """The same factors, once in patches of a quarter of the image and once shuffled, each anchor its own."""
+    patches = np.kron(np.random.default_rng(1).normal(0, 0.3, (4, 4)), np.ones((7, 7)))
+    shared, _ = wall(lambda rng: patches)
+    own, _ = wall(lambda rng: rng.permutation(patches.ravel()).reshape(28, 28))
+    assert shared.ratio("amplitude") > 5 * own.ratio("amplitude")
+    assert shared.ratio("unseen") > 2 * own.ratio("unseen")
+
+
+def test_more_regions_on_another_surface_make_it_more_probable():
+    def spots(share):
+        def error(rng):
+            return np.kron(rng.random((14, 14)) < share, np.ones((2, 2)))
+
+        return wall(error)
+
+    (few, calm), (many, rough) = spots(0.0), spots(0.15)
+    assert few.ratio("wrong") < MODEL.wrong < many.ratio("wrong")
+    assert rough.outlier.mean() > 2 * calm.outlier.mean()
+
+
 def test_the_variance_is_the_second_moment_about_the_posterior_depth():
-    """Drawn: true depths d e^n, and with the probability of another surface d e^(n - o), at share 0 and 1."""
+    """Drawn: true depths d e^n, and with the probability p of another surface d e^(n - o)."""
     rng, size = np.random.default_rng(0), 2_000_000
-    for offset, share in ((-0.4, 0.0), (0.3, 1.0)):
-        p = MODEL.wrong + MODEL.other * share
+    for offset, p in ((-0.4, 0.03), (0.3, 0.3)):
         other = rng.random(size) < p
         n = rng.normal(np.where(other, -offset, 0), np.where(other, MODEL.spread * 0.1, 0.3) ** 0.5)
-        given = (np.array([x]) for x in (0.3, share, offset, 0.1))
-        variance = posterior_cpu._total(SimpleNamespace(config=MODEL), *given)
+        given = (np.array([x]) for x in (0.3, p, offset, 0.1))
+        variance = posterior_scene_cpu.second_moment(SimpleNamespace(config=MODEL), *given)
         assert variance == pytest.approx(((np.exp(n) - 1) ** 2).mean(), rel=0.03)
 
 
@@ -191,7 +221,7 @@ def test_the_probability_of_another_surface_grows_with_the_distance_from_evidenc
     p = out.outlier[0].mean(0)
     assert float(p[1]) == pytest.approx(MODEL.wrong, abs=2e-3)
     assert bool((p.diff()[4:50] > 0).all())
-    assert float(p.max()) <= MODEL.wrong + MODEL.other
+    assert float(p.max()) <= MODEL.wrong * (1 + MODEL.other)
 
 
 def test_contradictory_anchors_and_depth_that_they_pull_near_are_less_certain():

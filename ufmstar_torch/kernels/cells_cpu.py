@@ -84,8 +84,6 @@ def read(
     limits = config.edge_contrast**2, LARGEST
     _pixels(depth, valid, logs, claimed, left, right, between - before, base, slopes, limits, y, spread, share)
     factor = np.exp(y, out=y)
-    share *= config.other
-    share += config.wrong
     return depth * factor, spread * factor * factor, share
 
 

@@ -25,15 +25,15 @@ class PosteriorConfig(Checked):
         alone: variance of y of an anchor without others; 1/N of it, of each among N
         roughness: standard deviation of y from one pixel to the next, before it is learnt
         unseen: variance of y a width of the image from evidence, before it is learnt
-        prior_weight: anchors for which these values count
+        prior_weight: anchors, or pairs of neighbouring ones, for which these values count
         half_life: age after which what an anchor taught counts half
-        clip: largest z^2 of an anchor in what is learnt of amplitude, roughness and noise
+        clip: largest z^2 of an anchor in what is learnt of roughness and noise
         weak_sigma: an anchor whose noise has this standard deviation counts half by area; a noisier one is no evidence
         reach: distance from the evidence from which on a node has none
         discs: discs of anchors that are held out in a frame
         radius: of a disc; standard deviation of the Gaussian that weighs the anchors around a node
-        wrong: probability that the local correction does not hold, at evidence
-        other: what is added to it from ``reach`` on, since another surface may begin
+        wrong: probability that the local correction does not hold, at evidence, before it is learnt
+        other: by how much of itself it has grown from ``reach`` on, since another surface may begin
         spread: variance of y where it does not hold, over that of the anchors' y around
         widest: variance of y from which on the variance of the depth grows no more
         edge_contrast: difference of log d at which a node counts half at a pixel
@@ -45,7 +45,7 @@ class PosteriorConfig(Checked):
     prior_sigma: float = number(0.5, "sigma_b", "1", 0.0, open_low=True)
     tilt_sigma: float = number(0.2, "sigma_t", "1", 0.0, open_low=True)
     drift: float = number(0.05, "tau", "1/frame^.5", 0.0)
-    degrees_of_freedom: float = number(19.0, "nu", "1", 0.0, open_low=True)
+    degrees_of_freedom: float = number(4.0, "nu", "1", 0.0, open_low=True)
     alone: float = number(1.0, "sigma_1^2", "1", 0.0)
     roughness: float = number(0.05, "sigma_0", "1", 0.0, open_low=True)
     unseen: float = number(0.1, "g", "1/width", 0.0)
@@ -57,7 +57,7 @@ class PosteriorConfig(Checked):
     discs: int = number(3, "", "1", 0, 16)
     radius: float = number(5 / 28, "r", "width", 0.0, open_low=True)
     wrong: float = number(0.03, "p_0", "1", 0.0, 0.5)
-    other: float = number(0.06, "p_1", "1", 0.0, 0.5)
+    other: float = number(2.0, "p_1", "1", 0.0)
     spread: float = number(2.0, "a", "1", 0.0, 4.0)
     widest: float = number(2.0, "v_2", "1", 0.0, 4.0, open_low=True)
     edge_contrast: float = number(0.1, "delta", "1", 0.0, open_low=True)

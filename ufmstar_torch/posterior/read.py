@@ -18,7 +18,7 @@ def read(
     depth: Tensor, valid: Tensor, claimed: Tensor, nodes: Tensor, coefficients: Tensor, mean: Tensor,
     size: tuple[int, int], config: PosteriorConfig,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Depth, variance and the probability of another surface at every pixel.
+    """Depth, variance and the share without evidence at every pixel.
 
     The four nodes around it count by their bilinear weights and by 1/(1 + (D/edge_contrast)^2); D is the difference
     between the pixel's log d and the node's.
@@ -34,8 +34,8 @@ def read(
         config: of the posterior.
 
     Returns:
-        Depth d e^y [m], variance (d e^y)^2 (v + share claimed/d^2) [m^2] and probability wrong + other share, [B, H, W]
-        in depth's dtype, NaN where not valid.
+        Depth d e^y [m], variance (d e^y)^2 (v + share claimed/d^2) [m^2] and the share, [B, H, W] in depth's dtype, NaN
+        where not valid.
     """
     rows, cols = size
     b, height, width = depth.shape
@@ -57,9 +57,8 @@ def read(
     y = c[0] + c[1] * (logs - mean[:, None, None]) + c[2] * (2 * u - 1) + c[3] * (2 * v - 1)[:, None] + offset
     corrected = d * y.clamp(-LARGEST, LARGEST).exp()
     spread = corrected.square() * (variance + unseen * claimed.double() / d.square())
-    maps = corrected, spread, config.wrong + config.other * unseen
-    corrected, spread, outlier = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in maps)
-    return corrected, spread, outlier
+    corrected, spread, unseen = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in (corrected, spread, unseen))
+    return corrected, spread, unseen
 
 
 def _between(x: Tensor, count: int) -> tuple[Tensor, Tensor]:

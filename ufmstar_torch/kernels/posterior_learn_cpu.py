@@ -1,0 +1,100 @@
+"""What a frame's anchors teach, on the CPU (``ufmstar_torch.posterior.learn``): one stream."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.kernels.field_cpu import Field, Floats, at, given
+from ufmstar_torch.kernels.posterior_scene_cpu import (
+    LeftOut,
+    Running,
+    Scene,
+    away_from,
+    second_moment,
+    spread_around,
+    wrong,
+)
+from ufmstar_torch.posterior.learn import LEAST_REST, STEPS
+
+
+def learnt(
+    scene: Scene, field: Field, weight: Floats, left_out: LeftOut, claimed: Floats, running: Running
+) -> Floats:  # fmt: skip
+    """Packed."""
+    above, below = running.added(_of_neighbours(scene, left_out, running) | _of_discs(scene, weight, claimed, running))
+    first = [running.frames + 1, scene.grid.mean]
+    return np.concatenate([first, above, below, field.coefficients, field.covariance.ravel()])
+
+
+def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[str, tuple[float, float]]:
+    variance = left_out.total
+    excess = np.minimum(left_out.residual**2, scene.config.clip * variance) - variance
+    once = 1 / scene.counted(np.ones(len(variance)))
+    sums = {}
+    for name, part in (("roughness", np.full(len(variance), running.ratios["roughness"])), ("noise", scene.stated)):
+        w = once * (part / variance) ** 2
+        unit = running.ratios[name] / np.maximum(part, 1e-12)
+        sums[name] = float((w * (part + excess) * unit).sum()), float(w.sum())
+    return sums
+
+
+def _of_discs(scene: Scene, weight: Floats, claimed: Floats, running: Running) -> dict[str, tuple[float, float]]:
+    held, config = _discs(scene, running.frames), scene.config
+    rest = ~held
+    held = held & (np.count_nonzero(rest) >= LEAST_REST)
+    field = given(scene.prior, scene.observed, weight * rest)
+    node, x, noise = scene.observed.node[held], scene.observed.features[held], scene.noise[held]
+    mean, variance = at(field, node, x)
+    away, b = away_from(scene, rest)[node], field.coefficients
+    error, offset = scene.observed.value[held] - mean, mean - (x * b).sum(1)
+    believed = np.where(held, scene.believed(), 0.0)
+    area = (believed / np.maximum(scene.counted(believed), 1e-12))[held]
+    share, spread = away / config.reach, spread_around(scene, rest, b[0])[node]
+    p, own = wrong(running, share), variance + noise + away * running.ratios["unseen"]
+    wide = noise + np.minimum(config.spread * spread, config.widest)
+    with np.errstate(over="ignore"):  # certainly another surface
+        odds = p / (1 - p) * np.sqrt(own / wide) * np.exp((error**2 / own - (error + offset) ** 2 / wide) / 2)
+    stated = second_moment(scene, own, p, offset, spread) + share * claimed[held]
+    sums = {
+        "wrong": (area * (1 - 1 / (1 + odds)), area * (1 + config.other * share)),
+        "calibration": (area * error**2 / stated, area),
+    }
+    added = {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}
+    return _of_pairs(scene, node, np.stack([error, variance, away, noise]), running) | added
+
+
+def _of_pairs(
+    scene: Scene, node: NDArray[np.int64], values: Floats, running: Running
+) -> dict[str, tuple[float, float]]:  # fmt: skip
+    grid, amplitude, sums = scene.grid, running.ratios["amplitude"], np.zeros(4)
+    count = np.bincount(node, minlength=grid.rows * grid.cols)
+    means = np.stack([np.bincount(node, row, len(count)) for row in values]) / np.maximum(count, 1)
+    cells, alone, pairs = np.arange(len(count)).reshape(grid.rows, grid.cols), count > 0, 0
+    for first, second, link in ((cells[:, :-1], cells[:, 1:], grid.right), (cells[:-1], cells[1:], grid.down)):
+        pair = (count[first] > 0) & (count[second] > 0)
+        one, other = first[pair], second[pair]
+        alone[one] = alone[other] = False
+        pairs += len(one)
+        _, variance, away, noise = (means[:, one] + means[:, other]) / 2
+        covariance = np.maximum(variance - amplitude * link[one] / 2, 0)
+        sums += _products(means[0, one] * means[0, other], covariance, variance, noise, away)
+    error, variance, away, noise = means[:, alone]
+    share = len(error) / max(len(error) + pairs, 1)
+    sums += share * _products(error**2 - noise / count[alone], variance, variance, noise, away)
+    return {"amplitude": (float(sums[0]), float(sums[1]) / amplitude), "unseen": (float(sums[2]), float(sums[3]))}
+
+
+def _products(product: Floats, expected: Floats, variance: Floats, noise: Floats, away: Floats) -> Floats:
+    weight = 1 / np.maximum(variance + noise, 1e-12)
+    terms = weight * product, weight * expected, away * (product - expected), away**2
+    return np.array([x.sum() for x in terms])
+
+
+def _discs(scene: Scene, frames: float) -> NDArray[np.bool_]:
+    at_, discs = (scene.observed.features[:, 2:4] + 1) / 2, scene.config.discs
+    inside = np.zeros(len(at_), np.bool_)
+    for disc in range(discs):
+        centre = np.array([((frames * discs + disc + 1) * step) % 1 for step in STEPS])
+        inside |= ((at_ - centre) ** 2).sum(1) < scene.config.radius**2
+    return inside

@@ -1,0 +1,163 @@
+"""A frame's nodes and anchors, the field fitted to them, and the variance that follows (model: ``update``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.anchors.anchors import AnchorInput
+from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.posterior.config import PosteriorConfig
+from ufmstar_torch.posterior.distance import distance
+from ufmstar_torch.posterior.field import Field, Observed, Prior
+from ufmstar_torch.posterior.grid import Grid
+from ufmstar_torch.posterior.read import LARGEST
+from ufmstar_torch.posterior.running import Running
+
+# Least share of 1 - w v, by which a residual is divided to leave its anchor out: an anchor alone would divide by 0.
+LEAST_LEFT = 0.05
+# No probability that the local correction does not hold is larger.
+MOST_WRONG = 0.5
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A frame's nodes and anchors, before they are fitted.
+
+    Attributes:
+        config: of the posterior.
+        grid: the nodes.
+        prior: of b and f.
+        observed: the anchors.
+        stated: [B, N] noise s^2/g^2 of y, as learnt.
+        noise: [B, N] n, with roughness and blur^2.
+        valid: [B, N] bool.
+    """
+
+    config: PosteriorConfig
+    grid: Grid
+    prior: Prior
+    observed: Observed
+    stated: Tensor
+    noise: Tensor
+    valid: Tensor
+
+    @classmethod
+    def of(cls, grid: Grid, frame: FrameInput, anchors: AnchorInput, running: Running) -> Scene:
+        node = grid.node(anchors.pixel, frame.size)
+        log_depth = anchors.predicted.log()
+        observed = Observed(
+            node, grid.features_at(anchors.pixel, log_depth, frame.size),
+            torch.where(anchors.valid, anchors.depth.log() - log_depth, torch.zeros_like(log_depth)),
+        )  # fmt: skip
+        stated = running.ratio("noise")[:, None] * anchors.variance / anchors.depth.square()
+        stated = stated + running.config.alone / anchors.valid.sum(1, keepdim=True).clamp_min(1).to(stated)
+        noise = stated + running.ratio("roughness")[:, None] + (_range(frame, anchors) / 2).square()
+        return cls(running.config, grid, _prior(grid, running), observed, stated, noise, anchors.valid)
+
+    def counted(self, values: Tensor) -> Tensor:
+        """[B, N] values, summed over the anchors of the same cell."""
+        kept = torch.where(self.valid, values, torch.zeros_like(values))
+        nodes = torch.zeros_like(self.grid.log_depth).scatter_add(1, self.observed.node, kept)
+        return torch.gather(nodes, 1, self.observed.node)
+
+    def believed(self) -> Tensor:
+        """[B, N] by how much an anchor counts for what is learnt: less the noisier it is, 0 where not valid."""
+        return torch.where(self.valid, 1 / (1 + self.noise / self.config.weak_sigma**2), torch.zeros_like(self.noise))
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Each anchor, predicted by the field of the others.
+
+    Attributes:
+        residual: [B, N] of y.
+        total: [B, N] variance that is predicted for it.
+    """
+
+    residual: Tensor
+    total: Tensor
+
+
+def _prior(grid: Grid, running: Running) -> Prior:
+    """The prior of b and f in the next frame."""
+    mean, covariance = running.expected(grid.mean)
+    amplitude = running.ratio("amplitude")[:, None]
+    diagonal = (running.config.precision / amplitude).expand_as(grid.log_depth)
+    right, down = 1 / (grid.right * amplitude), 1 / (grid.down * amplitude)
+    return Prior(diagonal, right, down, mean, torch.linalg.inv_ex(covariance).inverse, grid.size[1])
+
+
+def _range(frame: FrameInput, anchors: AnchorInput) -> Tensor:
+    """[B, N] largest less smallest log d of the valid pixels among an anchor's pixel and its eight neighbours."""
+    height, width = frame.size
+    low = high = anchors.predicted.log()
+    depth, valid = frame.depth.flatten(1), frame.valid.flatten(1)
+    row, column = anchors.index // width, anchors.index % width
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            index = (row + down).clamp(0, height - 1) * width + (column + right).clamp(0, width - 1)
+            fine = torch.gather(valid, 1, index) & anchors.valid
+            near = torch.where(fine, torch.gather(depth, 1, index).double(), anchors.predicted).log()
+            low, high = torch.minimum(low, near), torch.maximum(high, near)
+    return high - low
+
+
+def fitted(scene: Scene) -> tuple[Field, LeftOut, Tensor]:
+    """The field, how well it predicts each anchor from the others, and the anchors' weights in it."""
+    zero = torch.zeros_like(scene.noise)
+    _, left_out = _with_weights(scene, torch.where(scene.valid, 1 / scene.noise, zero))
+    excess = (left_out.residual.square() - left_out.total).clamp_min(0) / (scene.config.degrees_of_freedom + 1)
+    weight = torch.where(scene.valid, 1 / (scene.noise + excess), zero)
+    return *_with_weights(scene, weight), weight
+
+
+def _with_weights(scene: Scene, weight: Tensor) -> tuple[Field, LeftOut]:
+    field = Field.given(scene.prior, scene.observed, weight)
+    mean, variance = field.at(scene.observed.node, scene.observed.features)
+    left = (1 - weight * variance).clamp_min(LEAST_LEFT)
+    return field, LeftOut((scene.observed.value - mean) / left, variance / left + scene.noise)
+
+
+def spread_around(scene: Scene, used: Tensor, mean: Tensor) -> Tensor:
+    """[B, n] variance of y among the anchors of the mask [B, N] around every node, and one anchor of the prior variance
+    about ``mean`` [B]."""
+    each = torch.where(used, scene.believed() / scene.counted(torch.ones_like(scene.noise)).clamp_min(1), 0.0)
+    y, (rows, cols) = scene.observed.value, scene.grid.size
+    nodes = torch.zeros(3, *scene.grid.log_depth.shape, dtype=each.dtype, device=each.device)
+    values = torch.stack([each, each * y, each * y.square()])
+    nodes = nodes.scatter_add(2, scene.observed.node.expand(3, -1, -1), values).unflatten(2, (rows, cols))
+    width = scene.config.radius
+    weight, first, second = (_window(rows, width, mean) @ nodes @ _window(cols, width, mean)).flatten(2)
+    centre, prior = mean[:, None], scene.config.prior_sigma**2
+    middle = (first + centre) / (weight + 1)
+    return ((second + centre.square() + prior) / (weight + 1) - middle.square()).clamp_min(0)
+
+
+def _window(count: int, width: float, like: Tensor) -> Tensor:
+    """[count, count] weight of a row of nodes, or column, for another one."""
+    at = torch.arange(count, dtype=like.dtype, device=like.device) / count
+    return (-((at[:, None] - at) / width).square() / 2).exp()
+
+
+def wrong(running: Running, share: Tensor) -> Tensor:
+    """[B, n] probability that the local correction does not hold, from the share [B, n] without evidence."""
+    return (running.ratio("wrong")[:, None] * (1 + running.config.other * share)).clamp_max(MOST_WRONG)
+
+
+def second_moment(scene: Scene, variance: Tensor, p: Tensor, offset: Tensor, spread: Tensor) -> Tensor:
+    """Variance over the squared depth: of y's ``variance``, and with the probability p that the local correction
+    ``offset`` does not hold, of ``spread``."""
+    config, q = scene.config, (-offset).clamp_max(LARGEST).exp()
+    own, wide = (v.clamp_max(config.widest) for v in (variance, config.spread * spread))
+    tail = q.square() * (2 * wide).exp() - 2 * q * (wide / 2).exp() + 1
+    return (1 - p) * ((2 * own).exp() - 2 * (own / 2).exp() + 1) + p * tail
+
+
+def away_from(scene: Scene, evidence: Tensor) -> Tensor:
+    """[B, n] how far every node is from the anchors of the mask [B, N], in widths of the image."""
+    grid = scene.grid
+    source = torch.zeros_like(grid.log_depth).scatter_add(1, scene.observed.node, evidence.to(grid.log_depth)) > 0
+    return distance(source, grid.far_right, grid.far_down, grid.size[1], scene.config.reach)
