@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 from torch import Tensor, nn
@@ -22,8 +22,9 @@ class UncertainDepth(pipeline.UncertainDepth):
     ) -> tuple[list[nn.Module], networks_in_turn.Preprocess | None]:
         """See the base class. Functions, and models and pipelines of ``transformers``, are wrapped; they take a
         ``preprocess`` that is a ``Preprocess`` or an image processor."""
-        several = isinstance(networks, Iterable) and not isinstance(networks, nn.Module | str | dict)
-        members = list(networks) if several else [networks]
+        members: list[Any] = [networks]
+        if isinstance(networks, Iterable) and not isinstance(networks, nn.Module | str | Mapping):
+            members = list(networks)
         foreign = [not isinstance(member, nn.Module) or of_transformers(member) for member in members]
         declared = preprocess if hasattr(preprocess, "to_dict") else None
         modules = [
