@@ -17,7 +17,7 @@ START = {
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
 PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
-REACH, RADIUS, WEAK, CLIP = 1.0, 5 / 28, 0.25**2, 9.0
+REACH, RADIUS, WEAK, CLIP, APART = 1.0, 5 / 28, 0.25**2, 9.0, 0.5
 
 
 def start():
@@ -259,7 +259,7 @@ def pairs(state, logs, held, node, error, var, away, noise):
     for i, j, variance, _ in links(logs):
         if i in inside and j in inside:
             e, v, a, n = ([x[inside[k]].mean() for k in (i, j)] for x in (error, var, away, noise))
-            common, far = max((sum(v) - amplitude * variance) / 2, 0), sum(a) / 2
+            common, far = max((sum(v) - APART * amplitude * variance) / 2, 0), sum(a) / 2
             weight, product = 2 / (sum(v) + sum(n)), e[0] * e[1]
             sums += weight * product, weight * common / amplitude, far * (product - common), far**2
             alone, count = alone - {i, j}, count + 1
