@@ -66,7 +66,7 @@ class WrappedNetwork(DepthNetwork):
         result = infer(self.network, image, intrinsics, takes=self._passes_intrinsics)
         if isinstance(result, DepthPrediction):
             return result
-        return self.outputs.prediction(_named(result), (image.shape[-2], image.shape[-1]), intrinsics)
+        return self.outputs.prediction(named(result), (image.shape[-2], image.shape[-1]), intrinsics)
 
 
 def wrap_network(
@@ -234,7 +234,7 @@ def _existing(path: str | Path) -> str:
     return str(path)
 
 
-def _named(result: Any) -> dict[str | int, Tensor]:
+def named(result: Any) -> dict[str | int, Tensor]:
     """The tensors (or NumPy arrays) of whatever a network returned, by name or position."""
     if isinstance(result, Tensor | np.ndarray):
         return {"depth": as_tensor("the network's output", result)}

@@ -17,7 +17,7 @@ START = {
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
 PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
-REACH, RADIUS, WEAK, CLIP = 1.0, 5 / 28, 0.25**2, 9.0
+REACH, RADIUS, WEAK, CLIP, APART = 1.0, 5 / 28, 0.25**2, 9.0, 0.5
 
 
 def start():
@@ -90,6 +90,17 @@ def joint_prior(logs, state):
     return mean, Q
 
 
+def loosened(Q, logs, f, amplitude):
+    """The prior's precision after a first fit f: links are Student's t, with two degrees of freedom."""
+    Q, q = Q.copy(), FEATURES
+    for i, j, variance, _ in links(logs):
+        w = 1 / (variance * amplitude)
+        more = w * 3 / (2 + w * (f[i] - f[j]) ** 2) - w
+        for a, b, s in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+            Q[q + a, q + b] += s * more
+    return Q
+
+
 def condition(mean, Q, H, y, w):
     """Posterior mean and covariance given y = H x + noise of precision w."""
     covariance = np.linalg.inv(Q + (H * w[:, None]).T @ H)
@@ -146,15 +157,16 @@ def update(state, depth, claimed, pixel, g, variance):
     noise = stated + roughness + blur**2
     x = np.array([features(math.log(d[k]) - m0, u[k], v[k]) for k in range(N)])
     H = design(x, node, n)
-    weight = 1 / noise
+    weight, prior = 1 / noise, Q
     for round_ in range(2):
-        mean, C = condition(mean0, Q, H, y, weight)
+        mean, C = condition(mean0, prior, H, y, weight)
         fit, var = H @ mean, np.einsum("ij,jk,ik->i", H, C, H)
         left = np.maximum(1 - weight * var, 0.05)
         residual, var = (y - fit) / left, var / left
         total = var + noise
         if round_ < 1:
-            weight = 1 / (noise + np.maximum(residual**2 / total - 1, 0) * total / 5)
+            weight = 1 / (noise + np.maximum(residual**2 / total - 1, 0) * total / 3)
+            prior = loosened(Q, logs, mean[FEATURES:], ratio(state, "amplitude"))
     away = distances(logs, set(node[weight * WEAK >= 1]))
     count = np.bincount(node, minlength=n)[node]
     square = np.minimum(residual**2, CLIP * total)
@@ -247,7 +259,7 @@ def pairs(state, logs, held, node, error, var, away, noise):
     for i, j, variance, _ in links(logs):
         if i in inside and j in inside:
             e, v, a, n = ([x[inside[k]].mean() for k in (i, j)] for x in (error, var, away, noise))
-            common, far = max((sum(v) - amplitude * variance) / 2, 0), sum(a) / 2
+            common, far = max((sum(v) - APART * amplitude * variance) / 2, 0), sum(a) / 2
             weight, product = 2 / (sum(v) + sum(n)), e[0] * e[1]
             sums += weight * product, weight * common / amplitude, far * (product - common), far**2
             alone, count = alone - {i, j}, count + 1

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from ufmstar_torch import DepthPrediction, LiveDepth, UncertainDepth
+from ufmstar_torch import AnchorConfig, DepthPrediction, LiveDepth, UfMStarConfig, UncertainDepth
 from ufmstar_torch.live import BACKWARDS, CLOSED, GAP, LATE, LOST, NEWER
 
 K = (50.0, 50.0, 31.5, 23.5)
@@ -32,7 +32,7 @@ class Network(torch.nn.Module):
     def forward(self, x):
         self.entered.set()
         assert self.gate.wait(20)
-        if x.float().mean() > 200:
+        if x.float().mean() > 0.8:
             raise OSError("the network failed")
         return DepthPrediction(torch.full((len(x), 48, 64), 2.0))
 
@@ -191,6 +191,20 @@ def test_a_reset_after_an_image_was_taken_holds_for_the_next_one(model):
         show(live, 0)
         show(live, 1)
     assert int(model.image_index) == 1
+
+
+@pytest.mark.parametrize("anchors", ["corners", "dense"])
+def test_a_camera_that_changes_its_size_restarts_the_evidence_of_its_anchors(network, anchors):
+    rng, results = np.random.default_rng(0), []
+    model = UncertainDepth(network, UfMStarConfig(anchors=AnchorConfig()), anchors=anchors)
+    with LiveDepth(model, results.append, K) as live:
+        for n, (h, w) in enumerate([(48, 64)] * 3 + [(24, 32)] * 3):
+            scale, picture = w / 64, rng.integers(0, 256, (h, w, 3), dtype=np.uint8)
+            live.push_pose(n, at(n / 100))
+            live.push_image(n, picture, (50 * scale, 50 * scale, (w - 1) / 2, (h - 1) / 2))
+            assert live.wait_idle(20)
+    assert len(results) == 6
+    assert require_all_counted(live).restarts == 1
 
 
 @pytest.mark.parametrize("what", ["model", "on_result", "exit"])

@@ -9,7 +9,8 @@ import sys
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Condition, Thread, current_thread, main_thread
 from time import perf_counter
@@ -20,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.tracker import OtherCameraError
 from ufmstar_torch.arguments import CameraLike, ImageLike, as_image, as_intrinsics, as_pose
 from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.camera import rotation_deviation
@@ -30,12 +32,8 @@ from ufmstar_torch.trajectory import SAME_TIME, Trajectory, interpolate_pose
 
 # Why an image was dropped (another one was more recent) or skipped (it cannot be used).
 NEWER, CLOSED = "a newer image was ready", "closed"
-BACKWARDS, LATE, GAP, LOST = (
-    "its stamp is not after the image before",
-    "no pose in time",
-    "poses too far apart around it",
-    "a pose around it is not finite",
-)
+BACKWARDS, LATE, GAP = "its stamp is not after the image before", "no pose in time", "poses too far apart around it"
+LOST = "a pose around it is not finite"
 _WAITING = 16  # images that wait for their poses: half a second at 30 frames/s
 _POSES = 4096  # poses kept: 4 s of an inertial filter at 1 kHz
 
@@ -68,6 +66,7 @@ class LiveStatistics:
     dropped: Mapping[str, int]  # by reason: images without a fault of their own
     skipped: Mapping[str, int]  # by reason: images that could not be used
     saved: int  # how often the state was
+    restarts: int  # how often an image of another size or camera made the anchors' evidence start afresh
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,20 +77,6 @@ class _Waiting:
     image: ImageLike
     intrinsics: Tensor
     received: float
-
-
-@dataclass(eq=False)
-class _Failure:
-    """Keeps the error that ends a block, for another thread to raise."""
-
-    error: BaseException | None = field(default=None)
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, _: object, error: BaseException | None, __: object) -> bool:
-        self.error = error
-        return True
 
 
 class LiveDepth:
@@ -109,9 +94,9 @@ class LiveDepth:
         intrinsics: of the images [px], [3, 3] or fx, fy, cx, cy; None: every ``push_image`` has its own.
         max_wait: for poses after an image [s].
         max_gap: between the poses around an image, beyond which it is skipped [s].
-        state: file in which ``model.state_dict()`` is saved, as a whole or not at all, every ``save_every`` seconds
-            and at the end; None = never. ``model.load_state_dict(torch.load(FILE))`` goes on from it.
-        save_every: [s].
+        state: file in which ``model.state_dict()`` is saved, whole or not at all, every ``save_every`` seconds [s] and
+            at the end; None = never. ``model.load_state_dict(torch.load(FILE))`` goes on from it.
+        save_every: see ``state``.
         at_sigterm: on SIGTERM, end after the current image, save the state, and then deliver the signal to the handler
             that was there before. Only from the main thread.
 
@@ -119,8 +104,9 @@ class LiveDepth:
         TypeError, ValueError: an argument is impossible.
         FileNotFoundError: the folder of ``state`` does not exist.
 
-    An error of the model, of ``on_result`` or of saving ends the worker; every later ``push_*``, ``reset``,
-    ``wait_idle`` and ``close`` raises it.
+    Images of another size or camera than those before start the evidence of ``model``'s anchors afresh. An error of the
+    model, of ``on_result`` or of saving ends the worker; every later ``push_*``, ``reset``, ``wait_idle`` and ``close``
+    raises it.
 
     Example::
 
@@ -157,15 +143,13 @@ class LiveDepth:
         self._intrinsics = None if intrinsics is None else as_intrinsics(intrinsics)
         self._max_wait, self._max_gap, self._save_every = max_wait, max_gap, save_every
         self._changed = Condition()  # guards everything below; reentrant, since a signal may come inside
-        self._waiting: list[_Waiting] = []
+        self._waiting: list[_Waiting] = []  # images, the oldest first
         self._times: list[float] = []  # of the poses, increasing
         self._poses: list[np.ndarray] = []
         self._last_image = -math.inf
         self._busy = self._ending = self._ended = self._resetting = self._signalled = False
-        self._counts: Counter[str] = Counter()
-        self._dropped: Counter[str] = Counter()
-        self._skipped: Counter[str] = Counter()
-        self._failure = _Failure()
+        self._counts, self._dropped, self._skipped = Counter[str](), Counter[str](), Counter[str]()
+        self._error: BaseException | None = None
         self._before: Any = None  # the handler of SIGTERM before ours; None = ours is not installed
         self._worker = Thread(target=self._run, name="ufmstar live", daemon=True)
         if at_sigterm:
@@ -235,7 +219,7 @@ class LiveDepth:
     def statistics(self) -> LiveStatistics:
         """Counts up to now."""
         with self._changed:
-            counts = {name: self._counts[name] for name in ("images", "poses", "results", "saved")}
+            counts = {name: self._counts[name] for name in ("images", "poses", "results", "saved", "restarts")}
             return LiveStatistics(**counts, dropped=dict(self._dropped), skipped=dict(self._skipped))
 
     def reset(self) -> None:
@@ -247,9 +231,8 @@ class LiveDepth:
             self._times, self._poses, self._last_image, self._resetting = [], [], -math.inf, True
 
     def wait_idle(self, timeout: float | None = None) -> bool:
-        """Wait until no image waits and none is computed, at most ``timeout`` [s] (not in
-        ``on_result``); whether that came true. Raises
-        BaseException: the model or ``on_result`` failed."""
+        """Wait until no image waits and none is computed, at most ``timeout`` [s] (not in ``on_result``); whether that
+        came true. Raises BaseException: the model or ``on_result`` failed."""
         with self._changed:
             idle = self._changed.wait_for(lambda: not (self._waiting or self._busy) or self._ended, timeout)
         self._raise()
@@ -270,8 +253,8 @@ class LiveDepth:
             self._raise()
 
     def _raise(self) -> None:
-        if self._failure.error is not None:
-            raise self._failure.error
+        if self._error is not None:
+            raise self._error
 
     def _end(self) -> None:
         with self._changed:
@@ -296,13 +279,18 @@ class LiveDepth:
             os.kill(os.getpid(), number)
 
     def _run(self) -> None:
-        with self._failure:
+        with ExitStack() as stack:
+            stack.push(self._keep_error)
             self._work()
         with self._changed:
             self._busy, self._ended, signalled = False, True, self._signalled
             self._changed.notify_all()
         if signalled:
             os.kill(os.getpid(), signal.SIGTERM)
+
+    def _keep_error(self, _: object, error: BaseException | None, __: object) -> bool:
+        self._error = error
+        return True
 
     def _work(self) -> None:
         saved, unsaved = perf_counter(), False
@@ -359,7 +347,14 @@ class LiveDepth:
         if resetting:
             self.model.reset()
         started = perf_counter()
-        out = self.model(frame.image, T, frame.intrinsics)
+        try:
+            out = self.model(frame.image, T, frame.intrinsics)
+        except OtherCameraError:
+            assert self.model.landmarks is not None
+            self.model.landmarks.reset()
+            with self._changed:
+                self._counts["restarts"] += 1
+            out = self.model(frame.image, T, frame.intrinsics)
         finished = perf_counter()
         if fault := int(out.ufm.statistics.fault[0]):
             with self._changed:

@@ -229,7 +229,6 @@ def _model(options: LiveOptions) -> UncertainDepth:
         mode="full" if chosen.mode == "full" else "alternate",
         posterior=options.uncertainty.posterior,
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
-        preprocess=source.networks[0].preprocess,
         anchors=_anchors(anchors),
         recalibration=recalibration_of(as_dict(options.uncertainty) | as_dict(chosen), config, source),
     ).to(options.device)

@@ -59,6 +59,7 @@ class RealTime:
             "results": statistics.results,
             "dropped": dict(statistics.dropped),
             "skipped": dict(statistics.skipped),
+            "restarts": statistics.restarts,
             "lost_share": lost / statistics.images if statistics.images else None,
             "seconds": seconds,
             "per_second": (len(compute) - 1) / seconds if len(compute) > 1 else None,

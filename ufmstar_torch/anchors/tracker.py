@@ -49,6 +49,13 @@ _CELLS = 6
 _MEDIAN = 0.6745
 
 
+class OtherCameraError(ValueError):
+    """An image is of another size or camera than those before."""
+
+    def __init__(self) -> None:
+        super().__init__("image and K must be of the size and camera of the images before: call reset() first")
+
+
 @dataclass(frozen=True)
 class TrackerConfig(Checked):
     """Settings of the search for corners, of their tracking and acceptance. Lengths in pixels are the camera's.
@@ -237,7 +244,7 @@ class LandmarkTracker(SavedState):
         gray, T, K = checked(image, T_world_cam, K)
         if self._gray.size:
             if gray.shape != self._gray.shape or not np.array_equal(K, self._K):
-                raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
+                raise OtherCameraError
             position, alive = self._followed(gray, T)
         else:
             position, alive = np.zeros((self.config.max_points, 2)), np.zeros(self.config.max_points, dtype=bool)

@@ -15,7 +15,7 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
     spread_around,
     wrong,
 )
-from ufmstar_torch.posterior.learn import LEAST_REST, STEPS
+from ufmstar_torch.posterior.learn import APART, LEAST_REST, STEPS
 
 
 def learnt(
@@ -77,7 +77,7 @@ def _of_pairs(
         alone[one] = alone[other] = False
         pairs += len(one)
         _, variance, away, noise = (means[:, one] + means[:, other]) / 2
-        covariance = np.maximum(variance - amplitude * link[one] / 2, 0)
+        covariance = np.maximum(variance - APART * amplitude * link[one] / 2, 0)
         sums += _products(means[0, one] * means[0, other], covariance, variance, noise, away)
     error, variance, away, noise = means[:, alone]
     share = len(error) / max(len(error) + pairs, 1)

@@ -142,10 +142,18 @@ def _prior(grid: Grid, running: Running) -> Prior:
 
 
 def fitted(scene: Scene) -> tuple[Field, LeftOut, Floats]:
-    _, left_out = _with_weights(scene, 1 / scene.noise)
+    first, left_out = _with_weights(scene, 1 / scene.noise)
     excess = np.maximum(left_out.residual**2 - left_out.total, 0) / (scene.config.degrees_of_freedom + 1)
     weight = 1 / (scene.noise + excess)
-    return *_with_weights(scene, weight), weight
+    return *_with_weights(scene._replace(prior=_loosened(scene, first)), weight), weight
+
+
+def _loosened(scene: Scene, field: Field) -> Prior:
+    nu, grid, prior = scene.config.degrees_of_freedom, scene.grid, scene.prior
+    f = field.offset.reshape(grid.rows, grid.cols)
+    right, down = np.diff(f, axis=1, append=f[:, -1:]).ravel(), np.diff(f, axis=0, append=f[-1:]).ravel()
+    right, down = (w * (nu + 1) / (nu + w * x**2) for w, x in ((prior.right, right), (prior.down, down)))
+    return prior._replace(right=right, down=down)
 
 
 def _with_weights(scene: Scene, weight: Floats) -> tuple[Field, LeftOut]:

@@ -21,7 +21,7 @@ class PosteriorConfig(Checked):
         prior_sigma: standard deviation of b's constant and of its slope in log d before the first anchor
         tilt_sigma: the same of its slopes in u and v
         drift: standard deviation of b's change from frame to frame
-        degrees_of_freedom: of the Student-t distribution of an anchor about the others' prediction
+        degrees_of_freedom: of the Student-t distributions of an anchor about the others' prediction, and of a link
         alone: variance of y of an anchor without others; 1/N of it, of each among N
         roughness: standard deviation of y from one pixel to the next, before it is learnt
         unseen: variance of y a width of the image from evidence, before it is learnt
@@ -45,7 +45,7 @@ class PosteriorConfig(Checked):
     prior_sigma: float = number(0.5, "sigma_b", "1", 0.0, open_low=True)
     tilt_sigma: float = number(0.2, "sigma_t", "1", 0.0, open_low=True)
     drift: float = number(0.05, "tau", "1/frame^.5", 0.0)
-    degrees_of_freedom: float = number(4.0, "nu", "1", 0.0, open_low=True)
+    degrees_of_freedom: float = number(2.0, "nu", "1", 0.0, open_low=True)
     alone: float = number(1.0, "sigma_1^2", "1", 0.0)
     roughness: float = number(0.05, "sigma_0", "1", 0.0, open_low=True)
     unseen: float = number(0.1, "g", "1/width", 0.0)

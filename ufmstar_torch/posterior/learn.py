@@ -16,6 +16,9 @@ from ufmstar_torch.posterior.field import Field
 from ufmstar_torch.posterior.running import Running, ratios
 from ufmstar_torch.posterior.scene import LeftOut, Scene, away_from, second_moment, spread_around, wrong
 
+# Variance of the difference between neighbouring nodes, over that of the link between them: on a square lattice the
+# other ways from one to the other are worth as much as the link.
+APART = 0.5
 # With fewer anchors beside the discs, nothing is held out: the field would be the prior.
 LEAST_REST = 5
 # The frame's number moves the discs along this sequence of low discrepancy (R2, Roberts).
@@ -99,7 +102,9 @@ def _of_pairs(scene: Scene, held: Tensor, values: Tensor, running: Running) -> d
         paired, pairs = paired | pad(pair, before) | pad(pair, after), pairs + pair.sum((1, 2))
         _, variance, away, noise = (one + other) / 2
         between = amplitude[:, None, None] * link.view_as(count).narrow(axis, 0, n)
-        sums = sums + _products(pair, one[0] * other[0], (variance - between / 2).clamp_min(0), variance, noise, away)
+        sums = sums + _products(
+            pair, one[0] * other[0], (variance - APART * between / 2).clamp_min(0), variance, noise, away
+        )
     error, variance, away, noise = means
     alone, product = (count > 0) & ~paired, error.square() - noise / count.clamp_min(1)
     share = alone.sum((1, 2)) / (alone.sum((1, 2)) + pairs).clamp_min(1)

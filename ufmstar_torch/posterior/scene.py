@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ufmstar_torch.anchors.anchors import AnchorInput
 from ufmstar_torch.frame import FrameInput
@@ -108,10 +109,19 @@ def _range(frame: FrameInput, anchors: AnchorInput) -> Tensor:
 def fitted(scene: Scene) -> tuple[Field, LeftOut, Tensor]:
     """The field, how well it predicts each anchor from the others, and the anchors' weights in it."""
     zero = torch.zeros_like(scene.noise)
-    _, left_out = _with_weights(scene, torch.where(scene.valid, 1 / scene.noise, zero))
+    first, left_out = _with_weights(scene, torch.where(scene.valid, 1 / scene.noise, zero))
     excess = (left_out.residual.square() - left_out.total).clamp_min(0) / (scene.config.degrees_of_freedom + 1)
     weight = torch.where(scene.valid, 1 / (scene.noise + excess), zero)
-    return *_with_weights(scene, weight), weight
+    return *_with_weights(replace(scene, prior=_loosened(scene, first)), weight), weight
+
+
+def _loosened(scene: Scene, field: Field) -> Prior:
+    """The prior with Student's t for links too: across one whose ends differ by much in the field, f may jump."""
+    nu, prior = scene.config.degrees_of_freedom, scene.prior
+    f = field.offset.unflatten(1, scene.grid.size)
+    right, down = pad(f.diff(dim=2), (0, 1)).flatten(1), pad(f.diff(dim=1), (0, 0, 0, 1)).flatten(1)
+    right, down = (w * (nu + 1) / (nu + w * x.square()) for w, x in ((prior.right, right), (prior.down, down)))
+    return replace(prior, right=right, down=down)
 
 
 def _with_weights(scene: Scene, weight: Tensor) -> tuple[Field, LeftOut]:

@@ -12,7 +12,8 @@ the predicted depth (``grid``, ``field``). An anchor observes y with the varianc
 where blur is half the range of log d among the pixel's neighbours, and ``noise`` the factor by which anchors state
 their variances too small, and ``alone`` over the number of anchors is added: few anchors do not confirm each other. An
 anchor is distributed about the prediction of the others as Student's t. What (nu + z^2)/(nu + 1) adds to that
-prediction's variance, with z from the leave-one-out residual, is counted as its noise: this takes outliers out.
+prediction's variance, with z from the leave-one-out residual, is counted as its noise: this takes outliers out. The
+difference of f across a link is Student's t in the same way, so that f may jump where the anchors say so.
 
 Variance over the squared depth at a node, with v the field's variance + roughness + unseen distance, and
 share = min(1, distance/reach):
