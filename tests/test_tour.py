@@ -40,13 +40,10 @@ def scene(*parts) -> Tour:
     lights[..., 3:] = 1
     return Tour(
         seed=0,
-        style=STYLES["home"],
         rooms=room,
         room_styles=("home",),
         doors=torch.zeros(0, 2, 3, dtype=torch.float64),
-        door_rooms=torch.zeros(0, 2, dtype=torch.int64),
         surfaces=surfaces(parts, np.random.default_rng(0)),
-        labels=("",) * len(parts),
         lights=lights,
         volumes=torch.ones(1, 1, 2, 2, 2),
         noise=noise_table(),
@@ -132,7 +129,7 @@ def test_the_nearer_surface_hides_the_farther_one():
 def same(a: Tour, b: Tour) -> bool:
     pairs = [(a.rooms, b.rooms), (a.lights, b.lights), (a.volumes, b.volumes)]
     pairs += [(getattr(a.surfaces, n), getattr(b.surfaces, n)) for n in a.surfaces.__dataclass_fields__]
-    return all(torch.equal(x, y) for x, y in pairs) and a.labels == b.labels
+    return all(torch.equal(x, y) for x, y in pairs)
 
 
 def test_a_seed_makes_the_same_tour_and_pictures_for_any_number_of_threads(home):
@@ -172,7 +169,7 @@ def test_every_way_keeps_clear_of_everything(style):
         boxes = torch.cat([tour.rooms, tour.doors])
         assert ((boxes[:, 0] < points[:, None]) & (points[:, None] < boxes[:, 1])).all(-1).any(1).all()
         distance = to_surfaces(tour, points)
-        assert distance.min() >= 0.3, tour.labels[int(distance.argmin())]
+        assert distance.min() >= 0.3
 
 
 def test_poses_are_rigid_level_and_smooth(home):
@@ -243,8 +240,6 @@ def test_mixed_tours_begin_at_home_and_end_in_a_hall(mixed):
     rooms = mixed.room_at(tour_path(mixed, 150)[:, :3, 3])
     assert rooms[0] == 0
     assert (rooms == 2).sum() > 40
-    styles = [mixed.style_at(p) for p in mixed.rooms.mean(1)]
-    assert styles == ["home", "home", "hall"]
     texture, room = mixed.surfaces.texture, mixed.surfaces.rooms
     of_hall = {TEXTURES[i] for i in texture[(room[:, 0] == 2) & (room[:, 1] < 0)].tolist()}
     of_home = {TEXTURES[i] for i in texture[room[:, 0] < 2].tolist()}
@@ -289,7 +284,7 @@ def test_a_pan_turns_in_place_and_a_blank_home_is_plain():
     assert np.ptp(poses[:, :3, 3], axis=0).max() < 2 * 0.04  # the sway of a hand
     turned = poses[0, :3, :3].T @ poses[-1, :3, :3]
     assert np.degrees(np.arccos((np.trace(turned) - 1) / 2)) > 30
-    assert set(HOME_TEXTURES) - set(make_tour(2, "blank").style.textures) >= {"wood", "tiles", "bricks", "plaster"}
+    assert set(HOME_TEXTURES) - set(STYLES["blank"].textures) >= {"wood", "tiles", "bricks", "plaster"}
 
 
 def test_an_exported_tour_reads_as_a_generic_sequence(tmp_path):

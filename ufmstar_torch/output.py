@@ -123,8 +123,10 @@ class UfMStarOutput:
             ``config.anchors``.
         bias: the relative error r = g/d - 1 that anchors lead to expect; None unless ``config.anchors``.
         posterior_depth, posterior_variance: what :meth:`posterior` returns; None unless ``config.posterior``.
-        posterior_outlier: probability that the pixel lies on another surface than the anchors that corrected it; its
-            variance is counted in ``posterior_variance``. NaN before any anchor; None likewise.
+        posterior_outlier: probability p that the pixel lies on another surface than the anchors that corrected it. NaN
+            before any anchor; None likewise.
+        posterior_inlier_variance: V_1 [m^2], the variance if it does not. ``posterior_variance`` V contains both: where
+            it does, the variance is (V - (1 - p) V_1)/p.
         features: regressed further entries of H, [B, H, W, F], in the caller's units.
         measured: share in [0, 1] of M that rests on surfaces seen from two views or more; below one half the pixel
             counts as not measured (``config.unmeasured``). NaN where not valid.
@@ -150,6 +152,7 @@ class UfMStarOutput:
     posterior_depth: Tensor | None = None
     posterior_variance: Tensor | None = None
     posterior_outlier: Tensor | None = None
+    posterior_inlier_variance: Tensor | None = None
 
     def __repr__(self) -> str:
         """Shape, median standard deviation and counts in a line."""

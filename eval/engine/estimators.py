@@ -27,7 +27,7 @@ from ufmstar_torch.recalibrate import Recalibration
 Answer = dict[str, Any]
 _OF_OUTPUT = (
     "depth", "variance", "valid", "aleatoric", "epistemic", "disagreement", "measured", "anchored", "bias",
-    "posterior_depth", "posterior_variance", "statistics",
+    "posterior_depth", "posterior_variance", "posterior_inlier_variance", "posterior_outlier", "statistics",
 )  # fmt: skip
 
 

@@ -29,10 +29,8 @@ DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
 _BROKEN_IMAGE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 # Key of a PNG's text chunk: metres per unit of its 16-bit values.
 SCALE_KEY = "depth_scale"
-# Bit depth, colour type, compression, filter and interlacing, from a PNG's header.
-_RGB = (8, 2, 0, 0, 0)
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_HEADER = struct.Struct(">8s8x2I5B")
+# A PNG's signature, two numbers, width and height; then bit depth, colour type, compression, filter and interlacing.
+_HEADER, _SIGNATURE, _RGB = struct.Struct(">8s8x2I5s"), b"\x89PNG\r\n\x1a\n", bytes((8, 2, 0, 0, 0))
 _MILLIMETRE = 1e-3
 # Names of a depth channel of an EXR file, best first; Blender prefixes its layer ("ViewLayer.Depth.Z").
 _DEPTH_NAMES = ("Z", "depth", "V", "Y", "R")
@@ -53,12 +51,13 @@ def read_color(path: str | Path, content: bytes | None = None) -> np.ndarray:
 
 
 def read_depth(path: str | Path, scale: float | None = None, *, default_scale: float = _MILLIMETRE) -> np.ndarray:
-    """A depth map as [H, W] float32 [m]; non-finite and non-positive values become 0 (invalid).
+    """A depth map as [H, W] float32 [m], 0 = invalid, of a 16-bit PNG or TIFF, float TIFF, EXR, npy or npz (key
+    ``depth``, or its only array).
 
     Args:
-        path: 16-bit PNG or TIFF, float TIFF, EXR, npy or npz (key ``depth``, or its only array).
-        scale: metres per unit of the stored values, for any of these. None: floats are metres; integers
-            are in the unit that a PNG's text ``depth_scale`` names, or else in ``default_scale``.
+        path: of the file.
+        scale: metres per unit of the stored values. None: floats are metres; integers are in the unit that a PNG's text
+            ``depth_scale`` names, or else in ``default_scale``.
         default_scale: metres per unit of integers without another indication.
 
     Raises:
@@ -73,15 +72,8 @@ def read_depth(path: str | Path, scale: float | None = None, *, default_scale: f
 
 
 def read_map(path: str | Path, key: str) -> tuple[np.ndarray, float | None]:
-    """A one-channel map [H, W] as stored, and the metres per unit that a PNG's text names (or None).
-
-    Args:
-        path: PNG, TIFF, EXR, npy or npz.
-        key: which array of an npz to take, where it holds several.
-
-    Raises:
-        FrameError: as :func:`read_depth`.
-    """
+    """A one-channel map [H, W] as stored, and the metres per unit that a PNG's text names (or None); ``key`` is the
+    array of an npz that holds several. Raises FrameError: as :func:`read_depth`."""
     path = Path(path)
     suffix = path.suffix.lower()
     scale = None
@@ -200,8 +192,8 @@ def _plain_png(path: Path) -> np.ndarray | None:
         content = file.read(_HEADER.size)
     if len(content) < _HEADER.size:
         return None
-    signature, width, height, *found = _HEADER.unpack(content)
-    if signature != _SIGNATURE or tuple(found) != _RGB or width * height > (Image.MAX_IMAGE_PIXELS or 0):
+    signature, width, height, found = _HEADER.unpack(content)
+    if (signature, found) != (_SIGNATURE, _RGB) or width * height > (Image.MAX_IMAGE_PIXELS or 0):
         return None
     from kornia_rs import io
 
@@ -225,14 +217,8 @@ def _from_image(path: Path) -> tuple[np.ndarray, float | None]:
 
 
 def _read_exr(path: Path) -> np.ndarray:
-    """The depth channel of an OpenEXR file as [H, W] float32, values as stored.
-
-    It is the only channel, or the first one called Z, depth, V, Y or R (after a layer prefix).
-
-    Raises:
-        FrameError: not an OpenEXR file, truncated, a deep image, or no such channel.
-        ModuleNotFoundError: OpenEXR is not installed.
-    """
+    """The depth channel of an OpenEXR file as [H, W] float32, values as stored: the only channel, or the first one
+    called Z, depth, V, Y or R (after a layer prefix)."""
     OpenEXR = optional("OpenEXR", "EXR files need OpenEXR", "'ufmstar-torch[eval]'")
     try:
         with redirect_stdout(StringIO()):  # the library prints a remark on damaged files

@@ -56,6 +56,11 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
+def pinhole_values(K: np.ndarray) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy [px] of a matrix [3, 3]."""
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+
+
 def camera_matrix(given: IntrinsicsLike | None, known: np.ndarray, known_size: Size, size: Size | None) -> np.ndarray:
     """K [3, 3] of images of ``size``: the ``given`` one, or the layout's own of ``known_size``, scaled."""
     return scale_intrinsics(known, known_size, size) if given is None else read_intrinsics(given)

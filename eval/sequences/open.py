@@ -12,11 +12,8 @@ from ufmstar_torch.eval.sequences.images import within
 from ufmstar_torch.eval.sequences.layout import layout_of, readers
 from ufmstar_torch.eval.sequences.lens import parse_distortion, undistort
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS, in_metres
 
-# By prefix of the path, the module and function that render such a sequence; imported on use, since that package
-# imports this one.
-_RENDERED = {"tour:": ("ufmstar_torch.eval.tour.sequence", "open_tour")}
 # Options that a layout has no use for, beside those of KITTI-360 alone.
 _REFUSED = {
     "tum": "images depth depth_intrinsics fps T_color_depth",
@@ -58,25 +55,26 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
         ValueError: unknown or ambiguous layout (with what was looked for), an option out of range or of no
             use for the layout, malformed files (named by file and line), or no usable frame.
     """
-    for prefix, (module, name) in _RENDERED.items():
-        if str(path).startswith(prefix):
-            if layout != "auto":
-                raise ValueError(f"layout must be auto for {path!r}, got {layout!r}")
-            if options:
-                raise ValueError(f"{path!r} takes no {', '.join(options)}: a tour's options stand in its name")
-            return convert_poses(getattr(import_module(module), name)(str(path)), poses)
+    if poses not in CONVENTIONS:
+        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
+    if str(path).startswith("tour:"):
+        if layout != "auto":
+            raise ValueError(f"layout must be auto for {path!r}, got {layout!r}")
+        if options:
+            raise ValueError(f"{path!r} takes no {', '.join(options)}: a tour's options stand in its name")
+        # Imported on use, since that package imports this one.
+        return convert_poses(import_module("ufmstar_torch.eval.tour.sequence").open_tour(str(path)), poses)
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"path: no such file or folder: {path}")
     chosen = Options(**options)
-    if poses not in CONVENTIONS:
-        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
     explicit = chosen.images is not None or chosen.trajectory is not None
     layout = layout_of(layout, path, explicit, chosen.plugin)
-    chosen.reject(layout, *_REFUSED.get(layout, "").split(), *(("drive", "scans") if layout != "kitti360" else ()))
-    chosen.reject(layout, *(("topics",) if layout != "bag" else ()))
-    if chosen.trajectory is None and layout != "generic":
-        chosen.reject(layout, "fps")
+    refused = _REFUSED.get(layout, "").split()
+    refused += [] if layout == "kitti360" else ["drive", "scans"]
+    refused += [] if layout == "bag" else ["topics"]
+    refused += [] if layout == "generic" or chosen.trajectory is not None else ["fps"]
+    chosen.reject(layout, *refused)
     sequence = readers(chosen.plugin)[layout].read(path, chosen)
     if chosen.distortion is not None:
         coefficients = parse_distortion(chosen.distortion)
@@ -90,19 +88,13 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
 
 def scale_poses(sequence: FrameSequence, metres: float) -> FrameSequence:
     """The sequence with positions in metres, of which a unit of its poses has ``metres``."""
-    scaled = []
-    for entry in sequence.entries:
-        T = entry.T_world_cam.copy()
-        T[:3, 3] *= metres
-        scaled.append(replace(entry, T_world_cam=T))
-    return replace(sequence, entries=tuple(scaled), metric=True, pose_scale=metres * sequence.pose_scale)
+    scaled = tuple(replace(entry, T_world_cam=in_metres(entry.T_world_cam, metres)) for entry in sequence.entries)
+    return replace(sequence, entries=scaled, metric=True, pose_scale=metres * sequence.pose_scale)
 
 
 def convert_poses(sequence: FrameSequence, convention: str) -> FrameSequence:
-    """The sequence with its poses, which were written so, as camera-to-world ones with our axes. Raises ValueError: an
-    unknown convention, or a sequence without poses."""
-    if convention not in CONVENTIONS:
-        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {convention!r}")
+    """The sequence with its poses, which were written so, as camera-to-world ones with our axes. Raises ValueError: a
+    sequence without poses."""
     if convention == OURS:
         return sequence
     if not sequence.posed:

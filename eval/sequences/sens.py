@@ -55,14 +55,9 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a ``.sens`` file; depth comes as it is, with ``depth_intrinsics``, as from a SensReader export.
-
-    Frames are called by their number. In a truncated file, those before the break are used and the others skipped.
-
-    Raises:
-        ValueError: not version 4; compressions other than jpeg or png and zlib_ushort; a broken header; no usable
-            frame.
-    """
+    """Opens a ``.sens`` file; depth comes as it is, with ``depth_intrinsics``, as from a SensReader export. Frames are
+    called by their number. In a truncated file, those before the break are used and the others skipped. Raises
+    ValueError: another version or compression, a broken header, or no usable frame."""
     file = _files(path)[0] if path.is_dir() else path
     with file.open("rb") as opened:
         header = _read_header(opened, file)
@@ -72,8 +67,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         color_size, depth_size = (tuple(header[key].tolist()[::-1]) for key in ("color_size", "depth_size"))
         scale = options.depth_scale or 1 / float(header["units_per_metre"])
         frames = _frames(opened, file, int(header["frames"]), depth_size, scale)
-    times = [np.nan if isinstance(f, Skipped) or f.timestamp is None else f.timestamp for f in frames]
-    frames = attach_given(frames, file.parent, options, np.array(times) if np.isfinite(times).all() else None)
+    frames = attach_given(frames, file.parent, options)
     for number in range(len(frames), int(header["frames"])):
         frames.append(Skipped(str(number), "beyond the end of the truncated file"))
     K_color, K_depth = (header[key][:3, :3].astype(np.float64) for key in ("K_color", "K_depth"))

@@ -27,7 +27,6 @@ LOOKED_FOR = f"{FILE}, also in one of its own name *.json"
 # Of a file or of one of its frames that structure from motion made.
 _NOT_METRIC = ("aabb_scale", "colmap_im_id")
 _SIGMA = "sigma_file_path"  # of a frame of `ufmstar export`
-_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
 _MODELS = (*_FISHEYES, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "")
 
@@ -38,16 +37,12 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens the frames in the file's order; one whose image is missing is skipped.
-
-    Raises:
-        ValueError: no JSON of this layout (the entry is named), an unknown camera model, or no usable frame.
-    """
+    """Opens the frames in the file's order. Raises ValueError: no JSON of this layout (the entry is named), an unknown
+    camera model, or no usable frame."""
     file = path if path.is_file() else path / FILE
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-        listed = content["frames"]
-        frames = [dict(frame) for frame in listed]
+        frames = [dict(frame) for frame in content["frames"]]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{file}: expected JSON with a list 'frames' of objects: {error}") from error
     scale = options.depth_scale or _number(content, "depth_unit_scale_factor", file, 0.001)
@@ -57,7 +52,9 @@ def read(path: Path, options: Options) -> FrameSequence:
     short = len({image.stem for image in paths}) == len(paths)
     for frame, image in zip(frames, paths, strict=True):
         name = image.stem if short else str(image.with_suffix("")).strip("/").replace("/", "__")
-        found = next((p for p in _candidates(file.parent / image) if p.is_file()), None)
+        whole = file.parent / image  # or without its ending, as in NeRF's synthetic scenes
+        candidates = (whole, *(whole.with_name(whole.name + suffix) for suffix in IMAGE_SUFFIXES))
+        found = next((path for path in candidates if path.is_file()), None)
         if found is None:
             entries.append(Skipped(name, "missing image file"))
             continue
@@ -81,11 +78,6 @@ def _path(frame: Mapping[str, Any], file: Path) -> Path:
     if not isinstance(value, str) or not value or "\0" in value:
         raise ValueError(f"{file}: a frame's file_path must be text, got {str(value)[:60]}")
     return Path(value)
-
-
-def _candidates(image: Path) -> list[Path]:
-    """The image, or with an ending, which NeRF's synthetic scenes leave out."""
-    return [image, *(image.with_name(image.name + suffix) for suffix in IMAGE_SUFFIXES)]
 
 
 def _pose(frame: Mapping[str, Any], file: Path) -> np.ndarray:
@@ -120,8 +112,7 @@ def _lens(values: Mapping[str, Any], size: Size, file: Path) -> Lens:
     cx, cy = _number(values, "cx", file, width / 2), _number(values, "cy", file, height / 2)
     sx, sy = size[1] / width, size[0] / height
     fisheye = model in _FISHEYES or values.get("is_fisheye") is True
-    known = [_number(values, key, file, 0.0) for key in _COEFFICIENTS]
-    k1, k2, p1, p2, k3, k4 = known
+    k1, k2, p1, p2, k3, k4 = (_number(values, key, file, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4"))
     if fisheye:
         coefficients: tuple[float, ...] = (k1, k2, k3, k4)
     else:

@@ -28,16 +28,9 @@ def tour_path(tour: Tour, frames: int, seed: int | None = None, *, pan: bool = F
 
     Without ``seed``, it starts in the first room, walks to the farthest one that the frames allow and back, and
     once more where it began. (In a tour whose last room has another style it goes there in any case, and turns
-    back only if the frames allow.) With ``seed``, it starts anywhere on the longest way, in either direction.
-
-    Args:
-        tour: where.
-        frames: at least 1.
-        seed: of the start, the sway of the hand and the glances; None = the tour's own.
-        pan: the camera stays at the start and turns, with the sway of the hand as its only baseline.
-
-    Raises:
-        ValueError: no frame, or a negative seed.
+    back only if the frames allow.) With ``seed``, it starts anywhere on the longest way, in either direction. With
+    ``pan``, it stays at the start and turns, with the sway of the hand as its only baseline. Raises ValueError: no
+    frame, or a negative seed.
     """
     if frames < 1:
         raise ValueError(f"frames must be at least 1, got {frames}")

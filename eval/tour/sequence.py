@@ -60,20 +60,10 @@ def tour_sequence(
     pan: bool = False,
     sensor: bool = True,
 ) -> FrameSequence:
-    """A tour as a sequence; frames are rendered when they are indexed.
-
-    Args:
-        seed: of the rooms, see :func:`make_tour`.
-        frames: at least 1.
-        size: (H, W) of images and depth maps.
-        style: ``home``, ``hall``, ``mixed``, ``blank`` or ``scales``.
-        fov: horizontal field of view [degrees], 20 to 120.
-        path_seed, pan: see :func:`tour_path`.
-        sensor: whether images have a sensor's exposure, vignetting and noise.
-
-    Raises:
-        ValueError: a value is out of its range.
-    """
+    """A tour as a sequence; frames are rendered when they are indexed. ``seed`` and ``style`` are those of
+    :func:`make_tour`, ``frames``, ``path_seed`` and ``pan`` of :func:`tour_path`; ``size`` is (H, W), ``fov`` the
+    horizontal field of view [degrees], ``sensor`` adds exposure, vignetting and noise. Raises ValueError: a value is
+    out of its range."""
     if len(size) != 2 or min(size) < 8:
         raise ValueError(f"size must be (H, W) of at least 8 px each, got {size}")
     if not 20 <= fov <= 120:
@@ -114,16 +104,8 @@ class _Renderer:
 
 
 def export_tour(sequence: FrameSequence, folder: str | Path) -> Path:
-    """Writes a sequence into the generic layout: images/, depth/ (float32 npy [m]), poses.txt and K.txt.
-
-    Args:
-        sequence: from :func:`tour_sequence`.
-        folder: new or empty.
-
-    Raises:
-        FileExistsError: the folder holds something.
-        ValueError: a frame has no image or no depth.
-    """
+    """Writes a sequence of :func:`tour_sequence` into the generic layout: images/, depth/ (float32 npy [m]), poses.txt
+    and K.txt. Raises FileExistsError: the folder is not empty; ValueError: a frame has no image or no depth."""
     from PIL import Image
 
     folder = Path(folder)

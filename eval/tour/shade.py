@@ -44,7 +44,8 @@ def shade(tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin:
     own = surface[order]
     kinds, rooms = _merged(spans, _TEXTURES), _merged(spans, 4 * _TEXTURES)
     hits = _hits(tour, own, depth[order], direction.index_select(1, order), origin, pixel_angle, kinds)
-    light = torch.maximum(_light(tour, hits, rooms), s.look[:, 7][own])
+    lit = [_light(tour, room, hits.point[:, a:b], hits.normal[:, a:b]) for room, a, b in rooms]
+    light = torch.maximum(torch.cat(lit, dim=1), s.look[:, 7][own])
     radiance = torch.empty_like(light)
     return radiance.index_copy_(1, order, _albedo(tour, hits, spans) * light)
 
@@ -128,21 +129,15 @@ def _albedo(tour: Tour, hits: Hits, spans: list[Span]) -> Tensor:
     colours = []
     for value, start, end in spans:
         part = slice(start, end)
-        first, second = look[:3, part], look[3:6, part]
         u, v = shifted[:, part]
         own_u, own_v = own[:, part]
-        patch = Patch(u, v, own_u, own_v, pixel[part], first, second, tour.noise)
+        patch = Patch(u, v, own_u, own_v, pixel[part], look[:3, part], look[3:6, part], tour.noise)
         colours.append(albedo(value % _TEXTURES, patch))
     return torch.cat(colours, dim=1)
 
 
-def _light(tour: Tour, hits: Hits, rooms: list[Span]) -> Tensor:
-    """[3, P] what the room's lamps and the light from everywhere bring to a surface."""
-    parts = [_light_of(tour, r, hits.point[:, a:b], hits.normal[:, a:b]) for r, a, b in rooms]
-    return torch.cat(parts, dim=1)
-
-
-def _light_of(tour: Tour, room: int, point: Tensor, normal: Tensor) -> Tensor:
+def _light(tour: Tour, room: int, point: Tensor, normal: Tensor) -> Tensor:
+    """[3, P] what a room's lamps and the light from everywhere bring to its surfaces."""
     lower, upper = tour.rooms[room].float()
     before = ((point + _BEFORE * normal - lower[:, None]) / (upper - lower)[:, None] * 2 - 1).T
     reached = grid_sample(

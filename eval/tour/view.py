@@ -35,18 +35,9 @@ def intrinsics(height: int, width: int, fov_degrees: float = 70.0) -> NDArray[np
 def render(
     tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int, *, frame_seed: int | None = None
 ) -> TourView:
-    """Renders one view.
-
-    Args:
-        tour: what is seen.
-        T_world_cam: [4, 4] camera-to-world, camera axes x right, y down, z forward [m].
-        K: [3, 3] intrinsics [px], the centre of the first pixel at (0, 0).
-        height, width: of the image.
-        frame_seed: adds what a sensor does (exposure, vignetting, noise); None = a perfect one.
-
-    Raises:
-        ValueError: a malformed pose, intrinsics or size, or a camera outside of every room.
-    """
+    """Renders one view from a pose [4, 4] (camera-to-world, x right, y down, z forward [m]) with intrinsics [3, 3]
+    [px]. ``frame_seed`` adds what a sensor does (exposure, vignetting, noise). Raises ValueError: a malformed pose,
+    intrinsics or size, or a camera outside of every room."""
     pose, intrinsics = _checked(tour, T_world_cam, K, height, width)
     depth, surface = cast(tour, pose, intrinsics, height, width)
     valid = surface >= 0
@@ -62,7 +53,7 @@ def render(
 def cast(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Depth [H, W] float64 [m], infinite where nothing is, and the primitives seen [H, W] int64, -1 for none; arguments
     as of :func:`render`."""
-    seen = surface_windows(tour, T_world_cam, K, height, width)
+    seen = surface_windows(tour.surfaces.corners, T_world_cam, K, height, width)
     u = torch.arange(width, dtype=torch.float64)
     v = torch.arange(height, dtype=torch.float64)[:, None]
     depth = torch.full((height, width), float("inf"), dtype=torch.float64)
