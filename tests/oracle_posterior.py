@@ -194,7 +194,7 @@ def update(state, depth, claimed, pixel, g, variance):
     alone = [second_moment(0.0, *each) for each in zip(spread, share, offset, around, strict=True)]
     spread = [second_moment(wrong, *each) for each in zip(spread, share, offset, around, strict=True)]
     posterior, variance, _ = read(depth, counted, logs, mean[:4], offset, spread, share)
-    _, inlier, unseen = read(depth, counted, logs, mean[:4], offset, alone, share)
+    _, inlier, unseen = read(depth, 0 * counted, logs, mean[:4], offset, alone, share)
     return after, posterior, variance, inlier, np.minimum(wrong * (1 + 2 * unseen), 0.5)
 
 

@@ -120,6 +120,5 @@ def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limi
             value = base[j] + by_depth * g + by_row * (2 * v - 1) + offset * share
             ys[j] = min(max(value, -largest), largest) if used[j] else np.nan
             far[j] = unseen * share if used[j] else np.nan
-            network = unseen * (V if V == V else 0.0)
-            out[j] = (own * d * d + network) * share
-            inside[j] = (here * d * d + network) * share
+            out[j] = (own * d * d + unseen * (V if V == V else 0.0)) * share
+            inside[j] = here * d * d * share

@@ -34,8 +34,8 @@ def read(
         config: of the posterior.
 
     Returns:
-        Depth d e^y [m], the two variances (d e^y)^2 (v + share claimed/d^2) [m^2] and the share, [B, H, W] in depth's
-        dtype, NaN where not valid.
+        Depth d e^y [m], variance (d e^y)^2 (v + share claimed/d^2) [m^2], that on the surface of the evidence, which
+        claimed is no part of, and the share, [B, H, W] in depth's dtype, NaN where not valid.
     """
     rows, cols = size
     b, height, width = depth.shape
@@ -56,8 +56,8 @@ def read(
     c = coefficients[:, None, None].expand(b, height, width, 4).unbind(-1)
     y = c[0] + c[1] * (logs - mean[:, None, None]) + c[2] * (2 * u - 1) + c[3] * (2 * v - 1)[:, None] + offset
     corrected = d * y.clamp(-LARGEST, LARGEST).exp()
-    beside = unseen * claimed.double() / d.square()
-    maps = corrected, corrected.square() * (variance + beside), corrected.square() * (inlier + beside), unseen
+    variance = variance + unseen * claimed.double() / d.square()
+    maps = corrected, corrected.square() * variance, corrected.square() * inlier, unseen
     corrected, variance, inlier, unseen = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in maps)
     return corrected, variance, inlier, unseen
 

@@ -21,7 +21,7 @@ share = min(1, distance/reach):
     (1 - p) m(v) + p tail + share V/d^2,      p = wrong (1 + other share),      m(v) = E[(e^n - 1)^2],      n ~ N(0, v).
 
 The error of the depth is log-normal, so m exceeds v where v is large. p is the probability that the depth is of another
-surface than its evidence: ``outlier``.
+surface than its evidence: ``outlier``. ``inlier`` is m(v) alone.
 
 The distance from evidence is geodesic, in widths of the image, and differences of log d lengthen it: on tours the
 variance of the error grows in proportion to it. V = M + A + E counts where evidence is far. ``learn`` says how
