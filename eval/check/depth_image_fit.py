@@ -35,12 +35,9 @@ class DepthImageFit:
 
 
 def depth_image_fit(frames: Iterable[tuple[np.ndarray, np.ndarray]]) -> DepthImageFit:
-    """The fit over pairs of an image [H, W, 3] uint8 and a depth map [H, W] [m] (0 = invalid).
-
-    Each edge pixel scores the rank of the image gradient there (ranks, because a lamp's gradient would
-    outweigh all others); scores are averaged over all frames, for each displacement. Observed quality: at
-    least 0.5 on registered recordings, at most 0.2 with 7-Scenes' unregistered geometry.
-    """
+    """The fit over pairs of an image [H, W, 3] uint8 and a depth map [H, W] [m] (0 = invalid). Each edge pixel scores
+    the rank of the image gradient there (a lamp's gradient would outweigh all others), for each displacement. Observed
+    quality: at least 0.5 on registered recordings, at most 0.2 with 7-Scenes' unregistered geometry."""
     total: np.ndarray | float = 0.0
     count: np.ndarray | float = 0.0
     edges, width = 0, 1

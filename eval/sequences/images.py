@@ -11,7 +11,7 @@ import re
 import struct
 from collections.abc import Iterable
 from contextlib import redirect_stdout, suppress
-from functools import lru_cache, partial
+from functools import partial
 from io import BytesIO, StringIO
 from pathlib import Path
 
@@ -66,8 +66,6 @@ def read_depth(path: str | Path, scale: float | None = None, *, default_scale: f
     values, named_scale = read_map(path, key="depth")
     if scale is None and np.issubdtype(values.dtype, np.integer):
         scale = named_scale or default_scale
-    if values.dtype == np.uint16 and scale is not None:
-        return _lengths(scale)[values]
     return positive(values.astype(np.float32) if scale is None else (values * np.float64(scale)).astype(np.float32))
 
 
@@ -155,12 +153,8 @@ def depth_loader(path: Path | None, scale: float | None, default_scale: float = 
     return None if path is None else partial(read_depth, path, scale, default_scale=default_scale)
 
 
-def within(load: Loader | None, most: float) -> Loader | None:
-    """The loader of a depth map without the depths beyond ``most`` [m] (None stays None)."""
-    return None if load is None else partial(_within, load, most)
-
-
-def _within(load: Loader, most: float) -> np.ndarray:
+def within(load: Loader, most: float) -> np.ndarray:
+    """A depth map without the depths beyond ``most`` [m]."""
     depth = load()
     return np.where(depth <= most, depth, np.float32(0))
 
@@ -171,12 +165,6 @@ def check_scale(depth_scale: float | None) -> None:
         raise ValueError(
             f"depth_scale is in metres per unit (0.001 for millimetres, 1/5000 for TUM), got {depth_scale}"
         )
-
-
-@lru_cache(maxsize=4)
-def _lengths(scale: float) -> np.ndarray:
-    """[65536] float32, the length of each 16-bit count [m]."""
-    return positive((np.arange(2**16) * np.float64(scale)).astype(np.float32))
 
 
 def positive(depth: np.ndarray) -> np.ndarray:

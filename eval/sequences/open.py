@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -81,7 +82,10 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
         sequence = undistort(sequence, *coefficients, depth_too=chosen.depth_intrinsics is None)
     sequence = convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), poses)
     if chosen.max_truth is not None:
-        entries = [replace(entry, load_depth=within(entry.load_depth, chosen.max_truth)) for entry in sequence.entries]
+        loaders = [
+            entry.load_depth and partial(within, entry.load_depth, chosen.max_truth) for entry in sequence.entries
+        ]
+        entries = [replace(e, load_depth=load) for e, load in zip(sequence.entries, loaders, strict=True)]
         sequence = replace(sequence, entries=tuple(entries))
     return sequence if chosen.pose_scale is None else scale_poses(sequence, chosen.pose_scale)
 

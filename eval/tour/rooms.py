@@ -74,30 +74,20 @@ def on_plan(axis: int, across: float, along: float) -> Array:
 
 def lay_out(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room], list[Door]]:
     """Draws the rooms; door i joins room i + 1 to an earlier one."""
-    while True:
-        layout = _try_layout(style, rng)
-        if layout is not None:
-            return layout
-
-
-def _try_layout(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room], list[Door]] | None:
     count = int(rng.integers(style.rooms[0], style.rooms[1] + 1))
-    styles = [style] * count
-    if style.last is not None:
-        styles[-1] = style.last
+    styles = [style] * (count - 1) + [style.last or style]
     rooms = [_room(styles[0], rng)]
     doors: list[Door] = []
     for own in styles[1:]:
         new = _room(own, rng)
         for _ in range(_TRIES):
             parent = len(rooms) - 1 if rng.random() < 0.75 or own is not style else int(rng.integers(len(rooms)))
-            attached = _attach(rooms, doors, parent, new, rng)
-            if attached is not None:
+            if (attached := _attach(rooms, doors, parent, new, rng)) is not None:
                 rooms.append(attached[0])
                 doors.append(attached[1])
                 break
         else:
-            return None
+            return lay_out(style, rng)
     return rooms, doors
 
 
