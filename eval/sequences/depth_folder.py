@@ -24,9 +24,6 @@ class DepthMaps:
     variance_files: tuple[Path, ...] = ()
     scale: float | None = None
 
-    def __len__(self) -> int:
-        return len(self.depth_files)
-
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Depth [H, W] float32 [m] (0 = invalid) and variance [H, W] float32 [m^2], or None without one. Where the
         variance is negative or not finite, both are 0. Raises FrameError: a file cannot be decoded, or the two differ
@@ -71,9 +68,6 @@ class DepthFolder:
                 raise ValueError(f"scale: {file} holds integers and no text {SCALE_KEY!r}: pass metres per unit")
             break
 
-    def __len__(self) -> int:
-        return len(self.files)
-
     def for_frames(
         self, names: Sequence[str], names_on_disk: Sequence[str] = (), selected: Sequence[str] | None = None
     ) -> DepthMaps:
@@ -106,9 +100,10 @@ def _paired(files: list[Path], names: Sequence[str], orders: Sequence[Sequence[s
         order = next((order for order in orders if len(order) == len(files)), None)
         if order is None:
             shown = ", ".join(missing[:10]) + (", ..." if len(missing) > 10 else "")
+            folder, first = files[0].parent, files[0].name
             raise ValueError(
-                f"{files[0].parent}: no map for {len(missing)} of {len(names)} frames ({shown}); its files are named "
-                f"{files[0].name}, ..., and {len(files)} are not as many as frames, so that order does not pair them"
+                f"{folder}: no map for {len(missing)} of {len(names)} frames ({shown}); its {len(files)} files are "
+                f"named {first}, ..., and there are not as many as frames, so that order does not pair them"
             )
         pairs = dict(zip(order, files, strict=True))
     return tuple(pairs[name] for name in names)

@@ -8,7 +8,6 @@ not applied: intrinsics hold for the stored pixels).
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Iterable
 from contextlib import redirect_stdout, suppress
 from functools import partial
@@ -29,8 +28,8 @@ DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
 _BROKEN_IMAGE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 # Key of a PNG's text chunk: metres per unit of its 16-bit values.
 SCALE_KEY = "depth_scale"
-# A PNG's signature, two numbers, width and height; then bit depth, colour type, compression, filter and interlacing.
-_HEADER, _SIGNATURE, _RGB = struct.Struct(">8s8x2I5s"), b"\x89PNG\r\n\x1a\n", bytes((8, 2, 0, 0, 0))
+# Bit depth, colour type, compression, filter and interlacing, from a PNG's header.
+_SIGNATURE, _RGB = b"\x89PNG\r\n\x1a\n", bytes((8, 2, 0, 0, 0))
 _MILLIMETRE = 1e-3
 # Names of a depth channel of an EXR file, best first; Blender prefixes its layer ("ViewLayer.Depth.Z").
 _DEPTH_NAMES = ("Z", "depth", "V", "Y", "R")
@@ -177,11 +176,9 @@ def _plain_png(path: Path) -> np.ndarray | None:
     if path.suffix.lower() != ".png" or not path.is_file():
         return None
     with path.open("rb") as file:
-        content = file.read(_HEADER.size)
-    if len(content) < _HEADER.size:
-        return None
-    signature, width, height, found = _HEADER.unpack(content)
-    if (signature, found) != (_SIGNATURE, _RGB) or width * height > (Image.MAX_IMAGE_PIXELS or 0):
+        header = file.read(29)
+    width, height = int.from_bytes(header[16:20]), int.from_bytes(header[20:24])
+    if header[:8] != _SIGNATURE or header[24:] != _RGB or width * height > (Image.MAX_IMAGE_PIXELS or 0):
         return None
     from kornia_rs import io
 

@@ -21,8 +21,7 @@ class Piece:
 
     name: str  # what it is
     parts: list[Part]  # its primitives
-    # width, depth, height: the space it takes [m].
-    width: float
+    width: float  # of the space it takes [m]
     depth: float
     height: float
 
@@ -245,7 +244,8 @@ def _column(rng: np.random.Generator, palette: Palette) -> Piece:
 
 
 AT_WALLS: tuple[Maker, ...] = (
-    _sofa, _bookshelf, _cabinet, _cabinet, _desk, _bed, _television, _lamp, _plant, _table, chair, _stool, _crates, _statue
+    _sofa, _bookshelf, _cabinet, _cabinet, _desk, _bed, _television, _lamp, _plant, _table, chair, _stool, _crates,
+    _statue,
 )  # fmt: skip
 FREE_STANDING: tuple[Maker, ...] = (_table, _stool, chair, _plant, _crates, _statue)
 IN_HALLS: tuple[Maker, ...] = (_column, _column, _statue, _sofa, _table, _plant, _crates, _bookshelf, _lamp)

@@ -29,8 +29,7 @@ class Finish:
     """The look of a surface: texture and colours."""
 
     texture: str = "plain"  # one of ``TEXTURES``
-    # first, second: its two colours, linear RGB in [0, 1].
-    first: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    first: tuple[float, float, float] = (0.5, 0.5, 0.5)  # its two colours, linear RGB in [0, 1]
     second: tuple[float, float, float] = (0.3, 0.3, 0.3)
     period: float = 0.3  # of the pattern [m]
     glow: float = 0.0  # light of its own, 0 = none
@@ -61,13 +60,8 @@ class Surfaces:
     taper: Tensor  # [N] float64
     rooms: Tensor  # [N, 2] int64
     texture: Tensor  # [N] int64, index into ``TEXTURES``
-    # [N, 8, 3] float64 of the boxes around them, by signs along x, y, z as binary digits [m].
-    corners: Tensor
-    # [N, 10] float32: two colours, period [m], glow, and two random offsets of the pattern [m].
-    look: Tensor
-
-    def __len__(self) -> int:
-        return self.kind.shape[0]
+    corners: Tensor  # [N, 8, 3] float64 of the boxes around them, by signs along x, y, z as binary digits [m]
+    look: Tensor  # [N, 10] float32: two colours, period [m], glow, and two random offsets of the pattern [m]
 
 
 def part(
