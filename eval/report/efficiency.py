@@ -11,8 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from ufmstar_torch.eval.methods.method import Method
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.report.data import setting_of
+from ufmstar_torch.eval.methods.row import row_from
 from ufmstar_torch.eval.report.names import row_labels
 from ufmstar_torch.eval.report.paper import PaperTable, paper_tables
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table
@@ -51,7 +50,7 @@ def _table(run: Mapping[str, Any], label: str) -> Table:
     units, network = run["devices"]["units"], run["networks"][bases[0]]
     labels = {row["row"]: row["row"] for row in rows}
     if all("setting" in row for row in rows):
-        known = {row["row"]: Row(Method.parse(row["method"]), setting_of(row["setting"])) for row in rows}
+        known = {row["row"]: row_from(row) for row in rows}
         shown = row_labels(known.values())
         labels = {name: shown[row] for name, row in known.items()}
     lines = [
