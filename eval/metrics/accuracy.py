@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, SumMetric, share
 from ufmstar_torch.eval.metrics.pixel_sums import add_delta1, add_errors
 
 TOLERANCE = 0.25  # [1] of delta1, in both definitions
@@ -22,10 +20,8 @@ class Delta1(SumMetric):
     """
 
     ADD = add_delta1
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(constants=(TOLERANCE,), **kwargs)
-        self.add_counts("hits", "hits_ratio", "pixels", "with_truth")
+    CONSTANTS = (TOLERANCE,)
+    STATES = (("hits", COUNT), ("hits_ratio", COUNT), ("pixels", COUNT), ("with_truth", COUNT))
 
     def compute(self) -> dict[str, Tensor]:
         return {
@@ -40,11 +36,8 @@ class AbsRel(SumMetric):
     """Mean of |d - g| / g; ``compute()`` returns ``abs_rel``, NaN without a pixel."""
 
     ADD = add_errors
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(None, (False,), **kwargs)
-        self.add_sums("total")
-        self.add_counts("pixels")
+    CONSTANTS = (False,)
+    STATES = (("total", SUM), ("pixels", COUNT))
 
     def compute(self) -> dict[str, Tensor]:
         return {"abs_rel": share(self.total, self.pixels)}
@@ -54,11 +47,8 @@ class RMSE(SumMetric):
     """Root of the mean of (d - g)^2 over all pixels [m]; ``compute()`` returns ``rmse``, NaN without one."""
 
     ADD = add_errors
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(None, (True,), **kwargs)
-        self.add_sums("total")
-        self.add_counts("pixels")
+    CONSTANTS = (True,)
+    STATES = (("total", SUM), ("pixels", COUNT))
 
     def compute(self) -> dict[str, Tensor]:
         return {"rmse": share(self.total, self.pixels).sqrt()}

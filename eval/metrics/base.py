@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -9,6 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torchmetrics import Metric
+
+COUNT, SUM = torch.int64, torch.float64  # kinds of states
 
 
 class Pixels(NamedTuple):
@@ -31,12 +35,17 @@ class SumMetric(Metric):
 
     Attributes:
         OF_VARIANCE: the name, in messages, of a metric that needs a variance; "" for one of the depth alone.
-        ADD: the loop over the pixels, of ``pixel_sums``.
-        constants: what it takes between the pixels and the states.
+        ADD: the loop over the pixels, of ``pixel_sums``; it takes the pixels, the constants and the states.
+        CONSTANTS: between the pixels and the states.
+        STATES: of each its name, ``COUNT`` or ``SUM``, and the sizes of its dimensions; zeros at the start.
+        settings: of the instance; sums of other settings cannot be merged.
     """
 
     OF_VARIANCE: ClassVar[str] = ""
     ADD: ClassVar[Any]
+    CONSTANTS: tuple[Any, ...] = ()
+    STATES: tuple[tuple[Any, ...], ...] = ()
+    settings: Mapping[str, Any] = MappingProxyType({})
     is_differentiable = False
     full_state_update = False
 
@@ -45,31 +54,17 @@ class SumMetric(Metric):
         def __getattr__(self, name: str) -> Tensor:
             """The states are the only attributes that are not in ``__dict__``."""
 
-    def __init__(self, settings: dict[str, Any] | None = None, constants: tuple[Any, ...] = (), **kwargs: Any) -> None:
+    def __init__(self, **kwargs: Any) -> None:
         # torchmetrics keeps a computed value across merge_state and load_state_dict, where it is stale.
         kwargs.setdefault("compute_with_cache", False)
         super().__init__(**kwargs)
-        self.settings, self.constants = dict(settings or {}), constants
+        for name, kind, *shape in self.STATES:
+            self.add_state(name, torch.zeros(shape, dtype=kind), dist_reduce_fx="sum", persistent=True)
 
     @property
     def update_called(self) -> bool:
         """True: sums that were loaded or merged are as good as updated ones, and no frame gives NaN."""
         return True
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Their names."""
-        return tuple(self._defaults)
-
-    def add_counts(self, *names: str, shape: tuple[int, ...] = ()) -> None:
-        """Add int64 states of zeros."""
-        for name in names:
-            self.add_state(name, torch.zeros(shape, dtype=torch.int64), dist_reduce_fx="sum", persistent=True)
-
-    def add_sums(self, *names: str, shape: tuple[int, ...] = ()) -> None:
-        """Add float64 states of zeros."""
-        for name in names:
-            self.add_state(name, torch.zeros(shape, dtype=torch.float64), dist_reduce_fx="sum", persistent=True)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use. Raises ValueError: shapes or types
@@ -82,8 +77,8 @@ class SumMetric(Metric):
         if self.OF_VARIANCE and len(pixels.variance) != len(pixels.depth):
             judged = f"{self.OF_VARIANCE} judges the predicted distribution N(depth, variance)"
             raise ValueError(f"variance must be given: {judged}")
-        sums = {name: getattr(self, name).to("cpu", copy=True) for name in self.states}
-        type(self).ADD(*pixels, *self.constants, *(value.numpy() for value in sums.values()))
+        sums = {name: getattr(self, name).to("cpu", copy=True) for name, *_ in self.STATES}
+        type(self).ADD(*pixels, *self.CONSTANTS, *(value.numpy() for value in sums.values()))
         for name, value in sums.items():
             setattr(self, name, value.to(getattr(self, name).device))
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, SumMetric, share
 from ufmstar_torch.eval.metrics.pixel_sums import add_ece_delta, add_ece_quantile
 
 
@@ -36,9 +36,9 @@ class ECEDelta(SumMetric):
     def __init__(self, delta: float = 0.25, bins: int = 10, **kwargs: Any) -> None:
         if not 0 < delta < 1 or bins < 1:
             raise ValueError(f"delta must lie in (0, 1) and bins be >= 1, got delta={delta}, bins={bins}")
-        super().__init__({"delta": delta, "bins": bins}, (delta,), **kwargs)
-        self.add_sums("confidence", shape=(bins,))
-        self.add_counts("accurate", "pixels", shape=(bins,))
+        self.settings, self.CONSTANTS = {"delta": delta, "bins": bins}, (delta,)
+        self.STATES = (("confidence", SUM, bins), ("accurate", COUNT, bins), ("pixels", COUNT, bins))
+        super().__init__(**kwargs)
 
     def compute(self) -> dict[str, Tensor]:
         total = self.pixels.sum()
@@ -50,11 +50,6 @@ class ECEDelta(SumMetric):
             "ece_delta_accuracy": share(self.accurate, self.pixels),
             "ece_delta_pixels": self.pixels.double(),
         }
-
-
-def quantile_levels(bins: int) -> Tensor:
-    """[B] q_b = (b - 1/2) / B, b = 1..B: the levels 0 and 1, which are always right, stay out."""
-    return (torch.arange(bins, dtype=torch.float64) + 0.5) / bins
 
 
 class ECEQuantile(SumMetric):
@@ -73,13 +68,13 @@ class ECEQuantile(SumMetric):
     ADD = add_ece_quantile
 
     def __init__(self, levels: Sequence[float] | None = None, **kwargs: Any) -> None:
-        q = quantile_levels(10) if levels is None else torch.tensor(list(levels), dtype=torch.float64)
+        levels = [(b + 0.5) / 10 for b in range(10)] if levels is None else list(levels)
+        q = self.levels = torch.tensor(levels, dtype=torch.float64)
         if q.numel() == 0 or not bool(((q >= 0) & (q <= 1)).all() and (q.diff() > 0).all()):
             raise ValueError(f"levels must rise within [0, 1], got {levels}")
-        super().__init__({"levels": q.tolist()}, (torch.special.ndtri(q).numpy(),), **kwargs)
-        self.levels = q
-        self.add_counts("at_or_below", shape=(q.numel(),))
-        self.add_counts("pixels")
+        self.settings, self.CONSTANTS = {"levels": levels}, (torch.special.ndtri(q).numpy(),)
+        self.STATES = (("at_or_below", COUNT, len(levels)), ("pixels", COUNT))
+        super().__init__(**kwargs)
 
     def compute(self) -> dict[str, Tensor]:
         levels = self.levels.to(self.pixels.device)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, SumMetric, share
 from ufmstar_torch.eval.metrics.pixel_sums import add_entropy, add_nll
 
 
@@ -21,11 +19,7 @@ class NLL(SumMetric):
 
     OF_VARIANCE = "NLL"
     ADD = add_nll
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_sums("total")
-        self.add_counts("pixels", "with_truth")
+    STATES = (("total", SUM), ("pixels", COUNT), ("with_truth", COUNT))
 
     def compute(self) -> dict[str, Tensor]:
         left_out = share(self.with_truth - self.pixels, self.with_truth)
@@ -41,17 +35,13 @@ class EntropyHistogram(SumMetric):
 
     OF_VARIANCE = "the entropy"
     ADD = add_entropy
-
-    def __init__(self, **kwargs: Any) -> None:
-        self.edges = torch.linspace(-8.0, 8.0, 65, dtype=torch.float64)
-        super().__init__(constants=(self.edges.numpy(),), **kwargs)
-        self.add_counts("counts", shape=(66,))
-        self.add_sums("total")
-        self.add_counts("pixels")
+    EDGES = torch.linspace(-8.0, 8.0, 65, dtype=torch.float64)
+    CONSTANTS = (EDGES.numpy(),)
+    STATES = (("counts", COUNT, 66), ("total", SUM), ("pixels", COUNT))
 
     def compute(self) -> dict[str, Tensor]:
         return {
             "entropy": share(self.total, self.pixels),
             "entropy_counts": self.counts.double(),
-            "entropy_edges": self.edges.to(self.counts.device),
+            "entropy_edges": self.EDGES.to(self.counts.device),
         }

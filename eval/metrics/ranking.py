@@ -7,12 +7,10 @@ of one bin count as ties. Each class states a bound on the error that this makes
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, SumMetric
 from ufmstar_torch.eval.metrics.pixel_sums import add_joint, add_nll_by_error, add_sparsification
 
 # In the logarithm of the variance or of the error; of both together: 5.5 % in variance, 2 MB of counts.
@@ -49,11 +47,10 @@ class Sparsification(SumMetric):
 
     OF_VARIANCE = "AUSE"
     ADD = add_sparsification
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_counts("count", "count_squared", "count_relative", shape=(BINS + 2,))
-        self.add_sums("squared", "relative", "sum_squared", "sum_relative", shape=(BINS + 2,))
+    STATES = (
+        *((name, COUNT, BINS + 2) for name in ("count", "count_squared", "count_relative")),
+        *((name, SUM, BINS + 2) for name in ("squared", "relative", "sum_squared", "sum_relative")),
+    )
 
     def compute(self) -> dict[str, Tensor]:
         kept = 1 - torch.arange(50, dtype=torch.float64, device=self.count.device) / 50
@@ -85,10 +82,7 @@ class SpearmanCorrelation(SumMetric):
 
     OF_VARIANCE = "Spearman's correlation"
     ADD = add_joint
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_counts("joint", shape=(JOINT_BINS + 2, JOINT_BINS + 2))
+    STATES = (("joint", COUNT, JOINT_BINS + 2, JOINT_BINS + 2),)
 
     def compute(self) -> dict[str, Tensor]:
         joint = self.joint.double()
@@ -113,11 +107,7 @@ class NLLByError(SumMetric):
 
     OF_VARIANCE = "NLL by error"
     ADD = add_nll_by_error
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_counts("count", shape=(BINS + 2,))
-        self.add_sums("nll", shape=(BINS + 2,))
+    STATES = (("count", COUNT, BINS + 2), ("nll", SUM, BINS + 2))
 
     def compute(self) -> dict[str, Tensor]:
         kept = torch.arange(1, 11, dtype=torch.float64, device=self.count.device) / 10

@@ -227,8 +227,10 @@ def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Curve
             for path in files:
                 for name, states in read_sums(path).items():
                     if name != CONFIDENCE:  # samples, no sums
-                        before = total.get(name, {})
-                        total[name] = {key: value + before.get(key, 0) for key, value in states.items()}
+                        mine = total.setdefault(name, {key: torch.zeros_like(value) for key, value in states.items()})
+                        if {key: v.shape for key, v in mine.items()} != {key: v.shape for key, v in states.items()}:
+                            raise RuntimeError(f"{name} of other shapes than in the sequences before it")
+                        total[name] = {key: mine[key] + value for key, value in states.items()}
             merged[dataset, row] = _curves(total)
         except RuntimeError as error:
             text = " ".join(str(error).split())[:200]

@@ -47,9 +47,8 @@ def pictures_of(results: Results, folder: Path) -> Iterator[tuple[str, Callable[
     """Name and function of strips, breakdowns, comparisons and rooms of the example frames; the function writes the
     picture into ``folder``. Raises ValueError: an example cannot be read; the message names the file.
     """
-    rows = {row.slug: row for row in results.rows}
-    yield from _of_frames(results, folder, rows)
-    yield from _of_rooms(results, folder, rows)
+    yield from _of_frames(results, folder)
+    yield from _of_rooms(results, folder)
 
 
 def file_name(*parts: str) -> str:
@@ -81,45 +80,44 @@ def strip_rows(rows: Sequence[Row], base: str) -> list[Row]:
     return [*by_fusion[ALONE], *(pruned or by_fusion[UFM])[:1], *by_fusion[UFM_STAR]]
 
 
-def _of_frames(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Drawing]:
-    labels = {row.slug: label for row, label in row_labels(rows.values()).items()}
+def _of_frames(results: Results, folder: Path) -> Iterator[Drawing]:
+    labels = {row.slug: label for row, label in row_labels(results.rows).items()}
     examples = [
         replace(example, dataset=dataset, sequence=sequence)
         for dataset, sequence in results.sequences()
         for example in find_examples(_folder_of(results, dataset, sequence), labels)
     ]
     for e in choose(examples, MOST_FRAMES):
-        shown = [row for slug, row in rows.items() if slug in e.rows]
+        shown = [row for row in results.rows if row.slug in e.rows]
         bases = dict.fromkeys(row.method.base for row in shown)
+        strips = {base: strip_rows(shown, base) for base in bases}
         frame = f"{e.sequence}, frame {e.frame}"
-        for base in bases:
+        for base, strip in strips.items():
             corrected = [row for row in shown if row.method.base == base and row.setting.posterior]
-            of_base = [row.slug for row in (*strip_rows(shown, base), *corrected)]
-            if of_base:
+            if of_base := [row.slug for row in (*strip, *corrected)]:
                 yield f"{frame}: strip of {base}", partial(draw_strip, folder, e, of_base, base)
-        parts = [row for base in _BREAKDOWN_BASES for row in strip_rows(shown, base) if row.method.fusion != UFM]
+        parts = [row for base in _BREAKDOWN_BASES for row in strips.get(base, ()) if row.method.fusion != UFM]
         if any(row.method.fusion == UFM_STAR for row in parts):
             yield f"{frame}: breakdown", partial(draw_breakdown, folder, e, [row.slug for row in parts])
-        for base in bases:
-            pair = [row.slug for row in strip_rows(shown, base) if row.method.fusion != ALONE]
+        for base, strip in strips.items():
+            pair = [row.slug for row in strip if row.method.fusion != ALONE]
             if len(pair) == 2:
                 yield f"{frame}: comparison of {base}", partial(draw_comparison, folder, e, pair, base)
 
 
-def _of_rooms(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Drawing]:
+def _of_rooms(results: Results, folder: Path) -> Iterator[Drawing]:
     drawn = 0
     for dataset, sequence in results.sequences():
         rooms = find_rooms(_folder_of(results, dataset, sequence))
         # One row of each room is enough: the suite's first UfM* with its default settings.
-        slug = next((s for s, row in rows.items() if s in rooms and row.setting.plain), None)
-        if slug is None or drawn == MOST_ROOMS:
+        row = next((row for row in results.rows if row.slug in rooms and row.setting.plain), None)
+        if row is None or drawn == MOST_ROOMS:
             continue
-        snapshots = choose_times(rooms[slug])
+        snapshots = choose_times(rooms[row.slug])
         if any(len(snapshot.mean) for snapshot in snapshots):
             drawn += 1
-            name = file_name(ROOM, dataset, sequence, slug)
-            label = row_labels([rows[slug]])[rows[slug]]
-            yield f"{sequence}: room", partial(_room, folder, name, label, sequence, snapshots)
+            path = folder / file_name(ROOM, dataset, sequence, row.slug)
+            yield f"{sequence}: room", partial(_room, path, row_labels([row])[row], sequence, snapshots)
 
 
 def _folder_of(results: Results, dataset: str, sequence: str) -> Path:
@@ -139,8 +137,8 @@ def _picture(example: Example, rows: Sequence[str], kind: str, base: str, title:
     return Picture(name, title, caption, f"{title}; {listed}")
 
 
-def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequence[Snapshot]) -> Picture:
-    scale = draw_room(folder / name, snapshots, f"{label}, {sequence}")
+def _room(path: Path, label: str, sequence: str, snapshots: Sequence[Snapshot]) -> Picture:
+    scale = draw_room(path, snapshots, f"{label}, {sequence}")
     counts = " then ".join(str(len(snapshot.mean)) for snapshot in snapshots)
     caption = (
         "Each Gaussian is an ellipse as large as the patch it stands for. What lies above the camera (the ceiling) is "
@@ -148,7 +146,7 @@ def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequenc
     )
     title = f"{sequence}: the Gaussians of {label}"
     alt = f"{title}: {counts} Gaussians, coloured by disagreement from 0 to {scale.high:.2g} m"
-    return Picture(name, title, caption, alt)
+    return Picture(path.name, title, caption, alt)
 
 
 class PanelScales(NamedTuple):
