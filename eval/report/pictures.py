@@ -64,9 +64,11 @@ Drawing = tuple[str, Callable[[], Picture]]
 
 def choose(examples: Sequence[Example], most: int) -> list[Example]:
     """Frames of as many sequences as possible: the last of each first, since by then most has been seen twice."""
-    turns: list[tuple[int, int, Example]] = []
-    for number, (_, group) in enumerate(groupby(examples, key=lambda e: (e.dataset, e.sequence))):
-        turns += [(turn, number, example) for turn, example in enumerate(reversed(list(group)))]
+    turns = [
+        (turn, number, example)
+        for number, (_, group) in enumerate(groupby(examples, key=lambda e: (e.dataset, e.sequence)))
+        for turn, example in enumerate(reversed(list(group)))
+    ]
     first = sorted(turns, key=lambda entry: entry[:2])[:most]
     return [example for _, _, example in sorted(first, key=lambda entry: (entry[1], entry[0]))]
 
@@ -128,13 +130,24 @@ def _folder_of(results: Results, dataset: str, sequence: str) -> Path:
 # ---- drawing: each writes its PNG into the folder and returns its words ----
 
 
-def _picture(example: Example, rows: Sequence[str], kind: str, base: str, title: str, caption: str) -> Picture:
-    """The name and the words of a picture; rows are listed with their mean NLL for those who cannot see it."""
+def _picture(
+    folder: Path,
+    example: Example,
+    rows: Sequence[str],
+    kind: str,
+    base: str,
+    words: tuple[str, str],
+    grid: Sequence[GridRow],
+    bars: Sequence[Bar],
+) -> Picture:
+    """Draw a grid; its ``words`` are title and caption. Rows are listed with their mean NLL for those who cannot see
+    it."""
     means = ((example.label(row), mean_nll(example, row)) for row in rows)
     listed = ", ".join(f"{label} ({'no NLL' if nll is None else f'mean NLL {nll:.2f}'})" for label, nll in means)
     name = file_name(kind, example.dataset, example.sequence, example.frame, *filter(None, (base,)))
-    title = f"{example.sequence}, frame {example.frame}: {title}"
-    return Picture(name, title, caption, f"{title}; {listed}")
+    draw_grid(folder / name, grid, bars, aspect=example.aspect)
+    title = f"{example.sequence}, frame {example.frame}: {words[0]}"
+    return Picture(name, title, words[1], f"{title}; {listed}")
 
 
 def _room(path: Path, label: str, sequence: str, snapshots: Sequence[Snapshot]) -> Picture:
@@ -183,9 +196,7 @@ def draw_strip(folder: Path, example: Example, rows: Sequence[str], base: str) -
         "A good standard deviation σ looks like the error beside it. NLL is bright where a row is overconfident; its "
         "colours are the same in all strips. Lengths share one scale."
     )
-    picture = _picture(example, rows, STRIP, base, Method(base).name, caption)
-    draw_grid(folder / picture.file, [head, *body], bars, aspect=example.aspect)
-    return picture
+    return _picture(folder, example, rows, STRIP, base, (Method(base).name, caption), [head, *body], bars)
 
 
 def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Picture:
@@ -206,9 +217,7 @@ def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Pictu
         "The parts add up as variances, V = A + E + M; shown are their square roots, in metres, on one scale with the "
         "error. A and E are the network's own, M is the disagreement between the views."
     )
-    picture = _picture(example, rows, BREAKDOWN, "", "parts of the variance", caption)
-    draw_grid(folder / picture.file, body, bars, aspect=example.aspect)
-    return picture
+    return _picture(folder, example, rows, BREAKDOWN, "", ("parts of the variance", caption), body, bars)
 
 
 def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: str) -> Picture:
@@ -231,9 +240,7 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
     bars = [Bar("|error| and σ [m]", scales.length, 1, span=3), Bar("UfM* minus UfM [m]", signed, 4)]
     title = f"{example.label(ufm_star)} against {example.label(ufm)}"
     caption = "Red: UfM* has the larger standard deviation; blue: the smaller."
-    picture = _picture(example, pair, COMPARE, base, title, caption)
-    draw_grid(folder / picture.file, grid, bars, aspect=example.aspect)
-    return picture
+    return _picture(folder, example, pair, COMPARE, base, (title, caption), grid, bars)
 
 
 def _judged(example: Example, row: str, scales: PanelScales) -> tuple[Panel, Panel, Panel]:
