@@ -12,12 +12,11 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from ufmstar_torch.eval.metrics.pixel_sums import HIGH, LOW
+from ufmstar_torch.eval.metrics.base import Array
+from ufmstar_torch.eval.metrics.ranking import HIGH, LOW
 from ufmstar_torch.recalibrate import CONFIDENCE, Recalibration
 
-Array = NDArray[np.float64]
 # Levels of |z| of a standard normal variable at which errors are compared with it. The outer tenth is left out:
 # gross errors of the depth would set the variance of all other pixels.
 LEVELS = np.arange(0.1, 0.91, 0.1)

@@ -70,7 +70,7 @@ def _template() -> Any:
     from markupsafe import Markup
 
     # Every template is HTML whatever its file is called: select_autoescape would leave out ".j2".
-    how = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    how: dict[str, Any] = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=FileSystemLoader(TEMPLATES), **how)
     environment.filters["typeset"] = lambda text: Markup(typeset(text))
     for name in ("css", "js"):

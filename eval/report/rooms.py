@@ -60,9 +60,9 @@ def find_rooms(folder: Path) -> dict[str, list[Snapshot]]:
         row, _, frame = file.stem.partition("_")
         if row and frame:
             stored = load_arrays(file, _STORED)
-            mixture = [stored[name].astype(np.float64) for name in _STORED]
-            path = stored.get("path", mixture[-1][None, :3, 3]).astype(np.float64)
-            rooms.setdefault(row, []).append(Snapshot(frame, *mixture, path))
+            mean, covariance, disagreement, count, T = (stored[name].astype(np.float64) for name in _STORED)
+            path = stored.get("path", T[None, :3, 3]).astype(np.float64)
+            rooms.setdefault(row, []).append(Snapshot(frame, mean, covariance, disagreement, count, T, path))
     return rooms
 
 

@@ -108,8 +108,8 @@ def _means(
     networks: dict[str, list[str]] = {}
     for base in results.bases:
         networks.setdefault(results.network(base) or "", []).append(base)
-    listed = ", ".join(f"{label} ({', '.join(bases)})" for label, bases in networks.items())
-    notes = [f"Network: {next(iter(networks))}." if len(networks) == 1 else f"Networks: {listed}."]
+    several = ", ".join(f"{label} ({', '.join(bases)})" for label, bases in networks.items())
+    notes = [f"Network: {next(iter(networks))}." if len(networks) == 1 else f"Networks: {several}."]
     if words := shared_words(records):
         notes.append(f"Images of all rows: {words}, resized to the networks' input.")
     notes.append(_interval_note(max(map(len, records.values()))))
