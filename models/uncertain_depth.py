@@ -8,7 +8,7 @@ from typing import Any, Literal
 from torch import Tensor, nn
 
 from ufmstar_torch import networks_in_turn, pipeline
-from ufmstar_torch.models.any_network import named, wrap_network
+from ufmstar_torch.models.any_network import wrap_network
 from ufmstar_torch.models.hugging_face import of_transformers
 from ufmstar_torch.models.outputs import METRIC, OutputSpec
 from ufmstar_torch.prediction import DepthPrediction
@@ -37,4 +37,4 @@ class UncertainDepth(pipeline.UncertainDepth):
         """See the base class. Maps that a network returns are taken as metric depth."""
         if isinstance(result, DepthPrediction):
             return result
-        return OutputSpec(METRIC).prediction(named(result), (x.shape[-2], x.shape[-1]))
+        return OutputSpec(METRIC).prediction(result, x)

@@ -20,7 +20,7 @@ from ufmstar_torch.eval.engine.estimators import Gaussians
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowRunner
-from ufmstar_torch.eval.methods.setting import TRACKED, Setting
+from ufmstar_torch.eval.methods.setting import CORNERS, Setting
 from ufmstar_torch.eval.run.run_folder import Checkpoint
 from ufmstar_torch.eval.run.scale import NetworkScale
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
@@ -68,7 +68,7 @@ class RunJob:
             self.source,
             Gaussians(self.config, self.device, recalibration=self.recalibration),
             every=self.every,
-            anchors=AnchorSource(Setting(anchors=TRACKED), Tracks(self.landmarks()))
+            anchors=AnchorSource(Setting(anchors=CORNERS), Tracks(self.landmarks()))
             if self.config.anchors is not None
             else None,
             skips_faults=True,

@@ -11,7 +11,7 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
     Running,
     Scene,
     away_from,
-    second_moment,
+    second_moments,
     spread_around,
     wrong,
 )
@@ -55,7 +55,7 @@ def _of_discs(scene: Scene, weight: Floats, claimed: Floats, running: Running) -
     wide = noise + np.minimum(config.spread * spread, config.widest)
     with np.errstate(over="ignore"):  # certainly another surface
         odds = p / (1 - p) * np.sqrt(own / wide) * np.exp((error**2 / own - (error + offset) ** 2 / wide) / 2)
-    stated = second_moment(scene, own, p, offset, spread) + share * claimed[held]
+    stated = second_moments(scene, own, p, offset, spread)[0] + share * claimed[held]
     sums = {
         "wrong": (area * (1 - 1 / (1 + odds)), area * (1 + config.other * share)),
         "calibration": (area * error**2 / stated, area),

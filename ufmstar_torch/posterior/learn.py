@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 from ufmstar_torch.fixed_order import total
 from ufmstar_torch.posterior.field import Field
 from ufmstar_torch.posterior.running import Running, ratios
-from ufmstar_torch.posterior.scene import LeftOut, Scene, away_from, second_moment, spread_around, wrong
+from ufmstar_torch.posterior.scene import LeftOut, Scene, away_from, second_moments, spread_around, wrong
 
 # Variance of the difference between neighbouring nodes, over that of the link between them: on a square lattice the
 # other ways from one to the other are worth as much as the link.
@@ -66,7 +66,7 @@ def _of_discs(scene: Scene, weight: Tensor, claimed: Tensor, running: Running) -
     own = variance + scene.noise + away * running.ratio("unseen")[:, None]
     wide = scene.noise + (scene.config.spread * spread).clamp_max(scene.config.widest)
     odds = p / (1 - p) * (own / wide).sqrt() * ((error.square() / own - (error + offset).square() / wide) / 2).exp()
-    stated = second_moment(scene, own, p, offset, spread) + share * claimed
+    stated = second_moments(scene, own, p, offset, spread)[0] + share * claimed
     return _of_pairs(scene, held, torch.stack([error, variance, away, scene.noise]), running) | {
         "wrong": (total(area * (1 - 1 / (1 + odds)), 1), total(area * (1 + scene.config.other * share), 1)),
         "calibration": (total(area * error.square() / stated, 1), total(area, 1)),
