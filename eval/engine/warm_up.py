@@ -9,7 +9,6 @@ import torch
 
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.ufmstar import UfMStar
 from ufmstar_torch.warm_up import warm_up
 
@@ -24,21 +23,14 @@ def warm_up_command(
     *,
     dense: bool = False,
 ) -> None:
-    """Compile UfM*, the metrics and what else is asked for, or load it from disk.
+    """Compile UfM* and what else is asked for, or load it from disk.
 
     Args:
         config, device: of UfM*.
         progress: as ``UfMStar.warm_up`` takes it.
         dense: anchors are :class:`DenseEvidence`.
     """
-    also = [metrics, *([dense_anchors] if dense else [])]
-    warm_up(UfMStar(config, device=device), (32, 32), 1, progress, also)
-
-
-def metrics() -> None:
-    """The metrics of single-precision maps."""
-    maps = torch.ones(1, 8, 8)
-    SequenceMetrics().update(maps, maps, maps)
+    warm_up(UfMStar(config, device=device), (32, 32), 1, progress, [dense_anchors] if dense else [])
 
 
 def dense_anchors() -> None:
