@@ -182,18 +182,17 @@ def test_errors_that_neighbouring_anchors_do_not_share_are_not_taken_for_the_net
 @pytest.mark.parametrize("tier", [update, posterior_cpu.update], ids=["torch", "numba"])
 @pytest.mark.parametrize("p", [0.0, 0.5])
 def test_extreme_errors_and_probabilities_stay_finite(tier, p):
-    """Anchors off by up to e^5 that claim to be certain; no other surface at all, or one as probable as its own."""
+    """After six frames of a wall as predicted, a tenth of the anchors are off by a factor of 90."""
     model, packed = dataclasses.replace(MODEL, wrong=p), torch.zeros(1, SIZE, dtype=torch.float64)
-    for seed in range(3):
-        depth, _, claimed, pixel, g, _ = scene(seed, n=120)
-        g = g * np.exp(np.random.default_rng(seed).normal(0, 2, len(g)).clip(-4, 4))
-        frame = checked(depth, pixel, g, (1e-3 * g) ** 2)
-        packed, out = tier(packed, *frame, torch.from_numpy(claimed)[None], model)
-    seen = torch.from_numpy(depth > 0)[None]
-    assert bool(packed.isfinite().all())
-    for value in (out.depth, out.variance, out.inlier, out.outlier):
-        assert bool(value[seen].isfinite().all())
-    assert p > 0 or not bool(out.outlier[seen].any())
+    depth, rng = np.full((56, 56), 2.0), np.random.default_rng(0)
+    rows, cols = (x.ravel() for x in np.mgrid[0:56:2, 0:56:2])
+    for share in (0, 0, 0, 0, 0, 0, 0.1):
+        g = 2 * np.exp(4.5 * (rng.random(len(rows)) < share))
+        frame = checked(depth, np.stack([cols, rows], -1) + 0.5, g, (1e-3 * g) ** 2)
+        packed, out = tier(packed, *frame, torch.zeros(1, 56, 56, dtype=torch.float64), model)
+    for value in (packed, out.depth, out.variance, out.inlier, out.outlier):
+        assert bool(value.isfinite().all())
+    assert p > 0 or not bool(out.outlier.any())
 
 
 def test_more_regions_on_another_surface_make_it_more_probable():
