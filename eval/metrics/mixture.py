@@ -42,12 +42,16 @@ class Mixture(SumMetric):
         below = (weight * torch.special.ndtr(error / sigma)).sum(0)
         bins = (confidence * _BINS).long().clamp_max(_BINS - 1)
         accurate = error.abs() <= _DELTA * d.abs()
-        self.total = self.total - torch.logsumexp(weight.log() + log_density, 0).sum()
-        self.confidence = self.confidence + torch.bincount(bins, confidence, _BINS)
-        self.pixels = self.pixels + torch.bincount(bins, minlength=_BINS)
-        self.accurate = self.accurate + torch.bincount(bins[accurate], minlength=_BINS)
-        self.at_or_below = self.at_or_below + (below[:, None] <= quantile_levels(_BINS)).sum(0)
-        self.covered = self.covered + ((below - 0.5).abs() <= _THREE_SIGMA / 2).sum()
+        self.add_sums(
+            {
+                "total": -torch.logsumexp(weight.log() + log_density, 0).sum(),
+                "confidence": torch.bincount(bins, confidence, _BINS),
+                "pixels": torch.bincount(bins, minlength=_BINS),
+                "accurate": torch.bincount(bins[accurate], minlength=_BINS),
+                "at_or_below": (below[:, None] <= quantile_levels(_BINS)).sum(0),
+                "covered": ((below - 0.5).abs() <= _THREE_SIGMA / 2).sum(),
+            }
+        )
 
     def compute(self) -> dict[str, Tensor]:
         count = self.pixels.sum()
