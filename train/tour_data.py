@@ -15,7 +15,7 @@ import logging
 import multiprocessing
 import os
 import random
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -116,7 +116,6 @@ def tour_frames(
     cache: str | Path | None = None,
     *,
     workers: int = 1,
-    progress: Callable[[int, int], None] | None = None,
 ) -> TourFrames:
     """The frames of tours, which are rendered if the cache does not have them.
 
@@ -128,7 +127,6 @@ def tour_frames(
         settings: what is rendered.
         cache: folder; None = ``ufmstar_torch/tours`` in the user's cache folder.
         workers: processes that render; 1 = this one.
-        progress: called with the number of stored tours and of all.
 
     Raises:
         ValueError: no seed, or a number out of range.
@@ -141,13 +139,9 @@ def tour_frames(
     folder.mkdir(parents=True, exist_ok=True)
     missing = [seed for seed in seeds if not tour_files(folder, seed)[-1].exists()]
     random.Random(os.getpid()).shuffle(missing)
-    done = len(seeds) - len(missing)
     if missing:
         _LOG.info("rendering %d tours of %d frames into %s", len(missing), settings.frames, folder)
-    for _ in _rendered(folder, missing, settings, min(workers, max(1, len(missing)))):
-        done += 1
-        if progress is not None:
-            progress(done, len(seeds))
+        _render(folder, missing, settings, min(workers, len(missing)))
     return TourFrames(folder, seeds, settings.frames)
 
 
@@ -191,13 +185,13 @@ def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
     write_together({path: partial(np.save, arr=array) for path, array in zip(files, arrays, strict=True)})
 
 
-def _rendered(folder: Path, seeds: list[int], settings: TourSettings, workers: int) -> Iterable[None]:
-    """One item per tour as it gets ready."""
+def _render(folder: Path, seeds: list[int], settings: TourSettings, workers: int) -> None:
     task = partial(render_tour, folder, settings)
     if workers == 1:
-        yield from map(task, seeds)
+        for seed in seeds:
+            task(seed)
         return
     # "spawn" as for the loader's workers; each process renders with one thread.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        yield from pool.map(task, seeds)
+        list(pool.map(task, seeds))
