@@ -43,9 +43,6 @@ class DecoderDropout(nn.Module):
         draw = torch.rand(*x.shape[:2], *(1,) * (x.dim() - 2), generator=self.generator, device=x.device)
         return x * (draw >= self.p).to(x.dtype) / (1 - self.p)
 
-    def extra_repr(self) -> str:
-        return f"p={self.p}, sampling={self.sampling}"
-
 
 def set_sampling(module: nn.Module, on: bool, generator: torch.Generator | None = None) -> int:
     """Switch sampling in eval mode of every :class:`DecoderDropout` in ``module`` (with p > 0), in place; their number.

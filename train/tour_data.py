@@ -135,7 +135,8 @@ def tour_frames(
     seeds = tuple(seeds)
     if not seeds or workers < 1:
         raise ValueError(f"seeds must hold at least one and workers be at least 1, got {len(seeds)} and {workers}")
-    folder = (default_cache() if cache is None else Path(cache)) / f"tours-{settings.digest()}"
+    own = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ufmstar_torch" / "tours"
+    folder = (own if cache is None else Path(cache)) / f"tours-{settings.digest()}"
     folder.mkdir(parents=True, exist_ok=True)
     missing = [seed for seed in seeds if not tour_files(folder, seed)[-1].exists()]
     random.Random(os.getpid()).shuffle(missing)
@@ -148,12 +149,6 @@ def tour_frames(
 def tour_files(folder: Path, seed: int) -> tuple[Path, ...]:
     """A tour's images, depth maps, poses and camera."""
     return tuple(folder / f"{seed}.{part}.npy" for part in ("image", "depth", "pose", "camera"))
-
-
-def default_cache() -> Path:
-    """``ufmstar_torch/tours`` where the user's system keeps caches."""
-    named = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(named) if named else Path.home() / ".cache") / "ufmstar_torch" / "tours"
 
 
 def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
