@@ -10,6 +10,7 @@ import pytest
 from tiny_suite import TRUTH, Stub
 
 from ufmstar_torch.eval.bench import measure as measurement
+from ufmstar_torch.eval.commands import evaluate
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.methods.suite import names
 from ufmstar_torch.eval.suite import shards
@@ -19,8 +20,8 @@ from ufmstar_torch.eval.suite import shards
 def stubbed(monkeypatch):
     """The judge of sequences, replaced by one that draws figures; returns it."""
     stub = Stub()
-    own = shards.evaluate_suite
-    monkeypatch.setattr(shards, "evaluate_suite", lambda *given, **how: own(*given, evaluate=stub, **how))
+    own = evaluate.evaluate_suite
+    monkeypatch.setattr(evaluate, "evaluate_suite", lambda *given, **how: own(*given, evaluate=stub, **how))
     return stub
 
 

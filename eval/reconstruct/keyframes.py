@@ -25,7 +25,8 @@ def write_keyframes(
     progress: Callable[[int], object] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[list[int], int]:
-    """Decodes a video's images once, in order, and writes its keyframes as ``folder/NAME.jpg``.
+    """Decode a video's images once, in order, and write its keyframes as ``folder/NAME.jpg``; their positions in
+    ``images``, and how many images cannot be decoded.
 
     Args:
         images: all of the video.
@@ -33,9 +34,6 @@ def write_keyframes(
         always: names of images that are keyframes wherever they lie.
         progress: called with the number of decoded images.
         stop: called before every image; True ends the video there.
-
-    Returns:
-        The keyframes' positions in ``images``, and how many images cannot be decoded.
     """
     import cv2
 
