@@ -45,8 +45,9 @@ from ufmstar_torch.posterior.running import SIZE
 KINDS_OF_TOURS = ("711?style=home", "713?style=home", "712?style=hall", "721?style=blank", "723?style=blank",
                   "732?style=blank&pan=1")  # fmt: skip
 TOURS = [f"tour:{kind}&frames=40&size=240x320" for kind in KINDS_OF_TOURS]
-# The last two are no metrics: shares of pixels beyond 3 sigma, and of frames whose RMSE is above 1.1 of the network's.
-FIGURES = ("delta1", "rmse", "ece_delta", "ece_q", "nll", "spearman", "beyond_3_sigma", "worse_frames")
+MIXTURE = ("mixture_nll", "mixture_ece_delta", "mixture_ece_q", "mixture_coverage")
+# The last one is no metric: share of frames whose RMSE is above 1.1 of the network's.
+FIGURES = ("delta1", "rmse", "ece_delta", "ece_q", "nll", "spearman", *MIXTURE, "worse_frames")
 KINDS = DENSE, CORNERS, NEAR = "dense", "corners", "near"
 NEAREST = 0.4  # share of the image that evidence of NEAR covers
 STRIDE = 4  # judged are every fourth pixel of every fourth row
@@ -115,19 +116,16 @@ def made(frame: Frame, edges: bool) -> tuple[Tensor, Tensor]:
 def figures(prepared: list[Prepared], kind: str, config: PosteriorConfig) -> list[float]:
     """``FIGURES`` of the posterior with one kind of evidence."""
     metrics, packed = SequenceMetrics(), torch.zeros(1, SIZE, dtype=torch.float64)
-    beyond, worse = [], []
+    worse = []
     for one in prepared:
         packed, out = update(packed, one.frame, one.anchors[kind], one.claimed, config)
-        maps = out.depth[0], out.variance[0], one.truth, one.frame.depth[0]
-        depth, variance, truth, network = (x[..., ::STRIDE, ::STRIDE] for x in maps)
-        metrics.update(depth, variance, truth)
+        maps = out.depth[0], out.variance[0], one.truth, one.frame.depth[0], out.inlier[0], out.outlier[0]
+        depth, variance, truth, network, *mixture = (x[..., ::STRIDE, ::STRIDE] for x in maps)
+        metrics.update(depth, variance, truth, mixture=(mixture[0], mixture[1]))
         known = (truth > 0) & (network > 0)
         error, before = (truth - depth)[known], (truth - network)[known]
-        beyond.append((error.square() > 9 * variance[known]).double().mean())
         worse.append((error.square().mean() > 1.21 * before.square().mean()).double())
-    row = metrics.compute() | dict(
-        zip(FIGURES[-2:], (float(torch.stack(x).nanmean()) for x in (beyond, worse)), strict=True)
-    )
+    row = metrics.compute() | {"worse_frames": float(torch.stack(worse).nanmean())}
     return [row[name] for name in FIGURES]
 
 

@@ -28,7 +28,7 @@ def main(words: Sequence[str] | None = None) -> Any:
     parser.add_argument("--camera", type=int, default=0)
     options = parser.parse_args(words)
     network = load_network("fastdepth", options.weights)
-    model = UncertainDepth(network, UfMStarConfig(on_bad_frame="skip"), preprocess=network.preprocess)
+    model = UncertainDepth(network, UfMStarConfig(on_bad_frame="skip"))
     model.ufm.warm_up((224, 224))
     latest: list[LiveResult] = []  # the newest alone; windows belong to the main thread
 

@@ -52,7 +52,7 @@ def attach(node: Any, model: UncertainDepth, sensor: Any, geometry: Any) -> Live
 
 if __name__ == "__main__":
     net = load_network("fastdepth", sys.argv[1])
-    model = UncertainDepth(net, UfMStarConfig(on_bad_frame="skip"), preprocess=net.preprocess)
+    model = UncertainDepth(net, UfMStarConfig(on_bad_frame="skip"))
     (rclpy := import_module("rclpy")).init(args=sys.argv)
     node = rclpy.create_node("ufmstar")
     with attach(node, model, import_module("sensor_msgs.msg"), import_module("geometry_msgs.msg")):

@@ -24,7 +24,7 @@ def main(tour: int = 5, frames: int = 40) -> dict[str, SequenceMetrics]:
         return {"metric_depth": own(image).depth}
 
     wrapped = wrap_network(network, "metric_depth", preprocess=own.preprocess)
-    model = UncertainDepth(wrapped, preprocess=wrapped.preprocess, posterior=True)
+    model = UncertainDepth(wrapped, posterior=True)
     rows = {"UfM*": SequenceMetrics(), "posterior": SequenceMetrics()}
     walk = tour_sequence(tour, frames=150, style="hall")
     for frame in (walk[i] for i in range(frames)):

@@ -10,17 +10,15 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.arguments import as_tensor
 from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.models.hugging_face import from_hugging_face, of_transformers
-from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.network import DeclaredNetwork, DepthNetwork
 from ufmstar_torch.models.outputs import METRIC, OutputSpec, ProgramSpec, Spread
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.prediction import DepthPrediction, infer, states_confidence
+from ufmstar_torch.prediction import DepthPrediction, infer
 from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
 
 # Files of a torch.export archive: those of a word or a number, and tensors as raw bytes.
@@ -29,44 +27,50 @@ _RAW = re.compile(r"[^/]+/data/(weights/weight|constants/tensor)_\d+")
 Spec = ProgramSpec | Mapping[str, Any] | str | Path
 
 
-class WrappedNetwork(DepthNetwork):
+class WrappedNetwork(DeclaredNetwork):
     """A network whose outputs are declared by an :class:`OutputSpec`; made by :func:`wrap_network`."""
 
     def __init__(
-        self, network: Callable[..., Any], outputs: OutputSpec, preprocess: Preprocess, takes_intrinsics: bool = False
+        self,
+        network: Callable[..., Any],
+        outputs: OutputSpec,
+        preprocess: Preprocess,
+        takes_intrinsics: bool = False,
+        path: str = "",
     ) -> None:
         super().__init__()
         self.network = network
-        self.outputs = outputs
-        self.preprocess = preprocess
+        self.outputs, self.preprocess, self.path = outputs, preprocess, path
         self._passes_intrinsics = takes_intrinsics or declares_intrinsics(network)
+
+    @property
+    def wrapped(self) -> tuple[Any]:
+        """The network."""
+        return (self.network,)
 
     @property
     def takes_intrinsics(self) -> bool:
         """True if the network takes intrinsics, or the unit of its depth depends on the focal length."""
-        return self.outputs.focal is not None or self._passes_intrinsics
-
-    @property
-    def max_depth(self) -> float | None:
-        """[m] As declared."""
-        return self.outputs.max_depth
-
-    @property
-    def states_confidence(self) -> bool:
-        """True if a confidence is declared, or stated by a network that returns a ``DepthPrediction``."""
-        return self.outputs.confidence is not None or states_confidence([self.network])
+        return self._passes_intrinsics or super().takes_intrinsics
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it, with ``intrinsics`` [B, 3, 3]
-        [px] for a network that takes them. Raises ValueError: the network's output is not what was declared, or the
-        intrinsics are missing."""
+        [px] for a network that takes them. Raises ValueError: the network's output is not what was declared, a program
+        does not take the image, or the intrinsics are missing."""
         if not isinstance(image, Tensor):
             expected = "image must be a tensor [B, 3, H, W] as network.preprocess(image, intrinsics) returns it"
             raise TypeError(f"{expected}, got {type(image).__name__}; UncertainDepth takes pictures as they are")
-        result = infer(self.network, image, intrinsics, takes=self._passes_intrinsics)
-        if isinstance(result, DepthPrediction):
-            return result
-        return self.outputs.prediction(_named(result), (image.shape[-2], image.shape[-1]), intrinsics)
+        try:
+            result = infer(self.network, image, intrinsics, takes=self._passes_intrinsics)
+        except (AssertionError, RuntimeError, TypeError, ValueError) as error:  # how programs refuse an input
+            if not self.path or isinstance(error, torch.OutOfMemoryError):
+                raise
+            given = f"{image.dtype} {tuple(image.shape)}{' and K' if self._passes_intrinsics else ''}"
+            raise ValueError(
+                f"{self.path} fails on {given}: {error}; if it is made for another input, declare its size in the "
+                "spec's preprocess and a second input, of intrinsics, as takes_intrinsics, or export it for this one"
+            ) from error
+        return result if isinstance(result, DepthPrediction) else self.declared(result, image, intrinsics)
 
 
 def wrap_network(
@@ -149,7 +153,7 @@ def load_torchscript(path: str | Path, spec: Spec | None = None) -> WrappedNetwo
         program = torch.jit.load(_existing(path), map_location="cpu")
     except RuntimeError as error:
         raise ValueError(f"{path} is not a readable TorchScript file: {error}") from error
-    return _wrapped(program.eval(), declared)
+    return _wrapped(program.eval(), declared, path)
 
 
 def load_exported(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
@@ -164,11 +168,11 @@ def load_exported(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
             f"{path} is not a readable torch.export file: {error}; expected what torch.export.save of a compatible "
             f"torch writes (this one is {torch.__version__}): export the network again"
         ) from error
-    return _wrapped(_Exported(program, str(path)), declared)
+    return _wrapped(_Exported(program), declared, path)
 
 
-def _wrapped(program: nn.Module, spec: ProgramSpec) -> WrappedNetwork:
-    return WrappedNetwork(program, spec.outputs, spec.preprocess or Preprocess(), spec.takes_intrinsics)
+def _wrapped(program: nn.Module, spec: ProgramSpec, path: str | Path) -> WrappedNetwork:
+    return WrappedNetwork(program, spec.outputs, spec.preprocess or Preprocess(), spec.takes_intrinsics, str(path))
 
 
 def _checked_copy(path: str) -> io.BytesIO:
@@ -209,20 +213,13 @@ def _is_json(content: bytes) -> bool:
 class _Exported(nn.Module):
     """An exported program, which keeps the mode it was exported in; torch's own refuses even ``eval()``."""
 
-    def __init__(self, program: nn.Module, path: str) -> None:
+    def __init__(self, program: nn.Module) -> None:
         super().__init__()
-        self.program, self.path = program, path
+        self.program = program
         self.training = False
 
     def forward(self, *inputs: Tensor) -> Any:
-        try:
-            return self.program(*inputs)
-        except AssertionError as error:  # how an exported program refuses an input
-            shapes = ", ".join(f"{value.dtype} {tuple(value.shape)}" for value in inputs)
-            raise ValueError(
-                f"{self.path} was exported for another input than {shapes}: {error}; declare its size in the spec's "
-                "preprocess, or export it with dynamic shapes"
-            ) from error
+        return self.program(*inputs)
 
     def train(self, mode: bool = True) -> _Exported:
         return self
@@ -232,17 +229,3 @@ def _existing(path: str | Path) -> str:
     if not Path(path).is_file():
         raise FileNotFoundError(f"no network file {path}")
     return str(path)
-
-
-def _named(result: Any) -> dict[str | int, Tensor]:
-    """The tensors (or NumPy arrays) of whatever a network returned, by name or position."""
-    if isinstance(result, Tensor | np.ndarray):
-        return {"depth": as_tensor("the network's output", result)}
-    if isinstance(result, (tuple, list)):
-        result = dict(enumerate(result))
-    elif not isinstance(result, Mapping):
-        if not hasattr(result, "__dict__"):
-            raise ValueError(f"a network must return tensors or a DepthPrediction, got {type(result).__name__}")
-        result = vars(result)
-    arrays = {name: value for name, value in result.items() if isinstance(value, Tensor | np.ndarray)}
-    return {name: as_tensor(f"the network's output {name!r}", value) for name, value in arrays.items()}

@@ -12,14 +12,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.models.network import ProgramNetwork, require_image
+from ufmstar_torch.models.network import DeclaredNetwork, require_image
 from ufmstar_torch.models.outputs import ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.optional import optional
 from ufmstar_torch.prediction import DepthPrediction
 
 
-class LiteRTNetwork(ProgramNetwork):
+class LiteRTNetwork(DeclaredNetwork):
     """A .tflite file as a module, on the CPU and without gradients; quantised tensors are converted by the scale and
     zero point in the file.
 
@@ -36,7 +36,9 @@ class LiteRTNetwork(ProgramNetwork):
 
     def __init__(self, path: str | Path, spec: ProgramSpec, *, threads: int = 0) -> None:
         super().__init__()
-        self.path, self.spec, self.threads = str(path), spec, threads
+        self.path, self.outputs, self.threads = str(path), spec.outputs, threads
+        if spec.takes_intrinsics:
+            raise ValueError(f"{path}: takes_intrinsics is not supported for .tflite files")
         self._open()
         preprocess = spec.preprocess or Preprocess()
         if preprocess.size not in (None, self.size):
@@ -61,14 +63,13 @@ class LiteRTNetwork(ProgramNetwork):
         if len(inputs) != 1 or len(shape) != 4 or shape[0] != 1 or 3 not in (shape[1], shape[3]):
             expected = "one input [1, H, W, 3] or [1, 3, H, W]"
             raise ValueError(f"{self.path}: expected {expected}, got {len(inputs)} of {shape}")
-        self.input = inputs[0]
+        self.input, kind = inputs[0], np.dtype(inputs[0]["dtype"])
+        if not (kind.kind == "f" or kind == np.uint8 or self.input["quantization"][0]):
+            raise ValueError(f"{self.path}: the input is {kind}, expected floats, bytes or a quantised type")
         self.size = (shape[1], shape[2]) if self.channels_last else (shape[2], shape[3])
-        self.outputs = {one["name"]: one for one in self.interpreter.get_output_details()}
-        declared = [str(name) for name in self.spec.outputs.names()]
-        if absent := [name for name in declared if name not in self.outputs]:
-            raise ValueError(f"{self.path}: the outputs are {list(self.outputs)}; it has no {absent}")
-        if self.spec.takes_intrinsics:
-            raise ValueError(f"{self.path}: takes_intrinsics is not supported for .tflite files")
+        self.details = {one["name"]: one for one in self.interpreter.get_output_details()}
+        if absent := [name for name in self.outputs.names() if name not in self.details]:
+            raise ValueError(f"{self.path}: the outputs are {list(self.details)}; it has no {absent}")
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth [B, H, W] [m], on the image's device, of ``image`` [B, 3, H, W] as ``preprocess`` returns it. Raises
@@ -78,27 +79,27 @@ class LiteRTNetwork(ProgramNetwork):
         array = image.detach().cpu().float()
         array = array.permute(0, 2, 3, 1) if self.channels_last else array
         runs = [self._run(one) for one in array.numpy()]
-        maps = {name: torch.cat([run[name] for run in runs]).to(image.device) for name in self.outputs}
-        return self.spec.outputs.prediction(maps, self.size, intrinsics)
+        maps = {name: torch.cat([run[name] for run in runs]).to(image.device) for name in self.details}
+        return self.declared(maps, image, intrinsics)
 
-    def _run(self, image: NDArray[np.float32]) -> dict[str | int, Tensor]:
+    def _run(self, image: NDArray[np.float32]) -> dict[str, Tensor]:
         scale, zero = self.input["quantization"]
         dtype = np.dtype(self.input["dtype"])
-        if scale:
+        if dtype.kind != "f":
             limits = np.iinfo(dtype)
-            image = (image / scale + zero).round().clip(limits.min, limits.max)
+            image = (image / (scale or 1) + zero).round().clip(limits.min, limits.max)
         self.interpreter.set_tensor(self.input["index"], image[None].astype(dtype))
         self.interpreter.invoke()
-        found: dict[str | int, Tensor] = {}
-        for name, about in self.outputs.items():
-            value = torch.from_numpy(self.interpreter.get_tensor(about["index"])).float()
+        found: dict[str, Tensor] = {}
+        for name, about in self.details.items():
+            value = torch.from_numpy(np.atleast_1d(self.interpreter.get_tensor(about["index"])).astype(np.float32))
             scale, zero = about["quantization"]
             found[name] = (value - zero) * scale if scale else value
         return found
 
     def __getstate__(self) -> dict[str, Any]:
         # An interpreter cannot be copied or pickled; the copy opens its own from the same file.
-        own = ("interpreter", "input", "outputs")
+        own = ("interpreter", "input", "details")
         return {key: value for key, value in self.__dict__.items() if key not in own}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

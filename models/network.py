@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,7 @@ from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction, stated_range, states_confidence, takes_intrinsics
 
 if TYPE_CHECKING:
-    from ufmstar_torch.models.outputs import ProgramSpec
+    from ufmstar_torch.models.outputs import OutputSpec
 
 
 class DepthNetwork(nn.Module, ABC):
@@ -88,25 +88,41 @@ class Backbone(DepthNetwork):
         return DepthPrediction(self.depth(self.features(image)))
 
 
-class ProgramNetwork(DepthNetwork):
-    """A network in a file that runs by itself; a specification declares its outputs."""
+class DeclaredNetwork(DepthNetwork):
+    """A network whose raw outputs are declared.
 
-    spec: ProgramSpec
+    Attributes:
+        outputs: the declaration.
+        path: the file that the network is in, which error messages name; "" without one.
+    """
+
+    outputs: OutputSpec
+    path: str = ""
 
     @property
     def takes_intrinsics(self) -> bool:
-        """True if the unit of its depth depends on the focal length."""
-        return self.spec.outputs.focal is not None
+        """True if the network takes intrinsics, or the unit of its depth depends on the focal length."""
+        return self.outputs.focal is not None or super().takes_intrinsics
 
     @property
     def states_confidence(self) -> bool:
-        """True if the spec names a confidence."""
-        return self.spec.outputs.confidence is not None
+        """True if a confidence is declared, or stated by a network that returns a ``DepthPrediction``."""
+        return self.outputs.confidence is not None or super().states_confidence
 
     @property
     def max_depth(self) -> float | None:
-        """[m] As declared."""
-        return self.spec.outputs.max_depth
+        """[m] As declared, or stated by a network that returns a ``DepthPrediction``."""
+        return self.outputs.max_depth or super().max_depth
+
+    def declared(self, result: Any, image: Tensor, intrinsics: Tensor | None) -> DepthPrediction:
+        """The prediction in what the network returned; arguments and errors as :meth:`OutputSpec.prediction`, with the
+        file's name."""
+        try:
+            return self.outputs.prediction(result, image, intrinsics)
+        except (TypeError, ValueError) as error:
+            if not self.path:
+                raise
+            raise ValueError(f"{self.path}: {error}") from error
 
 
 @contextmanager

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.checked import choice
-from ufmstar_torch.models.network import ProgramNetwork, require_image
+from ufmstar_torch.models.network import DeclaredNetwork, require_image
 from ufmstar_torch.models.outputs import ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.optional import optional
@@ -62,7 +62,7 @@ class OnnxSpec(ProgramSpec):
             raise ValueError(f"OnnxSpec.outputs must name ONNX outputs, got position {self.outputs.depth}")
 
 
-class OnnxNetwork(ProgramNetwork):
+class OnnxNetwork(DeclaredNetwork):
     """An ONNX depth network as a module; no gradients, and the computation runs where ONNX Runtime does.
 
     Args:
@@ -77,8 +77,6 @@ class OnnxNetwork(ProgramNetwork):
         ValueError: the file is broken, or spec and graph do not fit; the message names the tensor.
     """
 
-    spec: OnnxSpec
-
     def __init__(
         self,
         path: str | Path,
@@ -88,7 +86,7 @@ class OnnxNetwork(ProgramNetwork):
         providers: Sequence[str] = ("CPUExecutionProvider",),
     ) -> None:
         super().__init__()
-        self.path, self.spec = str(path), spec
+        self.path, self.spec, self.outputs = str(path), spec, spec.outputs
         self.threads, self.providers = threads, tuple(providers)
         self._open()
         self.preprocess = self._fitted_preprocess(spec.preprocess or Preprocess())
@@ -113,12 +111,12 @@ class OnnxNetwork(ProgramNetwork):
             )
         self.batch, _, *self.size = (shape[i] for i in order)
         outputs = [o.name for o in self.session.get_outputs()]
-        declared = [str(n) for n in self.spec.outputs.names()]
+        declared = [str(n) for n in self.outputs.names()]
         missing = [n for n in declared if n not in outputs]
-        if missing or (self.spec.outputs.depth is None and len(outputs) != 1):
+        if missing or (self.outputs.depth is None and len(outputs) != 1):
             fault = f"it has no {missing}" if missing else "declare which one is depth"
             raise ValueError(f"{self.path}: the graph's outputs are {outputs}; {fault}")
-        self.fetched = outputs if self.spec.outputs.depth is None else declared
+        self.fetched = outputs if self.outputs.depth is None else declared
 
     def _intrinsics_input(self, name: str | None, inputs: Mapping[str, NodeArg]) -> tuple[str, Any] | None:
         """Name and NumPy type of the graph's second input, the intrinsics [B, 3, 3]; None: it has only the image."""
@@ -146,7 +144,7 @@ class OnnxNetwork(ProgramNetwork):
     @property
     def takes_intrinsics(self) -> bool:
         """True if the graph takes intrinsics, or the unit of its depth depends on the focal length."""
-        return self.K_input is not None or self.spec.outputs.focal is not None
+        return self.K_input is not None or super().takes_intrinsics
 
     def _fitted_preprocess(self, preprocess: Preprocess) -> Preprocess:
         height, width = self.size
@@ -176,15 +174,8 @@ class OnnxNetwork(ProgramNetwork):
         if self.K_input is not None and intrinsics is not None:
             cameras = intrinsics.detach().cpu().expand(len(array), 3, 3).split(size)
         runs = [self._run(part.contiguous(), K) for part, K in zip(array.split(size), cameras, strict=True)]
-        outputs: dict[str | int, Tensor] = {
-            name: torch.cat([run[i] for run in runs]).to(image.device) for i, name in enumerate(self.fetched)
-        }
-        prediction = self.spec.outputs.prediction(outputs, (image.shape[-2], image.shape[-1]), intrinsics)
-        if len(prediction.depth) != len(image):
-            raise ValueError(
-                f"{self.path}: the depth output holds {len(prediction.depth)} maps for {len(image)} images"
-            )
-        return prediction
+        outputs = {name: torch.cat([run[i] for run in runs]).to(image.device) for i, name in enumerate(self.fetched)}
+        return self.declared(outputs, image, intrinsics)
 
     def _require_fit(self, image: Tensor) -> None:
         height, width = require_image(image)
@@ -212,7 +203,9 @@ class OnnxNetwork(ProgramNetwork):
                 f"{self.path}: a node fails when ONNX Runtime runs the graph on {shapes}: {error}; if the graph is "
                 "made for another size of image, declare it as the spec's preprocess.size"
             ) from error
-        return [torch.from_numpy(np.asarray(value)).to(torch.float32) for value in results]
+        if wrong := [name for name, value in zip(self.fetched, results, strict=True) if not _numbers(value)]:
+            raise ValueError(f"{self.path}: the outputs {wrong} are no tensors of numbers")
+        return [torch.from_numpy(np.atleast_1d(value).astype(np.float32, copy=False)) for value in results]
 
     def __getstate__(self) -> dict[str, Any]:
         # A session cannot be copied or pickled; the copy opens its own from the same file.
@@ -254,11 +247,15 @@ def _onnxruntime() -> Any:
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:
-    """Exceptions of ONNX Runtime for a graph that it cannot load or run; they have no common base class."""
+    """Exceptions of ONNX Runtime for a graph that it cannot load or run; those of its own have no common base class."""
     from onnxruntime.capi import onnxruntime_pybind11_state as state
 
     names = ("InvalidProtobuf", "InvalidGraph", "InvalidArgument", "Fail", "NotImplemented", "RuntimeException")
-    return tuple(getattr(state, name) for name in names)
+    return UnicodeDecodeError, *(getattr(state, name) for name in names)
+
+
+def _numbers(value: object) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
 
 
 def _fixed(node: NodeArg) -> list[int | None]:

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ufmstar_torch.arguments import as_tensor
 from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
@@ -85,23 +87,27 @@ class OutputSpec(Checked):
         """The outputs that are declared by name."""
         return [name for name in (self.depth, self.aleatoric, self.epistemic, self.confidence) if name is not None]
 
-    def prediction(
-        self, outputs: Mapping[str | int, Tensor], size: tuple[int, int], intrinsics: Tensor | None = None
-    ) -> DepthPrediction:
+    def prediction(self, result: Any, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """The declared outputs in metres.
 
         Args:
-            outputs: raw outputs by name, each [B, 1, H, W], [B, H, W, 1] or [B, H, W].
-            size: (H, W) [px] of the network's input, whose intrinsics the prediction has to share.
+            result: of the network: a tensor or array [B, 1, H, W], [B, H, W, 1] or [B, H, W]; several in a mapping,
+                a tuple or an object.
+            image: [B, 3, H, W] the network's input, whose size and intrinsics the prediction has to share.
             intrinsics: [B, 3, 3] of that input [px], for ``focal``.
 
         Raises:
-            ValueError: a declared output is missing or has another shape, or ``focal`` lacks the intrinsics.
+            ValueError: a declared output is missing or has another shape, depth is possible at no pixel (tested on the
+                CPU only, since an accelerator would have to be waited for), or ``focal`` lacks the intrinsics.
         """
+        outputs = _named(result)
         if self.depth is None and len(outputs) != 1:
             raise ValueError(f"the network returns {list(outputs)}; declare which one is depth")
         depth_name = next(iter(outputs)) if self.depth is None else self.depth
+        size = (len(image), image.shape[-2], image.shape[-1])
         depth = self._map(outputs, depth_name, size)
+        if depth.device.type == "cpu" and depth.numel() and not ((depth >= 0) & (depth < torch.inf)).any():
+            raise ValueError(f"output {depth_name!r} is NaN, infinite or negative at every pixel, expected depth")
         unit = self._unit(intrinsics, depth)
         depth = depth * unit
         aleatoric = self._variance(outputs, self.aleatoric, self.aleatoric_kind, depth, unit)
@@ -131,32 +137,49 @@ class OutputSpec(Checked):
         """[B, H, W] [m^2], or None where the network has none; ``depth`` [B, H, W] [m], ``unit`` as :meth:`_unit`."""
         if name is None:
             return None
-        spread = self._map(outputs, name, (depth.shape[-2], depth.shape[-1]))
+        spread = self._map(outputs, name, tuple(depth.shape))
         if kind == "relative_std":
             return (spread * depth).square()
         spread = spread.exp() if kind.startswith("log_") else spread
         return (spread.square() if kind.endswith("std") else spread) * unit**2
 
-    def _map(self, outputs: Mapping[str | int, Tensor], name: str | int, size: tuple[int, int]) -> Tensor:
-        """[B, H, W] of one output, in its own units."""
+    def _map(self, outputs: Mapping[str | int, Tensor], name: str | int, size: tuple[int, ...]) -> Tensor:
+        """One output as [B, H, W] = ``size``, in its own units."""
         if name not in outputs:
             raise ValueError(f"the network has no output {name!r}; it has {list(outputs)}")
         value = as_map(outputs[name], f"output {name!r}")
-        if value.shape[-2:] == size:
+        if len(value) != size[0]:
+            raise ValueError(f"output {name!r} holds {len(value)} maps for {size[0]} images")
+        if value.shape == size:
             return value
         if not self.resize:
             raise ValueError(
-                f"output {name!r} has {tuple(value.shape[-2:])} px, expected the input's {size}, whose intrinsics it "
-                "is used with; set resize to bring it there"
+                f"output {name!r} has {tuple(value.shape[1:])} px, expected the input's {size[1:]}, whose intrinsics "
+                "it is used with; set resize to bring it there"
             )
-        return F.interpolate(value[:, None], size, mode="nearest-exact")[:, 0]
+        return F.interpolate(value[:, None], size[1:], mode="nearest-exact")[:, 0]
+
+
+def _named(result: Any) -> dict[str | int, Tensor]:
+    """The tensors (or NumPy arrays) of whatever a network returned, by name or position."""
+    if isinstance(result, Tensor | np.ndarray):
+        return {"depth": as_tensor("the network's output", result)}
+    if isinstance(result, (tuple, list)):
+        result = dict(enumerate(result))
+    elif not isinstance(result, Mapping):
+        if not hasattr(result, "__dict__"):
+            raise ValueError(f"a network must return tensors or a DepthPrediction, got {type(result).__name__}")
+        result = vars(result)
+    arrays = {name: value for name, value in result.items() if isinstance(value, Tensor | np.ndarray)}
+    return {name: as_tensor(f"the network's output {name!r}", value) for name, value in arrays.items()}
 
 
 def as_map(value: Any, name: str) -> Tensor:
-    """[B, H, W] floating-point, of a tensor [B, 1, H, W], [B, H, W, 1] or [B, H, W]; half precision stays. Raises
-    ValueError: ``name`` is something else."""
-    if not isinstance(value, Tensor):
-        raise ValueError(f"{name} must be a tensor, got {type(value).__name__}")
+    """[B, H, W] floating-point, of a tensor [B, 1, H, W], [B, H, W, 1] or [B, H, W] of numbers; half precision stays.
+    Raises ValueError: ``name`` is something else."""
+    if not isinstance(value, Tensor) or value.is_complex() or value.dtype == torch.bool:
+        kind = value.dtype if isinstance(value, Tensor) else type(value).__name__
+        raise ValueError(f"{name} must be a tensor of numbers, got {kind}")
     shape = tuple(value.shape)
     if value.dim() == 4 and 1 in (shape[1], shape[3]):
         value = value[:, 0] if shape[1] == 1 else value[..., 0]

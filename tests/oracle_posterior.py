@@ -17,7 +17,7 @@ START = {
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
 PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
-REACH, RADIUS, WEAK, CLIP = 1.0, 5 / 28, 0.25**2, 9.0
+REACH, RADIUS, WEAK, CLIP, APART = 1.0, 5 / 28, 0.25**2, 9.0, 0.5
 
 
 def start():
@@ -136,7 +136,8 @@ def distances(logs, source):
 def update(state, depth, claimed, pixel, g, variance):
     """One frame: depth [H, W] (0 = not valid), claimed V [m^2], anchors (pixel [N, 2], depth, variance), all valid.
 
-    Returns the state after it, posterior depth and variance [H, W].
+    Returns the state after it, posterior depth, variance, variance on the evidence's surface, and probability of
+    another [H, W].
     """
     logs = nodes(depth)
     rows, cols = logs.shape
@@ -190,8 +191,11 @@ def update(state, depth, claimed, pixel, g, variance):
     offset, share = HX[:, 4:] @ mean[4:], away / REACH
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
     wrong = ratio(state, "wrong")
+    alone = [second_moment(0.0, *each) for each in zip(spread, share, offset, around, strict=True)]
     spread = [second_moment(wrong, *each) for each in zip(spread, share, offset, around, strict=True)]
-    return after, *read(depth, counted, logs, mean[:4], offset, spread, share)
+    posterior, variance, _ = read(depth, counted, logs, mean[:4], offset, spread, share)
+    _, inlier, unseen = read(depth, 0 * counted, logs, mean[:4], offset, alone, share)
+    return after, posterior, variance, inlier, np.minimum(wrong * (1 + 2 * unseen), 0.5)
 
 
 def y_variance(shape, node, y, noise, used, centre):
@@ -259,7 +263,7 @@ def pairs(state, logs, held, node, error, var, away, noise):
     for i, j, variance, _ in links(logs):
         if i in inside and j in inside:
             e, v, a, n = ([x[inside[k]].mean() for k in (i, j)] for x in (error, var, away, noise))
-            common, far = max((sum(v) - amplitude * variance) / 2, 0), sum(a) / 2
+            common, far = max((sum(v) - APART * amplitude * variance) / 2, 0), sum(a) / 2
             weight, product = 2 / (sum(v) + sum(n)), e[0] * e[1]
             sums += weight * product, weight * common / amplitude, far * (product - common), far**2
             alone, count = alone - {i, j}, count + 1
@@ -274,7 +278,7 @@ def pairs(state, logs, held, node, error, var, away, noise):
 def read(depth, claimed, logs, b, offset, spread, share):
     h, w = depth.shape
     rows, cols = logs.shape
-    out, variance = np.full((h, w), np.nan), np.full((h, w), np.nan)
+    out, variance, unseen = np.full((3, h, w), np.nan)
     for i in range(h):
         for j in range(w):
             if depth[i, j] <= 0:
@@ -292,4 +296,5 @@ def read(depth, claimed, logs, b, offset, spread, share):
             offset_, spread_, share_ = sums[1:] / sums[0]
             out[i, j] = depth[i, j] * math.exp(min(max(y + offset_, -math.log(100)), math.log(100)))
             variance[i, j] = out[i, j] ** 2 * (spread_ + share_ * claimed[i, j] / depth[i, j] ** 2)
-    return out, variance
+            unseen[i, j] = share_
+    return out, variance, unseen

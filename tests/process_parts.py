@@ -1,36 +1,43 @@
-"""Work of processes that are started anew: they import it by the name of this file."""
+"""A plug-in for processes that are started anew: a reader of sequences at which a process is killed, fails or waits.
+
+``NAME.act`` contains "kill", "fail", "wait" or "go".
+"""
 
 from __future__ import annotations
 
 import os
 import signal
 import time
-from functools import partial
-from pathlib import Path
 
-from ufmstar_torch.eval.suite import shards
+import numpy as np
 
-__all__ = ["Path", "at_work", "in_parts"]
+from ufmstar_torch.eval.sequences.frame import Entry, make_sequence
 
 
-def part(folder, ends, number):
-    """Stands for the work of a process; ``ends`` says what becomes of each."""
-    (folder / f"{number}-{os.getpid()}").touch()
-    if ends[number] == "kill":
-        os.kill(os.getpid(), signal.SIGKILL)
-    if ends[number] == "fail":
-        raise OSError("disk full")
-    while ends[number] == "wait":
-        time.sleep(0.02)
+class Acting:
+    LOOKED_FOR = "a file *.act"
+    detect = staticmethod(lambda path: path.suffix == ".act")
+
+    @staticmethod
+    def read(path, options):
+        act = path.read_text()
+        path.with_suffix(f".{os.getpid()}").touch()
+        while act != "go" and len(list(path.parent.glob("*.[0-9]*"))) < 2:
+            time.sleep(0.02)  # until another process is at work as well
+        if act == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if act == "fail":
+            raise TypeError("a mistake")
+
+        def load(value):
+            time.sleep(0.05 if act == "wait" else 0)
+            return value
+
+        image, depth = np.zeros((24, 32, 3), np.uint8), np.ones((24, 32), np.float32)
+        loaders = [lambda: load(image), lambda: load(depth)]
+        frames = [Entry(f"{i:05d}", np.eye(4), *loaders) for i in range(9999 if act == "wait" else 2)]
+        K = np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]])
+        return make_sequence(path.stem, "act", frames, K, image_size=(24, 32), depth_size=(24, 32))
 
 
-def in_parts(folder, *ends, stop=lambda: False):
-    """True if all of some processes finished, and their report."""
-    folder.mkdir()
-    lines: list[str] = []
-    return shards.in_processes(partial(part, folder, ends), len(ends), stop, lines.append), lines
-
-
-def at_work(folder):
-    """The numbers of the processes that have begun."""
-    return [int(path.name.rpartition("-")[2]) for path in folder.glob("*-*")]
+READERS = {"act": Acting}

@@ -9,7 +9,15 @@ from modules import CONFIG, H, K, W, frame, same
 from PIL import Image
 from torch import nn
 
-from ufmstar_torch import AnchorConfig, ConfidenceConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import (
+    AnchorConfig,
+    ConfidenceConfig,
+    DepthPrediction,
+    UfMStar,
+    UfMStarConfig,
+    UncertainDepth,
+    pipeline,
+)
 from ufmstar_torch.models import Preprocess, wrap_network
 from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.recalibrate import Recalibration
@@ -104,19 +112,28 @@ REFUSED = {
     ),
     "an image that is a file's name": (lambda: model("a.png"), TypeError, "image must be .*Pillow image, got str"),
     "bytes for a network of floats": (
-        lambda: model(IMAGE, network=nn.Conv2d(3, 1, 1)), TypeError, r"image of torch.uint8: give floats.*wrap_network"
+        lambda: model(IMAGE, network=nn.Conv2d(3, 1, 1), preprocess=None), TypeError, "image of torch.uint8: give flo"
     ),
     "an array for a wrapped network": (
         lambda: wrap_network(Brightness())(PICTURE), TypeError, r"image must be a tensor .*network.preprocess"
     ),
-    "a network that returns a tensor": (
-        lambda: model(IMAGE / 255, network=nn.Identity()), TypeError, r"DepthPrediction, got Tensor: wrap.*wrap_network"
+    "a network that returns no map": (
+        lambda: model(IMAGE, network=nn.Identity()), ValueError, r"output 'depth' must be \[B, 1, H, W\]"
     ),
-    "a function as network": (
-        lambda: UncertainDepth(ufm, CONFIG), TypeError, r"networks .*got a function; wrap .*wrap_network\(function\)"
+    "a tensor where the core is alone": (
+        lambda: pipeline.UncertainDepth(nn.Conv2d(3, 1, 1))(IMAGE, POSE, K), TypeError, "DepthPrediction, got Tensor: w"
     ),
-    "a function among networks": (lambda: UncertainDepth([ufm]), TypeError, "networks must be an nn.Module"),
-    "a number as network": (lambda: UncertainDepth(3, CONFIG), TypeError, "networks .*sequence of them, got a int$"),
+    "a function where the core is alone": (
+        lambda: pipeline.UncertainDepth(ufm), TypeError, r"networks .*got a function; wrap .*wrap_network\(network\)"
+    ),
+    "networks of different inputs": (
+        lambda: UncertainDepth([wrap_network(ufm, preprocess=Preprocess(size=(8, n))) for n in (8, 9)]),
+        ValueError, "networks must have the same preprocess",
+    ),
+    "a number among networks": (lambda: UncertainDepth([3], CONFIG), TypeError, "function, got int$"),
+    "a file as network": (lambda: UncertainDepth("w.pth"), TypeError, "got str 'w.pth': load it, as load_network"),
+    "weights as network": (lambda: UncertainDepth({"w": 1}), TypeError, "weights need their network"),
+    "a class as network": (lambda: UncertainDepth(nn.ReLU), TypeError, "the class ReLU: give an instance"),
     "no network": (lambda: UncertainDepth([]), ValueError, "networks must hold at least one"),
     "no networks for an image": (
         lambda: UncertainDepth(None)(IMAGE, POSE, K), ValueError, "no networks: give the predictions to update"
@@ -194,7 +211,7 @@ def test_whole_numbers_are_intrinsics():
 )
 def test_every_form_of_an_image_is_the_same_image(image):
     network = wrap_network(Brightness(), preprocess=Preprocess(size=(H // 2, W // 2)))
-    models = [UncertainDepth(network, CONFIG, preprocess=network.preprocess) for _ in range(2)]
+    models = [UncertainDepth(network, CONFIG, preprocess=network.preprocess), UncertainDepth(network, CONFIG)]
     expected, got = (m(x, POSE.numpy(), (FX, FY, CX, CY)) for m, x in zip(models, (IMAGE, image), strict=True))
     assert torch.equal(got.depth, expected.depth)
     assert same(got.variance, expected.variance)
@@ -211,18 +228,19 @@ def test_arrays_that_a_network_returns_are_tensors():
     torch.testing.assert_close(prediction.aleatoric_variance, torch.full((1, H, W), 0.01))
 
 
-def test_a_forgotten_preprocessing_is_named(caplog):
-    """A network that states the size of its input and gets another one; once, and not where it is right."""
-    network = wrap_network(Brightness(), preprocess=Preprocess(size=(H // 2, W // 2)))
-    right, forgotten = UncertainDepth(network, preprocess=network.preprocess), UncertainDepth(network)
-    with caplog.at_level("WARNING", "ufmstar_torch"):
-        for _ in range(2):
-            right(IMAGE, POSE, K)
-        assert not [m for m in caplog.messages if "preprocess" in m]
-        for _ in range(2):
-            forgotten(IMAGE / 255, POSE, K)
-    (said,) = [m for m in caplog.messages if "preprocess" in m]
-    assert "(15, 20) px and gets (30, 40)" in said
+@pytest.mark.parametrize("output", [lambda depth: depth[:, None], lambda depth: {"depth": depth.numpy()}])
+@pytest.mark.parametrize("kind", ["module", "function", "wrapped"])
+def test_every_kind_of_network_is_the_same_network(kind, output):
+    """A module or a function gets bytes in [0, 1], and its only output is metric depth, as ``wrap_network`` has it."""
+
+    class Bright(nn.Module):
+        def forward(self, image):
+            return output(1 + image.mean(1))
+
+    networks = {"module": Bright(), "function": Bright().forward, "wrapped": wrap_network(Bright())}
+    got = UncertainDepth(networks[kind], CONFIG)(PICTURE, POSE, K)
+    torch.testing.assert_close(got.depth, 1 + IMAGE.float().mean(1) / 255)
+    assert torch.equal(got.intrinsics, K[None])
 
 
 def test_a_posterior_without_a_source_of_anchors_is_dense():

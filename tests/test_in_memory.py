@@ -67,7 +67,10 @@ def test_a_pipeline_brings_its_image_processor(tmp_path):
         depth = network(network.preprocess(image, CAMERA)[0]).depth
         expected = pipe(Image.fromarray(image))["predicted_depth"]
     torch.testing.assert_close(depth.mean(), expected.mean(), rtol=0.05, atol=0)
-    assert UncertainDepth(network, CONFIG, preprocess=network.preprocess)(image, torch.eye(4), CAMERA).depth.mean() > 0
+    networks = [pipe, pipe.model, pipe.model, network]
+    given = [{}, {"preprocess": pipe.image_processor}, {"preprocess": network.preprocess}, {}]
+    for member, own in zip(networks, given, strict=True):
+        assert torch.equal(UncertainDepth(member, CONFIG, **own)(image, torch.eye(4), CAMERA).depth, depth)
 
 
 def test_depth_pro_takes_the_cameras_focal_length(tmp_path):

@@ -236,8 +236,11 @@ def test_litert_needs_a_spec_that_fits(tmp_path):
         load_network("litert", file, spec={**METRIC, "preprocess": {"size": [96, 96]}})
     with pytest.raises(FileNotFoundError, match=r"no \.tflite file"):
         load_network("litert", tmp_path / "n.tflite", spec=METRIC)
-    (tmp_path / "n.tflite").write_bytes(b"TFL3 nothing")
-    with pytest.raises(ValueError, match="is not a file that LiteRT can run"):
-        load_network("litert", tmp_path / "n.tflite", spec=METRIC)
+    for content in (b"", b"TFL3 nothing", b"PK", Path(file).read_bytes()[:-1]):
+        (tmp_path / "n.tflite").write_bytes(content)
+        with pytest.raises(ValueError, match=r"n\.tflite is not a file that LiteRT can run"):
+            load_network("litert", tmp_path / "n.tflite", spec=METRIC)
+    with pytest.raises(ValueError, match=r"int8\.tflite: takes_intrinsics is not supported"):
+        load_network("litert", file, spec={**METRIC, "takes_intrinsics": True})
     with pytest.raises(ValueError, match="a graph that only LiteRT runs"):
         Inference("onnx").ready(network, Path(file), torch.device("cpu"))

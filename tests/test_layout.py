@@ -154,6 +154,7 @@ def test_kernels_import_back_only_plain_types():
         "ratios",
         "LEAST_LEFT",
         "LEAST_REST",
+        "APART",
         "MOST_WRONG",
     }
     for path in (ROOT / "ufmstar_torch" / "kernels").glob("*_cpu.py"):

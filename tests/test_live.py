@@ -32,7 +32,7 @@ class Network(torch.nn.Module):
     def forward(self, x):
         self.entered.set()
         assert self.gate.wait(20)
-        if x.float().mean() > 200:
+        if x.float().mean() > 0.8:
             raise OSError("the network failed")
         return DepthPrediction(torch.full((len(x), 48, 64), 2.0))
 

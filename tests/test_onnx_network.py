@@ -235,6 +235,32 @@ def test_outputs_of_another_resolution(tmp_path: Path, image: Tensor) -> None:
     torch.testing.assert_close(got, small.repeat_interleave(2, -1).repeat_interleave(2, -2))
 
 
+DEFECTS: dict[str, tuple[str, list[str], dict[str, Any], str]] = {
+    "NaN": ("Div", ["zero", "zero"], {}, "NaN, infinite or negative at every pixel"),
+    "negative": ("Sub", ["zero", "one"], {}, "NaN, infinite or negative at every pixel"),
+    "a number": ("ReduceMean", ["channel"], {"keepdims": 0}, r"must be \[B, 1, H, W\], .* got \(1,\)"),
+    "three channels": ("Identity", ["image"], {}, r"must be \[B, 1, H, W\], .* got \(2, 3, 6, 8\)"),
+    "other images": ("Concat", ["channel", "channel"], {"axis": 0}, "holds 4 maps for 2 images"),
+    "half the size": ("MaxPool", ["channel"], {"kernel_shape": [2, 2], "strides": [2, 2]}, r"has \(3, 4\) px, exp"),
+    "truth values": ("Cast", ["channel"], {"to": TensorProto.BOOL}, "not .* file that ONNX Runtime can run: .*Type"),
+}
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_a_graph_with_a_defect_is_named(tmp_path: Path, image: Tensor, defect: str) -> None:
+    operation, inputs, options, message = DEFECTS[defect]
+    red = numpy_helper.from_array(np.array([[[[1]], [[0]], [[0]]]], np.float32), "red")
+    nodes = [
+        helper.make_node("Conv", ["image", "red"], ["channel"]),
+        helper.make_node("Sub", ["channel", "channel"], ["zero"]),
+        helper.make_node("Exp", ["zero"], ["one"]),
+        helper.make_node(operation, inputs, ["depth"], **options),
+    ]
+    path = save(tmp_path / "n.onnx", nodes, [red], [("image", ["n", 3, "h", "w"])], [("depth", None)])
+    with pytest.raises(ValueError, match=rf"n.onnx.* ({message})"):
+        OnnxNetwork(path, OnnxSpec(METRIC))(image[:2])
+
+
 @pytest.mark.parametrize("content", [b"", b"not a graph", None])
 def test_files_that_are_no_graphs(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "broken.onnx"

@@ -54,10 +54,12 @@ def test_values_against_the_oracle_over_frames(tier):
     state, packed = oracle.start(), torch.zeros(1, SIZE, dtype=torch.float64)
     for seed in range(2):
         depth, _, claimed, *anchors = scene(seed, (12, 16), 40)
-        state, expected, variance = oracle.update(state, depth, claimed, *anchors)
+        state, expected, variance, inlier, outlier = oracle.update(state, depth, claimed, *anchors)
         packed, out = tier(packed, *checked(depth, *anchors), torch.from_numpy(claimed)[None], MODEL)
         np.testing.assert_allclose(out.depth[0], expected, rtol=1e-8)
         np.testing.assert_allclose(out.variance[0], variance, rtol=1e-7)
+        np.testing.assert_allclose(out.inlier[0], inlier, rtol=1e-7)
+        np.testing.assert_allclose(out.outlier[0], outlier, rtol=1e-7)
         assert float(out.calibration) == pytest.approx(oracle.ratio(state, "calibration"), rel=1e-7)
         assert float(out.unseen) == pytest.approx(oracle.ratio(state, "unseen"), rel=1e-7)
 
@@ -104,7 +106,7 @@ def test_compiled_update_equals_the_reference(dtype, rtol):
         slow, expected = update(slow, frame, anchors, claimed, MODEL)
         fast, out = posterior_cpu.update(fast, frame, anchors, claimed, MODEL)
         torch.testing.assert_close(fast, slow, rtol=rtol, atol=1e-12)
-        for name in ("depth", "variance", "calibration", "unseen", "outlier"):
+        for name in ("depth", "variance", "inlier", "calibration", "unseen", "outlier"):
             value, reference = getattr(out, name), getattr(expected, name)
             assert value.dtype == reference.dtype
             torch.testing.assert_close(value, reference, rtol=rtol, atol=0, equal_nan=True, msg=name)
@@ -196,7 +198,7 @@ def test_the_variance_is_the_second_moment_about_the_posterior_depth():
         other = rng.random(size) < p
         n = rng.normal(np.where(other, -offset, 0), np.where(other, MODEL.spread * 0.1, 0.3) ** 0.5)
         given = (np.array([x]) for x in (0.3, p, offset, 0.1))
-        variance = posterior_scene_cpu.second_moment(SimpleNamespace(config=MODEL), *given)
+        variance, _ = posterior_scene_cpu.second_moments(SimpleNamespace(config=MODEL), *given)
         assert variance == pytest.approx(((np.exp(n) - 1) ** 2).mean(), rel=0.03)
 
 
@@ -221,6 +223,7 @@ def test_the_probability_of_another_surface_grows_with_the_distance_from_evidenc
     p = out.outlier[0].mean(0)
     assert float(p[1]) == pytest.approx(MODEL.wrong, abs=2e-3)
     assert bool((p.diff()[4:50] > 0).all())
+    assert bool((out.inlier < out.variance).all())  # what another surface would add is in the latter alone
     assert float(p.max()) <= MODEL.wrong * (1 + MODEL.other)
 
 
@@ -268,6 +271,7 @@ def test_before_the_first_anchor_it_is_plain_ufm_star_to_the_bit():
         assert torch.equal(a.variance.nan_to_num(), b.variance.nan_to_num())
         assert bool(b.statistics.calibration.isnan())
         assert bool(b.posterior_outlier.isnan().all())
+        assert torch.equal(a.variance.nan_to_num(), b.posterior_inlier_variance.nan_to_num())
     with pytest.raises(ValueError, match="posterior needs"):
         a.posterior()
 

@@ -227,10 +227,10 @@ def row(**values: Any) -> Row:
 )
 def test_anchored_rows_are_a_line_that_goes_through_the_row_without_noise(anchored, name, values):
     lines = sweep_lines(anchored, "depth_only", name)
-    tracked = [line for line in lines if dict(line.rest) == {"anchors": "tracked"}]
+    tracked = [line for line in lines if dict(line.rest) == {"anchors": "corners"}]
     assert [point.value for point in tracked[0].points] == pytest.approx(values)
     (at_default,) = (point for point in tracked[0].points if point.value == default_value(name))
-    assert at_default.rows == (row(anchors="tracked"),)
+    assert at_default.rows == (row(anchors="corners"),)
     assert tracked[0].words == "anchored"
     # And no row of another line is among those of plain UfM*.
     (alone,) = (line for line in lines if line.method == STAR and not line.rest)
@@ -244,7 +244,7 @@ def test_numbers_of_anchors_begin_with_none(anchored):
     assert [point.value for point in lines["anchored"].points] == [0, 5, 20, MOST]
     # Plain UfM* where no row says 0; and a row that says nothing has as many as the tracker follows.
     assert lines["anchored"].points[0].rows == (Row(STAR),)
-    assert lines["anchored"].points[-1].rows == (row(anchors="tracked"),)
+    assert lines["anchored"].points[-1].rows == (row(anchors="corners"),)
     assert lines["truth anchors"].points[0].rows == (row(anchors="truth", anchor_count=0),)
     both = results_of([row(anchors="truth"), *(row(anchors="truth", anchor_count=n) for n in (0, 20))])
     assert [point.value for point in sweep_lines(both, "depth_only", "anchor_count")[0].points] == [0, 20, TRUTH_COUNT]

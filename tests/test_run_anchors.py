@@ -167,7 +167,7 @@ def test_a_stopped_run_goes_on_with_the_same_tracks(tour, finished, tmp_path, at
 
 def test_only_a_run_with_anchors_goes_on_with_anchors(tour, finished, tmp_path, monkeypatch):
     run(map_job(tour, OFF, frames=slice(2)), tmp_path / "out")
-    with pytest.raises(FolderError, match=r"other input: source.anchors was null, now .tracked"):
+    with pytest.raises(FolderError, match=r"other input: source.anchors was null, now .corners"):
         run(map_job(tour, frames=slice(2)), tmp_path / "out", resume=True)
     with monkeypatch.context() as patch:
         patch.setattr(TrackerConfig, "to_dict", lambda config: {**dataclasses.asdict(config), "window": 9})

@@ -164,8 +164,8 @@ def test_it_stops_between_frames_and_goes_on(sequence):
 def rows_with_memory():
     """UfM* with anchors that are tracked at drifting poses, and a row that leaves images out."""
     expected = [
-        row("UfM*-DepthOnly", anchors="tracked", rotation_drift=0.3, translation_drift=0.01, seed=2),
-        row("UfM*-DepthOnly", anchors="tracked", rotation_drift=0.3, translation_drift=0.01, seed=2, corrected=True),
+        row("UfM*-DepthOnly", anchors="corners", rotation_drift=0.3, translation_drift=0.01, seed=2),
+        row("UfM*-DepthOnly", anchors="corners", rotation_drift=0.3, translation_drift=0.01, seed=2, posterior=True),
         row("UfM*-DepthOnly", skip=1),
     ]
     anchors, source = anchor_sources(expected), networks(Brightness(1.0), Brightness(1.1))

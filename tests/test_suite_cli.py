@@ -10,18 +10,16 @@ import pytest
 from tiny_suite import TRUTH, Stub
 
 from ufmstar_torch.eval.bench import measure as measurement
-from ufmstar_torch.eval.commands import evaluate
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.methods.suite import names
-from ufmstar_torch.eval.suite import shards
+from ufmstar_torch.eval.suite.shards import warned_once
 
 
 @pytest.fixture
 def stubbed(monkeypatch):
     """The judge of sequences, replaced by one that draws figures; returns it."""
     stub = Stub()
-    own = evaluate.evaluate_suite
-    monkeypatch.setattr(evaluate, "evaluate_suite", lambda *given, **how: own(*given, evaluate=stub, **how))
+    monkeypatch.setattr("ufmstar_torch.eval.suite.evaluate.evaluate_sequence", stub)
     return stub
 
 
@@ -159,7 +157,7 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
 def test_a_warning_of_many_streams_is_logged_once(caplog):
     logger = logging.getLogger("ufmstar_torch")
     for _ in range(2):
-        with shards.warned_once():
+        with warned_once():
             for stream, text in ((0, "a frame has no segment"), (1, "a frame has no segment"), (1, "other")):
                 logger.warning("stream %d: %s", stream, text)
     assert caplog.messages == 2 * ["stream 0: a frame has no segment", "stream 1: other"]

@@ -10,17 +10,17 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import process_parts
 import pytest
 import torch
-from process_parts import at_work, in_parts
-from tiny_suite import NAMES, Stub, go, job_on, kept
+from tiny_suite import NAMES, TRUTH, Stub, go, job_on, kept
 from trainings import SPEC
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.run import machine
 from ufmstar_torch.eval.run.folder import FolderError
-from ufmstar_torch.eval.suite.shards import KILLED, evaluate_suite, rank_of
+from ufmstar_torch.eval.suite.shards import evaluate_suite, rank_of
 from ufmstar_torch.eval.suite.work_items import Shard
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
@@ -39,7 +39,7 @@ def whole(rooms, tmp_path):
 
 
 @pytest.mark.slow
-def test_one_process_and_two_give_the_same_bits(rooms, tmp_path, capfd):
+def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
     torch.manual_seed(3)
     save_trained(tmp_path / "net.safetensors", [build_network(SPEC) for _ in range(2)], SPEC)
     (tmp_path / "some.toml").write_text(
@@ -49,11 +49,11 @@ def test_one_process_and_two_give_the_same_bits(rooms, tmp_path, capfd):
     words = ["--suite", str(tmp_path / "some.toml"), "--network", f"ensemble=trained:{tmp_path / 'net.safetensors'}"]
     words += ["--root", f"rooms={rooms}", "--examples", "0", "--out"]
     one, two = (job_from(read([*words, str(tmp_path / name)])) for name in ("one", "two"))
-    outcome = evaluate_suite(two, shard=Shard(), processes=2, threads=1)
+    lines, shown = list[str](), []
+    outcome = evaluate_suite(two, processes=2, threads=1, report=lines.append, progress=shown.append)
     assert (outcome.finished, outcome.stopped, outcome.complete, dict(outcome.failed)) == (True, False, True, {})
-    assert sorted(line.partition(":")[0] for line in capfd.readouterr().err.splitlines() if "rooms/" in line) == [
-        f"rooms/{name}" for name in NAMES
-    ]
+    assert sorted(line.partition(":")[0] for line in lines) == [f"rooms/{name}" for name in NAMES]
+    assert [(now.stage, now.done, now.total) for now in shown] == [("sequences", done, 3) for done in (1, 2, 3)]
     before = torch.get_num_threads()
     try:
         evaluate_suite(one, shard=Shard(), threads=1)
@@ -70,23 +70,47 @@ def is_alive(number):
         return False
 
 
+def acting(folder, *acts):
+    """Words of an evaluation in two processes of sequences a, b, ... at which something happens."""
+    folder.mkdir()
+    roots = [folder / f"{name}.act" for name in "abcd"[: len(acts)]]
+    for root, act in zip(roots, acts, strict=True):
+        root.write_text(act)
+    (folder / "alone.toml").write_text('[[rows]]\nmethods = ["DepthOnly"]\n')
+    words = ["--suite", folder / "alone.toml", "--plugin", process_parts.__file__, "--network", TRUTH]
+    words += ["--root", *(f"d={root}" for root in roots), "--processes", 2, "--threads", 1, "--no-report"]
+    return [str(word) for word in (*words, "--out", folder / "out")]
+
+
+def at_work(folder):
+    """The numbers of the processes that have opened a sequence."""
+    return {int(path.suffix[1:]) for path in folder.glob("*.[0-9]*")}
+
+
+def in_two(words, stop=lambda: False):
+    """An evaluation in two processes: whether it finished, and its lines."""
+    lines: list[str] = []
+    return evaluate_suite(job_from(read(words)), processes=2, threads=1, stop=stop, report=lines.append).finished, lines
+
+
 @pytest.mark.slow
 def test_processes_end_in_good_order_by_a_stop_by_an_error_and_by_a_kill(tmp_path):
-    with pytest.raises(RuntimeError, match="OSError: disk full"):
-        in_parts(tmp_path / "b", "fail", "wait")
-    assert in_parts(tmp_path / "c", "kill", "wait") == (False, [KILLED])
-    begun = tmp_path / "d"
-    assert in_parts(begun, "wait", "wait", stop=lambda: len(at_work(begun)) == 2) == (False, [])
+    with pytest.raises(RuntimeError, match=r"d/c: TypeError: a mistake"):
+        in_two(acting(tmp_path / "a", "go", "wait", "fail"))
+    assert len(list(tmp_path.glob("a/out/records/*/*/DepthOnly.json"))) == 1, "finished records stay"
+    finished, lines = in_two(acting(tmp_path / "b", "go", "wait", "kill"))
+    assert (finished, lines[0].partition(":")[0]) == (False, "d/a")
+    assert lines[1:] == ["a process was killed (for want of memory?) at one of d/b, d/c, which ends the others too"]
+    words = acting(tmp_path / "c", "wait", "wait", "go")
+    assert in_two(words, stop=lambda: len(at_work(tmp_path / "c")) == 2) == (False, [])
     assert not any(is_alive(number) for folder in tmp_path.iterdir() for number in at_work(folder))
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="torch's processes learn of their parent's end on Linux")
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_processes_end_with_a_parent_that_is_killed(tmp_path):
-    code = f"from process_parts import *; in_parts(Path({str(tmp_path / 'a')!r}), 'wait', 'wait')"
-    parent = subprocess.Popen(
-        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    )
+    words = [sys.executable, "-P", "-m", "ufmstar_torch.cli", "eval", *acting(tmp_path / "a", "wait", "wait")]
+    parent = subprocess.Popen(words)
     try:
         while len(at_work(tmp_path / "a")) < 2:
             assert parent.poll() is None

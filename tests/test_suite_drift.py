@@ -161,15 +161,15 @@ def test_a_row_sees_drift_and_noise_on_top_of_it():
 
 def test_rows_of_one_drift_share_a_tracker_and_a_reference():
     alike = [
-        row(NAME, anchors="tracked", rotation_drift=0.1),
-        row(NAME, anchors="tracked", rotation_drift=0.1, corrected=True),
+        row(NAME, anchors="corners", rotation_drift=0.1),
+        row(NAME, anchors="corners", rotation_drift=0.1, posterior=True),
     ]
     others = [
-        row(NAME, anchors="tracked", **{name: 0.1, "seed": seed})
+        row(NAME, anchors="corners", **{name: 0.1, "seed": seed})
         for name in ("translation_drift", "rotation_noise")
         for seed in (0, 1)
     ]
-    alone = [row(NAME), row(NAME, anchors="tracked"), row(NAME, anchors="tracked", skip=1)]
+    alone = [row(NAME), row(NAME, anchors="corners"), row(NAME, anchors="corners", skip=1)]
     sources = anchor_sources([*alike, *others, *alone])
     assert alone[0] not in sources
     assert sources[alike[0]].tracks is sources[alike[1]].tracks

@@ -7,6 +7,7 @@ import json
 import shutil
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import torch
@@ -206,7 +207,8 @@ def go(job, evaluate=None, **how):
     """Evaluate in this process by a judge of one sequence (None: :class:`Stub`): (outcome, lines that were
     reported)."""
     lines: list[str] = []
-    outcome = evaluate_suite(job, **{"shard": ALL, **how}, report=lines.append, evaluate=evaluate or Stub())
+    with mock.patch("ufmstar_torch.eval.suite.evaluate.evaluate_sequence", evaluate or Stub()):
+        outcome = evaluate_suite(job, **{"shard": ALL, **how}, report=lines.append)
     return outcome, lines
 
 

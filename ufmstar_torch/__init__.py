@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.recalibrate import Recalibration as Recalibration
     from ufmstar_torch.ufmstar import UfMStar as UfMStar
 else:
-    __getattr__, __dir__ = lazy_names(__name__)
+    # The core takes networks that return a DepthPrediction; the networks' layer adds every other kind.
+    __getattr__, __dir__ = lazy_names(__name__, UncertainDepth="ufmstar_torch.models.uncertain_depth")
 
 __version__ = "0.1.0"
 __all__ = [

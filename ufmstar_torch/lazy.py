@@ -19,11 +19,12 @@ from typing import Any
 from ufmstar_torch.optional import naming_extra
 
 
-def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def lazy_names(package: str, **completed: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """``__getattr__`` and ``__dir__`` of a package for the names imported under ``if TYPE_CHECKING:`` in it.
 
     Args:
         package: the package's ``__name__``. Its source is parsed when the first name is looked up.
+        completed: names whose class another module completes: that module. Type checkers read the listed class.
     """
 
     @cache
@@ -41,6 +42,7 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
         if name.startswith("__") or name not in origins():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module, original = origins()[name]
+        module = completed.get(name, module)
         try:
             return getattr(import_module(module), original)
         except ModuleNotFoundError as error:

@@ -7,7 +7,7 @@ stochastic network, or by a single one; or, for comparison, by all of them at on
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -77,23 +77,28 @@ class NetworksInTurn(nn.Module):
         """One inference of member ``n``, or sample ``n`` of a single network, on what :meth:`prepare` returned.
 
         Raises:
-            TypeError: the network takes no uint8, or returns something else than a :class:`DepthPrediction`.
+            TypeError: the network takes no uint8, or as :meth:`as_prediction`.
         """
         try:
-            prediction = infer(self.networks[n % len(self.networks)], x, intrinsics)
+            result = infer(self.networks[n % len(self.networks)], x, intrinsics)
         except RuntimeError as error:
             if x.is_floating_point():
                 raise
+            raise TypeError(f"network {n} does not take an image of {x.dtype}: give floats in [0, 1]") from error
+        return self.as_prediction(result, x)
+
+    def as_prediction(self, result: Any, x: Tensor) -> DepthPrediction:
+        """What a network returned for ``x`` [B, 3, H, W]; a class that knows more networks can accept more.
+
+        Raises:
+            TypeError: it is no :class:`DepthPrediction`.
+        """
+        if not isinstance(result, DepthPrediction):
             raise TypeError(
-                f"network {n} does not take an image of {x.dtype}: give floats, or UncertainDepth(network, "
-                "preprocess=network.preprocess) with network = ufmstar_torch.models.wrap_network(network)"
-            ) from error
-        if not isinstance(prediction, DepthPrediction):
-            raise TypeError(
-                f"network {n} must return a DepthPrediction, got {type(prediction).__name__}: wrap it with "
+                f"a network must return a DepthPrediction, got {type(result).__name__}: wrap it with "
                 "ufmstar_torch.models.wrap_network(network), which declares what its output means"
             )
-        return prediction
+        return result
 
     def every(self, x: Tensor, intrinsics: Tensor) -> DepthPrediction:
         """All members, or samples, on what :meth:`prepare` returned, combined (:func:`combine`)."""
@@ -118,10 +123,27 @@ def modules_of(networks: object) -> list[nn.Module]:
         raise ValueError("networks must hold at least one network")
     if wrong := [member for member in members if not isinstance(member, nn.Module)]:
         raise TypeError(
-            f"networks must be an nn.Module or a sequence of them, got a {type(wrong[0]).__name__}"
-            + ("; wrap a function with ufmstar_torch.models.wrap_network(function)" if callable(wrong[0]) else "")
+            f"networks must be an nn.Module or a sequence of them, got a {type(wrong[0]).__name__}; wrap another "
+            "kind with ufmstar_torch.models.wrap_network(network)"
         )
     return [member for member in members if isinstance(member, nn.Module)]
+
+
+def own_preprocess(networks: Sequence[nn.Module]) -> Preprocess:
+    """The networks' attribute ``preprocess``, or :func:`in_unit_range` where none has one.
+
+    Raises:
+        ValueError: they have different ones.
+    """
+    stated = [own for network in networks if callable(own := getattr(network, "preprocess", None))]
+    if any(other != stated[0] for other in stated):
+        raise ValueError(f"networks must have the same preprocess, or UncertainDepth be given one, got {stated}")
+    return stated[0] if stated else in_unit_range
+
+
+def in_unit_range(image: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+    """Bytes as floats in [0, 1]; other images and the intrinsics as they are."""
+    return (image.to(torch.get_default_dtype()) / 255 if image.dtype == torch.uint8 else image), intrinsics
 
 
 def combine(predictions: Sequence[DepthPrediction]) -> DepthPrediction:

@@ -123,8 +123,10 @@ class UfMStarOutput:
             ``config.anchors``.
         bias: the relative error r = g/d - 1 that anchors lead to expect; None unless ``config.anchors``.
         posterior_depth, posterior_variance: what :meth:`posterior` returns; None unless ``config.posterior``.
-        posterior_outlier: probability that the pixel lies on another surface than the anchors that corrected it; its
-            variance is counted in ``posterior_variance``. NaN before any anchor; None likewise.
+        posterior_outlier: probability p that the pixel lies on another surface than the anchors that corrected it. NaN
+            before any anchor; None likewise.
+        posterior_inlier_variance: V_1 [m^2], the variance if it does not. ``posterior_variance`` V contains both: where
+            it does, the variance is (V - (1 - p) V_1)/p.
         features: regressed further entries of H, [B, H, W, F], in the caller's units.
         measured: share in [0, 1] of M that rests on surfaces seen from two views or more; below one half the pixel
             counts as not measured (``config.unmeasured``). NaN where not valid.
@@ -150,6 +152,7 @@ class UfMStarOutput:
     posterior_depth: Tensor | None = None
     posterior_variance: Tensor | None = None
     posterior_outlier: Tensor | None = None
+    posterior_inlier_variance: Tensor | None = None
 
     def __repr__(self) -> str:
         """Shape, median standard deviation and counts in a line."""
@@ -178,19 +181,6 @@ class UfMStarOutput:
         if self.posterior_depth is None or self.posterior_variance is None:
             raise ValueError("posterior needs UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())")
         return self.posterior_depth, self.posterior_variance
-
-    def corrected(self) -> tuple[Tensor, Tensor]:
-        """Depth without the bias that anchors found, d (1 + r) [m], and the variance that remains [m^2].
-
-        From E[(x - r)^2] = E[x^2] - r^2: the bias's square leaves B, of which no less than 0 remains.
-
-        Raises:
-            ValueError: without ``config.anchors`` nothing is known of a bias.
-        """
-        if self.anchored is None or self.bias is None:
-            raise ValueError("corrected needs anchors: UfMStarConfig(anchors=AnchorConfig())")
-        remaining = (self.anchored - (self.depth * self.bias).square()).clamp_min(0)
-        return self.depth * (1 + self.bias), self.variance - self.anchored + remaining
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,11 @@ from ufmstar_torch.anchors.anchors import Anchors, require_anchors
 from ufmstar_torch.anchors.streams import Given, StreamLandmarks
 from ufmstar_torch.arguments import Array, CameraLike, ImageLike, as_image, as_intrinsics, as_pose, as_tensor
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
-from ufmstar_torch.networks_in_turn import NetworksInTurn, Preprocess, modules_of
+from ufmstar_torch.networks_in_turn import NetworksInTurn, Preprocess, in_unit_range, modules_of, own_preprocess
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty, UfMStarOutput
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.recalibrate import CONFIDENCE, Recalibration
 from ufmstar_torch.stateful import outliving
-from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.ufmstar import UfMStar
 
 
@@ -88,7 +87,8 @@ class UncertainDepth(NetworksInTurn):
         networks: one network or a sequence of them (an ensemble's members; BatchEnsemble members as
             separate callables); None: predictions are given to :meth:`update`. Each maps an image [B, 3, H, W] to a
             :class:`DepthPrediction`; one with an attribute ``takes_intrinsics = True`` is called as
-            ``network(x, K)`` with K [B, 3, 3] [px] of ``x``.
+            ``network(x, K)`` with K [B, 3, 3] [px] of ``x``. ``ufmstar_torch.UncertainDepth`` takes everything that
+            ``ufmstar_torch.models.wrap_network`` takes without further declarations: metric depth is assumed.
         config: of UfM*; where ``segment.max_depth`` is None, it becomes the networks' (:attr:`max_depth`).
         mode: "alternate" runs member n = i mod N (counted from 0) on image i; with one network this is the
             single-model mode, and with ``samples`` it is the sampling-based mode. "full" runs every member
@@ -99,7 +99,8 @@ class UncertainDepth(NetworksInTurn):
             with every image, set the two sections instead.
         samples: number of stochastic passes per image in mode "full" with one network (MC-Dropout; the
             network must sample by itself in eval mode). None: the network is deterministic.
-        preprocess: maps image and intrinsics to the network's input; None passes both through.
+        preprocess: maps image and intrinsics to the networks' input. "own": the networks' attribute ``preprocess``;
+            for networks without one, bytes become floats in [0, 1]. None passes both through.
         anchors: what yields the anchors of every image, with ``config.anchors``: "corners" (tracked in the image),
             "dense" (searched in earlier images), a file of landmarks, or a
             :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a list with one for
@@ -112,8 +113,9 @@ class UncertainDepth(NetworksInTurn):
     to sample in eval mode, as decoder dropout at test time does.
 
     Raises:
-        TypeError: something that is no ``nn.Module``: a function needs ``ufmstar_torch.models.wrap_network``.
-        ValueError: no network, an unknown mode, ``samples`` that fit neither, or anchors without ``config.anchors``.
+        TypeError: something that is no network.
+        ValueError: no network, networks whose own ``preprocess`` differs, an unknown mode, ``samples`` that fit
+            neither, or anchors without ``config.anchors``.
 
     Example::
 
@@ -127,25 +129,26 @@ class UncertainDepth(NetworksInTurn):
 
     def __init__(
         self,
-        networks: nn.Module | Sequence[nn.Module] | None,
+        networks: Callable[..., Any] | Sequence[Callable[..., Any]] | None,
         config: UfMStarConfig | None = None,
         *,
         mode: Literal["alternate", "full"] = "alternate",
         posterior: bool = False,
         samples: int | None = None,
-        preprocess: Preprocess | None = None,
+        preprocess: Preprocess | Literal["own"] | None = "own",
         anchors: Given | list[Given] | tuple[Given, ...] | None = None,
         recalibration: Recalibration | None = None,
         multiview_device: torch.device | str | None = None,
     ) -> None:
-        single = networks is not None and len(modules_of(networks)) == 1
+        members, preprocess = ([], None) if networks is None else self.accepted(networks, preprocess)
+        single = len(members) == 1
         if mode not in ("alternate", "full"):
             raise ValueError(f"mode must be 'alternate' or 'full', got {mode!r}")
         if samples is not None and (samples < 2 or not single or mode != "full"):
             raise ValueError("samples must be at least 2 and goes with one network in mode 'full'")
         if mode == "full" and single and samples is None:
             raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
-        super().__init__(networks, samples=samples, preprocess=preprocess)
+        super().__init__(members or None, samples=samples, preprocess=preprocess)
         config = config or UfMStarConfig()
         if posterior:
             sections = config.anchors or AnchorConfig(), config.posterior or PosteriorConfig()
@@ -161,7 +164,17 @@ class UncertainDepth(NetworksInTurn):
         self.multiview_device = None if multiview_device is None else torch.device(multiview_device)
         self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
         self._next = 0
-        self._warned = False
+
+    def accepted(
+        self, networks: object, preprocess: Preprocess | Literal["own"] | None
+    ) -> tuple[list[nn.Module], Preprocess | None]:
+        """The networks as modules, and what makes their input; a class that knows more networks can accept more.
+
+        Raises:
+            TypeError, ValueError: as the class has them.
+        """
+        members = modules_of(networks)
+        return members, own_preprocess(members) if preprocess == "own" else preprocess
 
     def forward(
         self,
@@ -312,7 +325,7 @@ class UncertainDepth(NetworksInTurn):
             skip = config.on_bad_frame == "skip"
             anchors = self.landmarks.update(predicted.image, predicted.pose, K, config.rotation_tolerance, skip=skip)
         try:
-            moved = anchors is not None and self.preprocess is not None
+            moved = anchors is not None and self.preprocess not in (None, in_unit_range)
             yield require_anchors(anchors).moved(K, predicted.map_intrinsics) if moved else anchors
         except BaseException:
             if self.landmarks is not None:
@@ -342,7 +355,6 @@ class UncertainDepth(NetworksInTurn):
         member = None if self.mode == "full" else self.turn(self._next + ahead)
         with torch.no_grad():
             x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
-            self._warn_of_size(x)
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
         H = None if features is None else as_tensor("features", features)
         own = (prediction.aleatoric_variance, prediction.epistemic_variance, prediction.confidence)
@@ -350,19 +362,6 @@ class UncertainDepth(NetworksInTurn):
         assert depth is not None
         assert K_there is not None
         return _Predicted(picture, T, K_image, DepthPrediction(depth, *maps), K_there, member, H, ready)
-
-    def _warn_of_size(self, x: Tensor) -> None:
-        """Name a network that states the size of its input and gets another one, as where ``preprocess`` was
-        forgotten; once."""
-        if self._warned or self.preprocess is not None:
-            return
-        sizes = {getattr(getattr(network, "preprocess", None), "size", None) for network in self.networks}
-        if not sizes & {None, tuple(x.shape[-2:])}:
-            self._warned = True
-            LOGGER.warning(
-                "the network states an input of %s px and gets %s: UncertainDepth(..., preprocess=network.preprocess) "
-                "resizes and normalises images (said once)", " or ".join(map(str, sizes)), tuple(x.shape[-2:]),
-            )  # fmt: skip
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """The networks move; UfM* stays on its own device, if it has one."""

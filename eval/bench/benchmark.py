@@ -112,7 +112,7 @@ def _rows(base: str, backends: tuple[str, ...]) -> list[tuple[str, Setting]]:
     rows = [(f"UfM-{alone}-100K", Setting())]
     for backend in backends:
         of = {} if backend == "auto" else {"backend": backend}
-        kinds: tuple[dict[str, Any], ...] = ({}, {"anchors": "tracked"}, {"anchors": "dense", "posterior": True})
+        kinds: tuple[dict[str, Any], ...] = ({}, {"anchors": "corners"}, {"anchors": "dense", "posterior": True})
         rows += [(f"UfM*-{alone}", Setting(overrides=of, **kind)) for kind in kinds]
     return rows
 

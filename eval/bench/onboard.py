@@ -87,9 +87,9 @@ def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: R
     sequence = in_memory(part, lambda done: progress(Progress("rooms", done, _WALKED)))
     config, cpu = UfMStarConfig(on_bad_frame="skip"), torch.device("cpu")
     warm_up_command(config, cpu, progress)
-    model = UncertainDepth(network, config, preprocess=network.preprocess)
+    model = UncertainDepth(network, config)
     summary = {"network": about, "realtime": _live(model, sequence, seconds, progress), "load_average": load_average()}
-    contrasts = _contrasts(UncertainDepth(network, config, preprocess=network.preprocess), sequence)
+    contrasts = _contrasts(UncertainDepth(network, config), sequence)
     if contrasts:
         summary["contrast"] = contrast_figures(contrasts)
         draw_contrasts(out / PICTURE, contrasts)

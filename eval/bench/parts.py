@@ -30,7 +30,7 @@ from ufmstar_torch.prediction import DepthPrediction
 
 MULTIVIEW = "multiview"
 # ``Setting.anchors`` that are measured: the name of their source of landmarks.
-ANCHORS = {"": None, "tracked": "corners", "dense": "dense"}
+ANCHORS = {"": None, "corners": "corners", "dense": "dense"}
 Part = tuple[str, str]  # the owner of a part, a base or a row by its label, and the part
 
 

@@ -10,6 +10,7 @@ intrinsics of another size, a late trajectory) and names what fits.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,7 +48,6 @@ class SequenceCheck:
     best_error: float  # and the error with both
     registration: DepthImageFit | None  # how depth lies on the image, None where it was not checked
     images: ImageFit | None  # how poses and intrinsics fit the images, None where no corner could be followed
-    unreadable: tuple[str, ...]  # files that could not be decoded
     problems: tuple[str, ...]
     undecided: tuple[str, ...]  # what this sequence leaves open
 
@@ -57,8 +57,7 @@ class SequenceCheck:
         return not self.problems
 
 
-@dataclass(frozen=True, eq=False)
-class _Pair:
+class _Pair(NamedTuple):
     """Points of one frame [3, N] and the frame in which they are looked up."""
 
     points: np.ndarray
@@ -77,16 +76,12 @@ def check_sequence(sequence: FrameSequence, pairs: int = 8) -> SequenceCheck:
         raise ValueError(f"pairs must be at least 1, got {pairs}")
     check = _Check(sequence)
     figures, images, registration = check.geometry(pairs), check.images(), check.registration()
-    unreadable = tuple(dict.fromkeys(check.unreadable))
-    return SequenceCheck(*figures, registration, images, unreadable, tuple(check.problems), tuple(check.undecided))
+    return SequenceCheck(*figures, registration, images, tuple(check.problems), tuple(check.undecided))
 
 
 def warp_error(pair: _Pair, poses: str, scale: float) -> float:
-    """Median |log(z warped / depth there)| of a pair; inf where too few points land on valid depth.
-
-    Depth times ``scale`` with poses is the same as depth with positions divided by ``scale``, which leaves
-    the comparison in the unit of the files.
-    """
+    """Median |log(z warped / depth there)| of a pair; inf where too few points land on valid depth. Depth times
+    ``scale`` is the same as positions divided by ``scale``, which leaves the comparison in the unit of the files."""
     convert = CONVENTIONS[poses].convert
     T_b_a = np.linalg.inv(convert(pair.T_world_b)) @ convert(pair.T_world_a)
     x, y, z = T_b_a[:3, :3] @ pair.points + T_b_a[:3, 3:] / scale
@@ -105,11 +100,10 @@ def warp_error(pair: _Pair, poses: str, scale: float) -> float:
 
 
 class _Check:
-    """A check in progress: files that could not be decoded, problems and undecided questions so far."""
+    """A check in progress: problems and undecided questions so far."""
 
     def __init__(self, sequence: FrameSequence) -> None:
         self.sequence = sequence
-        self.unreadable: list[str] = []
         self.problems: list[str] = []
         self.undecided: list[str] = []
 
@@ -173,11 +167,10 @@ class _Check:
         return fit
 
     def _read(self, index: int) -> tuple[Frame, np.ndarray] | None:
-        """A frame and its depth, if it has any; one that cannot be decoded is noted."""
+        """A frame and its depth, if it has any and can be decoded."""
         try:
             frame = self.sequence[index]
-        except FrameError as error:
-            self.unreadable.append(str(error))
+        except FrameError:  # counted by ``data_check``
             return None
         return None if frame.depth is None or not (frame.depth > 0).any() else (frame, frame.depth)
 

@@ -14,11 +14,13 @@ import numpy as np
 from ufmstar_torch.eval.check.check import SequenceCheck, check_sequence
 from ufmstar_torch.eval.check.image_fit import GIVEN
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.poses import OURS
 
-_SAMPLED = 12  # frames whose depth is looked at for its range
-_DECODED = 500  # frames that are read to see that they can be; of more, as many evenly spaced ones: seconds
+# Frames that are read to see that they can be; of more, as many evenly spaced ones: seconds.
+_DECODED, _RENDERED = 500, 12
+_SAMPLED = 4096  # pixels of each of them, for the range of depth
 _QUANTILES = (0.01, 0.99)
 # Scales that are customary [m per unit]; one within the check's own tolerance of the measured one is meant.
 _CUSTOMARY = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5, 1 / 5000, 1 / 256, 1 / 4000, 1 / 1024)
@@ -79,7 +81,23 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
         sequence = open_sequence(path, **options)
     except (FrameError, FileNotFoundError, ImportError, ValueError) as error:
         return DataReport(name or Path(path).name, str(path), problems=(f"cannot be opened: {error}",))
+    problems: list[str] = []
+    remedies: list[str] = []
+    if len(sequence) < _FEW * len(sequence.names_on_disk):
+        problems.append(f"only {len(sequence)} of {len(sequence.names_on_disk)} frames are usable")
+        remedies.append("see why frames are skipped above; if it is poses: --time-offset, --fps, --max-pose-gap")
+    read, broken, depths = _read_frames(sequence)
+    if broken:
+        problems.append(f"{len(broken)} of the {read} frames read cannot be decoded, first {broken[0]}")
+        remedies.append("they are skipped and counted when the sequence is used; copy them again if it is many")
+    outcome = check_sequence(sequence, pairs)
+    checked = {**asdict(outcome), "read": read, "unreadable": broken}
+    del checked["problems"], checked["undecided"]
+    if outcome.images is not None:
+        checked["images"]["words"] = outcome.images.words
     positions = np.array([entry.T_world_cam[:3, 3] for entry in sequence.entries])
+    K_depth = sequence.depth_intrinsics
+    valid = depths[depths > 0]
     return DataReport(
         name=name or sequence.name,
         path=str(path),
@@ -92,34 +110,15 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
         walked=float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
         image_size=sequence.image_size,
         depth_size=sequence.depth_size,
-        intrinsics=_pinhole(sequence.intrinsics),
-        depth_intrinsics=None if sequence.depth_intrinsics is None else _pinhole(sequence.depth_intrinsics),
-        **_depth_statistics(sequence),
-        **_verdict(sequence, path, pairs, options),
+        intrinsics=pinhole_values(sequence.intrinsics),
+        depth_intrinsics=None if K_depth is None else pinhole_values(K_depth),
+        depth_range=tuple(np.quantile(valid, _QUANTILES).tolist()) if valid.size else None,
+        filled=valid.size / max(depths.size, 1),
+        checked=checked,
+        problems=(*problems, *outcome.problems),
+        remedies=(*remedies, *_remedies(outcome, sequence, path, options)),
+        undecided=outcome.undecided,
     )
-
-
-def _verdict(sequence: FrameSequence, path: str | Path, pairs: int, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The last four fields of the report."""
-    problems: list[str] = []
-    remedies: list[str] = []
-    if len(sequence) < _FEW * len(sequence.names_on_disk):
-        problems.append(f"only {len(sequence)} of {len(sequence.names_on_disk)} frames are usable")
-        remedies.append("see why frames are skipped above; if it is poses: --time-offset, --fps, --max-pose-gap")
-    outcome = check_sequence(sequence, pairs)
-    read, broken = _read_frames(sequence)
-    if broken:
-        problems.append(f"{len(broken)} of the {read} frames read cannot be decoded, first {broken[0]}")
-        remedies.append("they are skipped and counted when the sequence is used; copy them again if it is many")
-    problems += outcome.problems
-    remedies += _remedies(outcome, sequence, path, options)
-    figures = ("pairs", "gap", "error", "poses", "scale", "best_error", "registration", "images")
-    checked = {name: value for name, value in asdict(outcome).items() if name in figures}
-    checked |= {"read": read, "unreadable": broken}
-    if outcome.images is not None:
-        checked["images"]["words"] = outcome.images.words
-    words = {"problems": tuple(problems), "remedies": tuple(remedies), "undecided": outcome.undecided}
-    return {"checked": checked, **words}
 
 
 def _remedies(check: SequenceCheck, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
@@ -192,42 +191,21 @@ def _metres_per_unit(sequence: FrameSequence, path: str | Path, options: Mapping
     return None
 
 
-def _read_frames(sequence: FrameSequence) -> tuple[int, list[str]]:
-    """Read frames; the number of them and the errors of the unreadable ones. Rendered frames are not read."""
-    if sequence.layout == "tour":
-        return 0, []
-    chosen = np.unique(np.linspace(0, len(sequence) - 1, min(_DECODED, len(sequence))).astype(int))
-    broken = []
+def _read_frames(sequence: FrameSequence) -> tuple[int, list[str], np.ndarray]:
+    """The number of frames read, the errors of those that cannot be decoded, and evenly spaced depths [m] of the others
+    (0 = invalid). Rendered frames do not count."""
+    rendered = sequence.layout == "tour"
+    most = min(_RENDERED if rendered else _DECODED, len(sequence))
+    broken, depths = [], [np.zeros(0, np.float32)]
+    chosen = np.unique(np.linspace(0, len(sequence) - 1, most).astype(int)).tolist()
     for index in chosen:
         try:
-            sequence[int(index)]
+            depth = sequence[index].depth
         except FrameError as error:
             broken.append(str(error))
-    return len(chosen), broken
-
-
-def _depth_statistics(sequence: FrameSequence) -> dict[str, Any]:
-    """Quantiles of depth [m] and the share of valid pixels, over evenly spaced frames; {} without any."""
-    with_depth = [entry for entry in sequence.entries if entry.load_depth is not None]
-    values, pixels = [], 0
-    for i in np.unique(np.linspace(0, len(with_depth) - 1, min(_SAMPLED, len(with_depth))).astype(int)):
-        load = with_depth[i].load_depth
-        try:
-            depth = None if load is None else load()
-        except FrameError:  # counted by the check
-            continue
-        if depth is not None:
-            values.append(depth[depth > 0])
-            pixels += depth.size
-    depths = np.concatenate(values) if values else np.zeros(0)
-    if depths.size == 0:
-        return {}
-    low_high = tuple(float(q) for q in np.quantile(depths, _QUANTILES))
-    return {"depth_range": low_high, "filled": depths.size / pixels}
-
-
-def _pinhole(K: np.ndarray) -> tuple[float, ...]:
-    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+        else:
+            depths += [] if depth is None else [depth.ravel()[:: max(1, depth.size // _SAMPLED)]]
+    return 0 if rendered else len(chosen), broken, np.concatenate(depths)
 
 
 # ---- in words: a page for one sequence, a line each for several ----

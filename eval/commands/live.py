@@ -214,7 +214,6 @@ def _model(options: LiveOptions) -> UncertainDepth:
         mode="full" if chosen.mode == "full" else "alternate",
         posterior=options.uncertainty.posterior,
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
-        preprocess=source.networks[0].preprocess,
         anchors=None if anchors is False else landmarks_of(anchors, None),
         recalibration=recalibration_of(as_dict(options.uncertainty) | as_dict(chosen), config, source),
     ).to(options.device)

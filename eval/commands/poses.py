@@ -118,11 +118,11 @@ def _images(options: PosesOptions) -> tuple[list[Any], tuple[int, int]]:
     path = Path(options.source)
     if not path.exists():
         raise FileNotFoundError(f"no such file or folder: {path}")
-    own = Options(images=options.images, fps=options.fps, time_offset=options.time_offset)
-    entries, size, times = open_images(path, own)
-    if times is not None:
-        entries = [replace(e, timestamp=float(time)) for e, time in zip(entries, times, strict=True)]
-    entries = entries[parse_slice(options.frames)]
+    entries, size = open_images(path, Options(images=options.images, fps=options.fps))
+    entries = [
+        entry if entry.timestamp is None else replace(entry, timestamp=entry.timestamp + options.time_offset)
+        for entry in entries[parse_slice(options.frames)]
+    ]
     if not entries or size is None:
         raise ValueError(f"{path}: no image that can be read")
     return entries, size
@@ -148,7 +148,7 @@ def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]
             write_atomic(out / "rgb.txt", lambda file: file.write(lines.encode()))
         K, threads = None if lens is None else lens.K, options.threads or available_cores()
         models = reconstruct(out, names, K, threads=threads, say=bars.say)
-    opening = Options(fps=options.fps, time_offset=options.time_offset, max_pose_gap=options.max_pose_gap)
+    opening = Options(fps=options.fps, max_pose_gap=options.max_pose_gap)
     scale = scale_model(models[0], images, length=options.known_length, trajectory=trajectory, options=opening)
     for number, model in enumerate(models):
         (out / "sparse" / str(number)).mkdir()

@@ -21,7 +21,7 @@ from ufmstar_torch.anchors.tracker import Landmarks, TrackerConfig
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import TRACKED, TRUTH, Setting
+from ufmstar_torch.eval.methods.setting import TRUTH, Setting
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.sequences.options import resolve
@@ -135,10 +135,10 @@ class AnchorSource:
 
 
 def landmarks_of(value: str | bool, folder: Path | None, scale: float = 1.0) -> LandmarkSource:
-    """The source of landmarks of a sequence; True and "tracked" mean corners, other values are as ``landmark_source``
-    takes them. A file lies in the sequence's folder or the working folder; its lengths are in the unit of the poses, of
-    ``scale`` metres. Raises FileNotFoundError, ValueError, as ``landmark_source``."""
-    word = CORNERS if value in (True, TRACKED) else str(value)
+    """The source of landmarks of a sequence; True means corners, other values are as ``landmark_source`` takes them. A
+    file lies in the sequence's folder or the working folder; its lengths are in the unit of the poses, of ``scale``
+    metres. Raises FileNotFoundError, ValueError, as ``landmark_source``."""
+    word = CORNERS if value is True else str(value)
     is_file = Path(word).suffix.lower() in FILE_TYPES
     source = landmark_source(resolve(folder or Path(), word) if is_file else word)
     if isinstance(source, LandmarkMap) and scale != 1:
@@ -148,7 +148,7 @@ def landmarks_of(value: str | bool, folder: Path | None, scale: float = 1.0) -> 
 
 def landmark_digests(rows: Iterable[Row], folder: Path | None, scale: float = 1.0) -> dict[str, str]:
     """Digests of the landmarks of rows that have them from a file, by slug. Errors as :func:`landmarks_of`."""
-    files = {row.slug: row.setting.anchors for row in rows if row.setting.anchors not in ("", TRACKED, DENSE, TRUTH)}
+    files = {row.slug: row.setting.anchors for row in rows if row.setting.anchors not in ("", CORNERS, DENSE, TRUTH)}
     identities = {file: landmarks_of(file, folder, scale).identity for file in set(files.values())}
     return {slug: identities[file]["landmarks"] for slug, file in files.items() if "landmarks" in identities[file]}
 

@@ -27,7 +27,7 @@ from ufmstar_torch.recalibrate import Recalibration
 Answer = dict[str, Any]
 _OF_OUTPUT = (
     "depth", "variance", "valid", "aleatoric", "epistemic", "disagreement", "measured", "anchored", "bias",
-    "posterior_depth", "posterior_variance", "statistics",
+    "posterior_depth", "posterior_variance", "posterior_inlier_variance", "posterior_outlier", "statistics",
 )  # fmt: skip
 
 
@@ -142,7 +142,7 @@ class Pointwise(Estimator):
 
 
 class Gaussians(Estimator):
-    """UfM*; ``setting`` is the row's: whether it answers with the corrected depth or the posterior."""
+    """UfM*; ``setting`` is the row's: whether it answers with the posterior."""
 
     def __init__(
         self,
@@ -165,8 +165,6 @@ class Gaussians(Estimator):
         answer = {name: getattr(out, name) for name in _OF_OUTPUT} | {"confidence": used.confidence}
         if self._setting.posterior:
             answer["depth"], answer["variance"] = out.posterior()
-        elif self._setting.corrected:
-            answer["depth"], answer["variance"] = out.corrected()
         return answer
 
     def mixture_world(self) -> GaussianMixture:

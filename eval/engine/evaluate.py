@@ -25,7 +25,7 @@ from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import TRACKED
+from ufmstar_torch.eval.methods.setting import CORNERS
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.plugins import Plugins
 from ufmstar_torch.frame import FRAME_FAULTS, check_frame
@@ -86,7 +86,7 @@ def evaluate_sequence(
         runners.append(RowRunner(row.slug, source, estimator, anchors=anchors.get(row), **how))
         named = {other.slug: other.method.name for other in references(row, rows)}
         judges.append(RowJudge(row, named, judge.bins, judge.plugins.metrics))
-    tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)
+    tracked = any(row.setting.anchors in (CORNERS, DENSE) for row in rows)
     check = partial(_check_frame, sources=sources.values(), tracked=tracked)
     stream = FrameStream(sequence, indices, runners, store=judge.store, device=judge.device, check=check)
     stream.drive([*judges, *sinks, ProgressSink(progress)], stop=stop)

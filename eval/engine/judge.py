@@ -85,7 +85,8 @@ class RunMetrics(FrameSink):
         if row.posterior_depth is not None:
             maps[POSTERIOR] = row.posterior_depth, row.posterior_variance
         for name, (depth, variance) in maps.items():
-            metrics_of(self._metrics, name, own=self._own).update(depth, variance, target, row.valid)
+            mixture = row.mixture if name == POSTERIOR else None
+            metrics_of(self._metrics, name, own=self._own).update(depth, variance, target, row.valid, mixture)
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,8 @@ class RowJudge(FrameSink):
             torch.where(result.valid, result.depth, torch.nan), result.variance, torch.from_numpy(result.truth)
         )  # fmt: skip
         how = {"with_variance": variance is not None, "bins": self._bins, "own": self._own}
-        metrics_of(self._metrics, METRICS, **how).update(depth, variance, target)
+        mixture = result.mixture if self.row.setting.posterior else None
+        metrics_of(self._metrics, METRICS, **how).update(depth, variance, target, mixture=mixture)
         if variance is None:
             return
         if result.confidence is not None:

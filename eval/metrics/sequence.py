@@ -13,6 +13,7 @@ from ufmstar_torch.eval.metrics.accuracy import RMSE, AbsRel, Delta1
 from ufmstar_torch.eval.metrics.base import SumMetric, flat_pixels
 from ufmstar_torch.eval.metrics.calibration import ECEDelta, ECEQuantile
 from ufmstar_torch.eval.metrics.likelihood import NLL, EntropyHistogram
+from ufmstar_torch.eval.metrics.mixture import Mixture
 from ufmstar_torch.eval.metrics.ranking import Sparsification, SpearmanCorrelation
 
 OURS, AUTHORS = "ours", "authors"
@@ -48,14 +49,17 @@ class SequenceMetrics(nn.Module):
         self.with_variance = with_variance
         kinds: list[type[SumMetric]] = [Delta1, AbsRel, RMSE]
         if with_variance:
-            kinds += [NLL, ECEDelta, ECEQuantile, EntropyHistogram, Sparsification, SpearmanCorrelation]
+            kinds += [NLL, ECEDelta, ECEQuantile, EntropyHistogram, Sparsification, SpearmanCorrelation, Mixture]
         finer = _AUTHORS if bins == AUTHORS else {}
         made = {kind.__name__: kind(**finer.get(kind, {}), sync_on_compute=False) for kind in kinds}
         usable = {name: kind for name, kind in own.items() if with_variance or not kind.OF_VARIANCE}
         made |= {f"{_OWN}{name}": kind(sync_on_compute=False) for name, kind in usable.items()}
         self.metrics = nn.ModuleDict(made)
 
-    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
+    def update(
+        self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None,
+        mixture: tuple[Tensor, Tensor] | None = None,
+    ) -> None:  # fmt: skip
         """Add one or more frames.
 
         Args:
@@ -63,6 +67,7 @@ class SequenceMetrics(nn.Module):
             variance: [...] predicted variance [m^2]; None only if made with ``with_variance=False``.
             target: [...] ground truth [m]; NaN or <= 0 means there is none.
             valid: [...] bool, True = use.
+            mixture: of a posterior (``Mixture``), the inliers' variance and the probability of an outlier, [...] each.
 
         All figures but the entropy are of the pixels with ground truth.
 
@@ -71,7 +76,10 @@ class SequenceMetrics(nn.Module):
         """
         pixels = flat_pixels(depth, variance, target, valid)
         for metric in self._all():
-            metric.add(pixels)
+            if not isinstance(metric, Mixture):
+                metric.add(pixels)
+            elif mixture is not None and variance is not None:
+                metric.add_mixture(depth, variance, target if valid is None else target.where(valid, 0), *mixture)
 
     def compute(self) -> dict[str, float]:
         """The scalar figures by name: delta1, delta1_ratio, abs_rel, rmse [m], nll, ece_delta, ece_q, ...

@@ -134,9 +134,7 @@ def scale_model(
         return {"scale_from": "length", "metres_per_unit": metres}
     if trajectory is None:
         return {"scale_from": None}
-    stamps = [entry.timestamp for entry in images]
-    times = None if None in stamps else np.array(stamps, dtype=np.float64)
-    known = attach(images, times, trajectory, options or Options())
+    known = attach(images, trajectory, options or Options())
     position = {
         f.name: f.T_world_cam[:3, 3] for f in known if isinstance(f, Entry) and np.isfinite(f.T_world_cam).all()
     }

@@ -14,7 +14,7 @@ from ufmstar_torch.anchors.tracker import TrackerConfig
 from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.method import ALONE, BASES, Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULTS, DENSE, TRACKED, TRUTH, default_of
+from ufmstar_torch.eval.methods.setting import CORNERS, DEFAULTS, DENSE, TRUTH, default_of
 from ufmstar_torch.eval.report import names, style
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, mean_of
@@ -25,10 +25,10 @@ from ufmstar_torch.eval.suite.record import Record
 COUNT = "anchor_count"
 Rest = tuple[tuple[str, Any], ...]
 # Rows without a number of anchors have at most so many.
-_COUNTS = {"": 0, TRACKED: TrackerConfig().max_points, TRUTH: TRUTH_COUNT}
+_COUNTS = {"": 0, CORNERS: TrackerConfig().max_points, TRUTH: TRUTH_COUNT}
 # Settings that a row without anchors cannot have, beside those that begin with "anchor_" or "anchors.".
-_OF_ANCHORS = ("anchors", "track_noise", "corrected", "posterior")
-_ANCHORED = {TRACKED: "anchored", DENSE: "dense anchors", TRUTH: "truth anchors"}
+_OF_ANCHORS = ("anchors", "track_noise", "posterior")
+_ANCHORED = {CORNERS: "anchored", DENSE: "dense anchors", TRUTH: "truth anchors"}
 
 
 class Point(NamedTuple):
@@ -121,7 +121,7 @@ def _changed(row: Row) -> list[str]:
 SHOWN = (names.NLL, names.ECE_DELTA, names.ECE_Q)
 # Colours and marks of lines of the same method by what is fixed; they differ from all of ``look_of``'s.
 _FIXED: dict[Rest, tuple[str, str]] = {
-    (("anchors", TRACKED),): ("#882255", "d"),
+    (("anchors", CORNERS),): ("#882255", "d"),
     (("anchors", TRUTH),): ("#222222", "*"),
 }
 _OTHERS = (("#117733", "h"), ("#88CCEE", "p"), ("#999933", "<"), ("#AA4499", ">"))

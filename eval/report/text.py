@@ -25,7 +25,7 @@ _CALIBRATED = 4.0  # mean z^2 of held-out anchors, and its inverse: sigma is rig
 _UNSUPPORTED = "mean sigma not shown: neither truth nor held-out anchors (--posterior) support it"
 # The counts of a frame's anchors by their source: how many have a depth, and of how many.
 _FOUND = {
-    "tracked": ("triangulated", "tracked"),
+    "corners": ("triangulated", "tracked"),
     "landmarks": ("in view", "in the map"),
     "dense": ("with a depth", "searched or seen again"),
 }

@@ -24,7 +24,7 @@ from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowRunner
-from ufmstar_torch.eval.methods.setting import TRACKED, Setting
+from ufmstar_torch.eval.methods.setting import CORNERS, Setting
 from ufmstar_torch.eval.run.run_folder import Checkpoint
 from ufmstar_torch.eval.run.scale import NetworkScale, network_scale, require_metric
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence, parse_size, parse_slice
@@ -75,7 +75,7 @@ class RunJob:
         estimator = Gaussians(self.config, self.device, recalibration=self.recalibration)
         anchors = None
         if self.config.anchors is not None:
-            anchors = AnchorSource(Setting(anchors=TRACKED), Tracks(self.landmarks()))
+            anchors = AnchorSource(Setting(anchors=CORNERS), Tracks(self.landmarks()))
         how: dict[str, Any] = {"every": self.every, "anchors": anchors, "device": self.device}
         row = RowRunner(UFM, self.source, estimator, skips_faults=True, **how)
         if checkpoint.state:

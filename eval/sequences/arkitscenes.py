@@ -7,18 +7,19 @@ https://github.com/apple/ARKitScenes/blob/main/DATA.md
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach
+from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped
-from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, depth_loader, list_files, list_images, read_color
+from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, depth_loader, list_files, list_images
 from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import associate, read_matrix
+from ufmstar_torch.eval.sequences.poses import associate, read_matrix, trajectory_of
 from ufmstar_torch.trajectory import Trajectory
 
 _IMAGES, _CAMERAS, _DEPTHS, _POSES = "lowres_wide", "lowres_wide_intrinsics", "lowres_depth", "lowres_wide.traj"
@@ -40,11 +41,8 @@ def _root(path: Path) -> Path | None:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens the low-resolution images of a video.
-
-    Raises:
-        ValueError: a malformed file (named), a file that is not called by its time, or no usable frame.
-    """
+    """Opens the low-resolution images of a video. Raises ValueError: a malformed file (named), a file that is not
+    called by its time, or no usable frame."""
     root = _root(path)
     assert root is not None
     images, cameras = list_images(root / _IMAGES), list_files(root / _CAMERAS, _PINCAM)
@@ -59,13 +57,10 @@ def read(path: Path, options: Options) -> FrameSequence:
             frames.append(Skipped(image.stem, "no camera at its time"))
             continue
         lenses[image.stem] = _lens(cameras[camera_of[number]])
-        depth = depths[depth_of[number]] if number in depth_of else None
-        load_depth = depth_loader(depth, options.depth_scale)
-        frames.append(Entry(image.stem, UNKNOWN, partial(read_color, image), load_depth, float(times[number])))
-    if options.trajectory is None and frames:
-        frames = attach(frames, times + options.time_offset, _trajectory(root / _POSES), options)
-    name = path.resolve().name
-    return sequence_of_lenses(name, "arkitscenes", frames, lenses, path, options, times=times)
+        load_depth = depth_loader(depths[depth_of[number]] if number in depth_of else None, options.depth_scale)
+        frames.append(frame_of_image(image.stem, image, load_depth, timestamp=float(times[number])))
+    own = partial(_trajectory, root / _POSES)
+    return sequence_of_lenses(path.resolve().name, "arkitscenes", frames, lenses, path, options, own=own)
 
 
 def _times(files: list[Path]) -> np.ndarray:
@@ -92,10 +87,6 @@ def _trajectory(file: Path) -> Trajectory:
     if table.ndim != 2 or table.shape[1] != 7:
         raise ValueError(f"{file}: expected lines of 7 numbers: time [s], rotation vector [rad], translation [m]")
     table = table[np.isfinite(table).all(axis=1)]
-    stamps, first = np.unique(table[:, 0], return_index=True)
-    if not stamps.size:
-        raise ValueError(f"{file}: no pose with finite values")
-    T = np.tile(np.eye(4), (len(stamps), 1, 1))
-    T[:, :3, :3] = Rotation.from_rotvec(table[first, 1:4]).as_matrix()
-    T[:, :3, 3] = table[first, 4:]
-    return Trajectory(stamps, np.linalg.inv(T))
+    quaternions = Rotation.from_rotvec(table[:, 1:4]).as_quat()
+    world_to_camera = trajectory_of(table[:, 0], table[:, 4:], quaternions, file)
+    return replace(world_to_camera, T_world_cam=np.linalg.inv(world_to_camera.T_world_cam))

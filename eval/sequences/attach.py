@@ -8,7 +8,7 @@ skipped and counted; nothing is moved to the next image.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -34,29 +34,24 @@ _MOST = 0.5
 UNKNOWN = np.full((4, 4), np.nan)
 
 
-def attach(
-    frames: Sequence[Entry | Skipped], times: np.ndarray | None, trajectory: Trajectory, options: Options
-) -> list[Entry | Skipped]:
-    """The frames with the poses (camera-to-world) of a trajectory; those without a pose are skipped.
+def attach(frames: Sequence[Entry | Skipped], trajectory: Trajectory, options: Options) -> list[Entry | Skipped]:
+    """All frames on disk, in order, with the poses (camera-to-world) of a trajectory; those without a pose are skipped.
 
     Without timestamps in the trajectory, pose i belongs to the i-th image. With them, the pose is interpolated at the
     image's time. Whole numbers that are those in the images' names (``frame-000012``) are frame numbers, unless ``fps``
     is given. Timestamps in nanoseconds (ORB-SLAM3), microseconds or milliseconds are recognised by meeting the images'
     times only then.
 
-    Args:
-        frames: all on disk, in order.
-        times: [N] of the frames [s], or None where only the names may hold them.
-        trajectory: the poses.
-        options: ``max_pose_gap``, ``fps`` and ``time_offset``.
-
     Raises:
         ValueError: more or fewer poses than images; the images' times are not known; no image has a pose (both time
             ranges are given).
     """
-    poses = _poses([frame.name for frame in frames], times, trajectory, options)
+    if all(isinstance(frame, Skipped) for frame in frames):
+        return list(frames)
+    stamps = [frame.timestamp if isinstance(frame, Entry) else np.nan for frame in frames]
+    times = None if None in stamps else np.array(stamps, np.float64) + options.time_offset
     attached: list[Entry | Skipped] = []
-    for i, (frame, T) in enumerate(zip(frames, poses, strict=True)):
+    for i, (frame, T) in enumerate(zip(frames, _poses(frames, times, trajectory, options), strict=True)):
         if isinstance(frame, Skipped):
             attached.append(frame)
         elif T is None:
@@ -68,24 +63,21 @@ def attach(
 
 
 def attach_given(
-    frames: Sequence[Entry | Skipped], root: Path, options: Options, times: np.ndarray | None = None
+    frames: Sequence[Entry | Skipped], root: Path, options: Options, own: Callable[[], Trajectory] | None = None
 ) -> list[Entry | Skipped]:
-    """A layout's frames, all that are on disk, with the poses of ``options.trajectory`` instead of their own
-    (``UNKNOWN``); as they are without one. ``times`` [N] of the frames [s]: with ``fps``, or without ``times``, frame
-    number / fps.
-
-    Raises:
-        FileNotFoundError: no such trajectory.
-        ValueError: see :func:`attach`.
-    """
+    """A layout's frames, all that are on disk, with the poses of ``options.trajectory``, or else of the layout's own
+    trajectory; as they are without either. With ``fps``, times are frame number / fps. Raises FileNotFoundError: no
+    such trajectory; ValueError: see :func:`attach`."""
     if options.trajectory is None:
-        return list(frames)
+        return list(frames) if own is None else attach(frames, own(), options)
     if options.fps is not None:
         numbers = frame_numbers([frame.name for frame in frames])
         times = (np.arange(len(frames)) if numbers is None else numbers) / options.fps
-    if times is not None:
-        times = times + options.time_offset
-    return attach(frames, times, read_trajectory(resolve(root, options.trajectory)), options)
+        frames = [
+            replace(frame, timestamp=float(time)) if isinstance(frame, Entry) else frame
+            for frame, time in zip(frames, times, strict=True)
+        ]
+    return attach(frames, read_trajectory(resolve(root, options.trajectory)), options)
 
 
 def frame_of_files(
@@ -93,32 +85,44 @@ def frame_of_files(
 ) -> Entry | Skipped:
     """A frame with a pose file of its own, which is not read where ``options.trajectory`` replaces it; skipped where
     the image or the pose is missing (None). Raises ValueError: a malformed pose file."""
-    if options.trajectory is None and pose is None:
+    if options.trajectory is not None:
+        return frame_of_image(name, image, load_depth)
+    if pose is None:
         return Skipped(name, "missing pose file")
-    if image is None:
+    return frame_of_image(name, image, load_depth, read_pose(pose))
+
+
+def frame_of_image(
+    name: str,
+    image: Path | None,
+    load_depth: Loader | None = None,
+    T_world_cam: np.ndarray = UNKNOWN,
+    timestamp: float | None = None,
+) -> Entry | Skipped:
+    """A frame of an image file; skipped where that is missing."""
+    if image is None or not image.is_file():
         return Skipped(name, "missing image file")
-    T = UNKNOWN if pose is None or options.trajectory is not None else read_pose(pose)
-    return Entry(name, T, partial(read_color, image), load_depth)
+    return Entry(name, T_world_cam, partial(read_color, image), load_depth, timestamp)
 
 
 def _poses(
-    names: Sequence[str], times: np.ndarray | None, trajectory: Trajectory, options: Options
+    frames: Sequence[Entry | Skipped], times: np.ndarray | None, trajectory: Trajectory, options: Options
 ) -> list[np.ndarray | None]:
-    """The pose [4, 4] of each image, None where the trajectory has none; ValueError: see ``attach``."""
+    """The pose [4, 4] of each image, None where the trajectory has none."""
     if trajectory.timestamps is None:
-        if len(trajectory) != len(names):
+        if len(trajectory) != len(frames):
             raise ValueError(
-                f"trajectory has {len(trajectory)} poses for {len(names)} images: without timestamps, there "
+                f"trajectory has {len(trajectory)} poses for {len(frames)} images: without timestamps, there "
                 "must be one for each"
             )
         return list(trajectory.T_world_cam)
-    times, stamps = _in_one_unit(names, times, trajectory.timestamps, options.fps)
+    times, stamps = _in_one_unit([frame.name for frame in frames], times, trajectory.timestamps, options.fps)
     trajectory = replace(trajectory, timestamps=stamps)
     poses = [interpolate_pose(trajectory, float(time), options.max_pose_gap) for time in times]
     if all(T is None for T in poses):
         gap = f", {np.median(np.diff(stamps)):.3g} s apart in the median" if len(stamps) > 1 else ""
         raise ValueError(
-            f"no image has a pose: images lie at {times[0]:.3f} to {times[-1]:.3f} s, the trajectory's "
+            f"no image has a pose: images lie at {np.nanmin(times):.3f} to {np.nanmax(times):.3f} s, the trajectory's "
             f"{len(stamps)} poses at {stamps[0]:.3f} to {stamps[-1]:.3f} s{gap}, used where they lie at most "
             f"{options.max_pose_gap:g} s apart; see --max-pose-gap, --time-offset and --fps"
         )
@@ -128,7 +132,7 @@ def _poses(
 def _in_one_unit(
     names: Sequence[str], times: np.ndarray | None, stamps: np.ndarray, fps: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times of images and poses in the same unit: seconds or frame numbers; ValueError where they are not known.
+    """Times of images and poses in the same unit, seconds or frame numbers.
 
     For ``stamps`` to be frame numbers, most timed images must have a pose each, since 0, 1, 2, ... could be seconds as
     well; of images without times, or with times that do not meet the trajectory's, most images or most poses.
@@ -137,17 +141,20 @@ def _in_one_unit(
     of_images = of_poses = 0.0
     if numbers is not None:
         of_images, of_poses = np.isin(numbers, stamps).mean(), np.isin(stamps, numbers).mean()
-    if numbers is not None and (of_images >= _MOST or (times is None and of_poses >= _MOST)):
-        return numbers, stamps
+        if of_images >= _MOST or (times is None and of_poses >= _MOST):
+            return numbers, stamps
     if times is None:
         raise ValueError(
             f"images: the name {names[0]!r} is no timestamp, there is no rgb.txt, and the trajectory's timestamps "
             f"({stamps[0]:g}, ...) are no frame numbers of the images: pass fps (and time_offset)"
         )
-    seconds = _in_seconds(stamps, times)
-    if not _meet(seconds, times) and numbers is not None and of_poses >= _MOST:
-        return numbers, stamps
-    return times, seconds
+    if _meet(stamps, times):
+        return times, stamps
+    step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    for unit in _UNITS:
+        if _meet(stamps / unit, times) and step / unit >= _MIN_STEP:
+            return times, stamps / unit
+    return (times, stamps) if numbers is None or of_poses < _MOST else (numbers, stamps)
 
 
 def frame_numbers(names: Sequence[str]) -> np.ndarray | None:
@@ -169,26 +176,14 @@ def stem_times(names: Sequence[str]) -> np.ndarray | None:
     return times
 
 
-def _in_seconds(stamps: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """[N] timestamps in seconds, as ``times`` are, if another unit than their own makes the two meet."""
-    if len(stamps) < 2 or _meet(stamps, times):
-        return stamps
-    step = float(np.median(np.diff(stamps)))
-    units = [unit for unit in _UNITS if _meet(stamps / unit, times) and step / unit >= _MIN_STEP]
-    return stamps / units[0] if units else stamps
-
-
 def _meet(first: np.ndarray, second: np.ndarray) -> bool:
-    return bool(first.min() <= second.max() and second.min() <= first.max())
+    return bool(np.nanmin(first) <= np.nanmax(second) and np.nanmin(second) <= np.nanmax(first))
 
 
 def pair_by_name(names: Sequence[str], files: Iterable[Path]) -> dict[str, Path]:
-    """The file of each frame name, where there is one.
-
-    A file belongs to a name if their stems are equal, or else if all numbers in them are
-    (``frame-000012.color`` and ``000012_depth``; leading zeros do not count, decimals do). Numbers that
-    occur twice among the files or among the names pair nothing.
-    """
+    """The file of each frame name, where there is one: their stems are equal, or else all numbers in them
+    (``frame-000012.color`` and ``000012_depth``; leading zeros do not count, decimals do). Numbers that occur twice
+    among the files or among the names pair nothing."""
     files = list(files)
     by_stem = {file.stem: file for file in files}
     file_of = _unique({file: _numbers(file.stem) for file in files})

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -57,7 +58,8 @@ class Place(NamedTuple):
 
 
 class Bag:
-    """A bag that is opened when it is first read; a worker process opens its own."""
+    """A bag that is opened when it is first read; a worker process opens its own. Raises FrameError: it cannot be
+    read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -66,55 +68,52 @@ class Bag:
 
     @property
     def topics(self) -> dict[str, str]:
-        """The types of the topics that have a message, by name. Raises FrameError: the bag cannot be read."""
-        try:
-            return {c.topic: _OLD_NAMES.get(c.msgtype, c.msgtype) for c in self._open().connections if c.msgcount}
-        except self._errors() as error:
-            raise self._broken(error) from error
+        """The types of the topics that have a message, by name."""
+        with self._opened() as reader:
+            return {c.topic: _OLD_NAMES.get(c.msgtype, c.msgtype) for c in reader.connections if c.msgcount}
 
     def messages(self, topics: Iterable[str], *when: int) -> Iterator[tuple[Place, Any]]:
         """The messages of topics in the order in which they were received, those of [start, stop) [ns] where that is
-        given. Raises FrameError: one cannot be read."""
+        given."""
         types, wanted = self.topics, set(topics)
-        decode = self._store.deserialize_ros1 if self.path.suffix == ".bag" else self._store.deserialize_cdr
         last: dict[str, tuple[int, int]] = {}
-        try:
-            chosen = [c for c in self._open().connections if c.topic in wanted]
-            for connection, received, raw in self._open().messages(chosen, *when) if chosen else ():
+        with self._opened() as reader:
+            decode = self._store.deserialize_ros1 if self.path.suffix == ".bag" else self._store.deserialize_cdr
+            chosen = [c for c in reader.connections if c.topic in wanted]
+            for connection, received, raw in reader.messages(chosen, *when) if chosen else ():
                 before, number = last.get(connection.topic, (-1, 0))
                 number = number + 1 if before == received else 0
                 last[connection.topic] = (received, number)
                 yield Place(connection.topic, received, number), decode(raw, types[connection.topic])
-        except self._errors() as error:
-            raise self._broken(error) from error
 
     def read(self, place: Place) -> Any:
-        """One message. Raises FrameError: it cannot be read."""
+        """One message."""
         for found, message in self.messages([place.topic], place.received, place.received + 1):
             if found == place:
                 return message
         raise FrameError(self.path, f"the message of {place.topic} at {place.received} ns is missing")
 
-    def _open(self) -> Any:
-        if self._reader is None:
-            stores, ros1 = _module("rosbags.typesys"), self.path.suffix == ".bag"
-            reader = _module("rosbags.rosbag1" if ros1 else "rosbags.rosbag2").Reader(self.path)
-            reader.open()
-            self._store = stores.get_typestore(stores.Stores.ROS1_NOETIC if ros1 else stores.Stores.ROS2_HUMBLE)
-            if ros1:  # ROS 1's types in rosbags have no tf
-                self._store.register(stores.get_types_from_msg(_TF_FIELDS, _TF))
-            self._reader = reader
-            finalize(self, reader.close)
-        return self._reader
-
-    def _errors(self) -> tuple[type[Exception], ...]:
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
         own = [_module(f"rosbags.{name}").ReaderError for name in ("rosbag1", "rosbag2")]
         zstd = _module("rosbags.rosbag2.storage_mcap").zstd
-        return (*own, _module("rosbags.serde").SerdeError, zstd.ZstdError, _module("apsw").Error, *_BROKEN)
+        try:
+            if self._reader is None:
+                self._open()
+            yield self._reader
+        except (*own, _module("rosbags.serde").SerdeError, zstd.ZstdError, _module("apsw").Error, *_BROKEN) as error:
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            raise FrameError(self.path, f"the bag cannot be read: {reason}") from error
 
-    def _broken(self, error: Exception) -> FrameError:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        return FrameError(self.path, f"the bag cannot be read: {reason}")
+    def _open(self) -> None:
+        stores, ros1 = _module("rosbags.typesys"), self.path.suffix == ".bag"
+        reader = _module("rosbags.rosbag1" if ros1 else "rosbags.rosbag2").Reader(self.path)
+        reader.open()
+        self._store = stores.get_typestore(stores.Stores.ROS1_NOETIC if ros1 else stores.Stores.ROS2_HUMBLE)
+        if ros1:  # ROS 1's types in rosbags have no tf
+            self._store.register(stores.get_types_from_msg(_TF_FIELDS, _TF))
+        self._reader = reader
+        finalize(self, reader.close)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"path": self.path, "_reader": None, "_store": None}
@@ -146,13 +145,9 @@ def _bag_path(path: Path) -> Path | None:
 
 def read(path: Path, options: Options) -> FrameSequence:
     """Opens the images of one camera, called by their number; times are the headers', or where those are 0, when a
-    message was received. ``options.topics`` chooses where there are several.
-
-    Raises:
-        ModuleNotFoundError: rosbags is not installed.
-        ValueError: a damaged bag, topics that are missing or not unique (listed), a camera that is not calibrated, or
-            no usable frame.
-    """
+    message was received. ``options.topics`` chooses where there are several. Raises ModuleNotFoundError: rosbags is not
+    installed; ValueError: a damaged bag, topics that are missing or not unique (listed), or a camera that is not
+    calibrated."""
     file = _bag_path(path)
     assert file is not None
     bag = Bag(file)
@@ -161,34 +156,30 @@ def read(path: Path, options: Options) -> FrameSequence:
         content = _Content(bag, topics)
     except FrameError as error:
         raise ValueError(error) from error
-    stamps = content.image_stamps
     entries: list[Entry | Skipped] = []
-    paired = associate(stamps, content.depth_stamps, options.max_time_difference)
-    for number, place in enumerate(content.images):
+    stamps, depth_stamps = (np.array([time for time, _ in places]) for places in (content.images, content.depths))
+    paired = associate(stamps, depth_stamps, options.max_time_difference)
+    for number, (time, place) in enumerate(content.images):
         load_depth = None
         if number in paired:
-            load_depth = partial(_decoded, ros.depth, bag, content.depths[paired[number]], options.depth_scale)
-        time = float(stamps[number])
+            load_depth = partial(_decoded, ros.depth, bag, content.depths[paired[number]][1], options.depth_scale)
         T = content.pose(time + options.time_offset, options.max_pose_gap) if options.trajectory is None else UNKNOWN
         name = f"{number:06d}"
         if T is None:
             entries.append(Skipped(name, f"no pose within {options.max_pose_gap:g} s around the image"))
         else:
             entries.append(Entry(name, T, partial(_decoded, ros.colour, bag, place), load_depth, time))
-    lens = content.lens or _sized(bag, content.images)
-    return sequence_of_lenses(path.resolve().stem, "bag", entries, lens, path, options, times=stamps)
+    lens = content.lens
+    if lens is None:  # its focal length is that of options.intrinsics
+        if not content.images:
+            raise ValueError(f"{file} holds no image")
+        height, width = _decoded(ros.colour, bag, content.images[0][1]).shape[:2]
+        lens = Lens((1.0, 1.0, width / 2, height / 2), (height, width))
+    return sequence_of_lenses(path.resolve().stem, "bag", entries, lens, path, options)
 
 
 def _decoded(decode: Callable[..., np.ndarray], bag: Bag, place: Place, *how: Any) -> np.ndarray:
     return decode(bag.read(place), *how, bag.path)
-
-
-def _sized(bag: Bag, images: list[Place]) -> Lens:
-    """A camera of which the images' size alone is known, for ``options.intrinsics``."""
-    for place in images:
-        height, width = _decoded(ros.colour, bag, place).shape[:2]
-        return Lens((1.0, 1.0, width / 2, height / 2), (height, width))
-    raise ValueError(f"{bag.path} holds no image")
 
 
 def _choose(bag: Bag, options: Options) -> _Topics:
@@ -204,16 +195,13 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         first = next((message for _, message in bag.messages([name])), None)
         if first is None:
             raise FrameError(bag.path, f"{name} should have messages, but has none: the bag is damaged")
-        is_depth = getattr(first, "encoding", "") in ros.DEPTH_ENCODINGS or ros.COMPRESSED_DEPTH in getattr(
-            first, "format", ""
-        )
-        (depths if is_depth else images)[name] = ros.frame_name(first.header.frame_id)
-    image = _one("the image", bag, images, named, types)
+        (depths if ros.is_depth(first) else images)[name] = ros.frame_name(first.header.frame_id)
+    image = _one("the image", bag, named, images)
     if not image:
         raise ValueError(f"{bag.path} has no topic of colour images, but {_listing(types)}")
     infos = [name for name, kind in types.items() if kind == _INFO]
     beside = [name for name in infos if name.rsplit("/", 1)[0] in (image.rsplit("/", 1)[0], image.rsplit("/", 2)[0])]
-    info = "" if options.intrinsics is not None else _one("the camera info", bag, beside or infos, named, types)
+    info = "" if options.intrinsics is not None else _one("the camera info", bag, named, beside or infos)
     if not info and options.intrinsics is None:
         raise ValueError(f"{bag.path} has no camera info: pass intrinsics")
     same_view = [name for name, frame in depths.items() if frame == images[image]]
@@ -224,7 +212,7 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         same_view = [name for name in same_view if name in named]
         depths = {name: depths[name] for name in same_view}
         so_called = [name for name in so_called if name not in predicted]
-    depth = _one("the depth", bag, so_called or same_view, named, types)
+    depth = _one("the depth", bag, named, so_called or same_view)
     other = [name for name in named if name in depths and name not in same_view]
     if other:
         raise ValueError(
@@ -237,16 +225,15 @@ def _choose(bag: Bag, options: Options) -> _Topics:
     if options.trajectory is None:
         by_tf = [name for name in named if types[name] == _TF]
         poses = [name for name, kind in types.items() if kind in _POSES]
-        pose = by_tf[0] if by_tf else _one("the pose", bag, poses, named, types)
+        pose = by_tf[0] if by_tf else _one("the pose", bag, named, poses)
         pose = pose or next((name for name, kind in types.items() if kind == _TF and "static" not in name), "")
         if not pose:
             raise ValueError(f"{bag.path} has no poses: pass trajectory")
     return _Topics(image, info, depth, pose, ros.frame_name(named.get(pose, "")))
 
 
-def _one(kind: str, bag: Bag, candidates: Iterable[str], named: dict[str, str], types: dict[str, str]) -> str:
-    candidates = list(candidates)
-    candidates = [name for name in candidates if name in named] or candidates
+def _one(kind: str, bag: Bag, named: dict[str, str], topics: Iterable[str]) -> str:
+    candidates = [name for name in topics if name in named] or list(topics)
     if len(candidates) > 1:
         raise ValueError(f"{bag.path}: {kind} may be {', '.join(sorted(candidates))}: name one with --topics")
     return candidates[0] if candidates else ""
@@ -257,14 +244,14 @@ def _listing(types: dict[str, str]) -> str:
 
 
 class _Content:
-    """The content of the chosen topics, found in one pass: places of images and depth maps, the camera, and poses."""
+    """The content of the chosen topics, found in one pass: times [s] and places of images and depth maps, the camera,
+    and poses."""
 
     def __init__(self, bag: Bag, topics: _Topics) -> None:
         self.bag, self.topics = bag, topics
         self.lens: Lens | None = None
-        self.images: list[Place] = []
-        self.depths: list[Place] = []
-        self._stamps: dict[str, list[float]] = {topics.image: [], topics.depth: []}
+        self.images: list[tuple[float, Place]] = []
+        self.depths: list[tuple[float, Place]] = []
         self._tree, self._body, self._camera, samples = ros.FrameTree(), "", "", list[ros.Sample]()
         tf = [name for name, kind in bag.topics.items() if kind == _TF]
         for place, message in bag.messages({*filter(None, topics[:4]), *tf}):
@@ -277,12 +264,11 @@ class _Content:
                 self._body = ros.frame_name(getattr(message, "child_frame_id", ""))
             elif place.topic == topics.info:
                 self._add_lens(message)
+            elif place.topic == topics.depth:
+                self.depths.append((_stamp(message, place), place))
             else:
-                (self.images if place.topic == topics.image else self.depths).append(place)
-                self._stamps[place.topic].append(_stamp(message, place))
-                if place.topic == topics.image:
-                    self._camera = ros.frame_name(message.header.frame_id)
-        self.image_stamps, self.depth_stamps = (np.array(self._stamps[name]) for name in (topics.image, topics.depth))
+                self.images.append((_stamp(message, place), place))
+                self._camera = ros.frame_name(message.header.frame_id)
         self._trajectory = ros.trajectory(samples) if samples else None
         self._prepare()
 
@@ -316,13 +302,11 @@ class _Content:
 
     def pose(self, time: float, max_gap: float) -> np.ndarray | None:
         """[4, 4] camera-to-world at ``time`` [s]; None where there is none."""
-        if self._trajectory is None:
-            return self._tree.at(self._camera, self._body, time, max_gap)
-        T_world_body = interpolate_pose(self._trajectory, time, max_gap)
-        if self._body == self._camera or T_world_body is None:
-            return T_world_body
         T_body_camera = self._tree.between(self._camera, self._body, time, max_gap)
-        return None if T_body_camera is None else np.asarray(T_world_body @ T_body_camera)
+        if self._trajectory is None or T_body_camera is None:
+            return T_body_camera
+        T_world_body = interpolate_pose(self._trajectory, time, max_gap)
+        return None if T_world_body is None else T_world_body @ T_body_camera
 
 
 def _stamp(message: Any, place: Place) -> float:

@@ -12,16 +12,15 @@ import json
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import pair_depth
-from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped
-from ufmstar_torch.eval.sequences.generic import DEPTHS, listed_times
-from ufmstar_torch.eval.sequences.images import depth_loader, natural_key, read_color
+from ufmstar_torch.eval.sequences.attach import frame_of_image, pair_depth
+from ufmstar_torch.eval.sequences.frame import FrameSequence
+from ufmstar_torch.eval.sequences.generic import depth_folder, listed_times
+from ufmstar_torch.eval.sequences.images import depth_loader, natural_key
 from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_quaternions
@@ -55,11 +54,8 @@ def detect(path: Path) -> bool:
 
 def read(path: Path, options: Options) -> FrameSequence:
     """Opens a model's images in the order of their names. ``images`` and ``depth`` name other folders than ``images/``
-    and ``depth/``; an image that is not there is skipped and counted. Times come from ``rgb.txt`` beside the images.
-
-    Raises:
-        ValueError: a file is truncated or malformed (named), a camera model that is not OpenCV's, or no usable frame.
-    """
+    and ``depth/``; times come from ``rgb.txt`` beside the images. Raises ValueError: a file is truncated or malformed
+    (named), a camera model that is not OpenCV's, or no usable frame."""
     model = _model_folder(path)
     assert model is not None
     root = next((f for f in (path, *model.parents[:2]) if (f / "images").is_dir()), path)
@@ -69,25 +65,19 @@ def read(path: Path, options: Options) -> FrameSequence:
     if not views:
         raise ValueError(f"{_file(model, 'images')} holds no image")
     names = [_frame_name(view) for view in views]
-    depths = next((root / name for name in DEPTHS if (root / name).is_dir()), None)
-    depths = resolve(path, options.depth) if options.depth is not None else depths
+    depths = depth_folder(path, root, options)
     depth_of = {} if depths is None else pair_depth(names, depths)
     times = listed_times(folder, [Path(view.name) for view in views])
-    frames: list[Entry | Skipped] = []
-    lenses = {}
+    frames, lenses = [], {}
     for number, (view, name) in enumerate(zip(views, names, strict=True)):
         if view.camera not in cameras:
             raise ValueError(f"{_file(model, 'images')}: image {view.name!r} has the camera {view.camera}, not listed")
-        if not (folder / view.name).is_file():
-            frames.append(Skipped(name, "missing image file"))
-            continue
         lenses[name] = cameras[view.camera]
         load_depth = depth_loader(depth_of.get(name), options.depth_scale)
         time = None if times is None else float(times[number])
-        frames.append(Entry(name, _pose(view, model), partial(read_color, folder / view.name), load_depth, time))
-    name = path.resolve().name
+        frames.append(frame_of_image(name, folder / view.name, load_depth, _pose(view, model), time))
     metric = _metric(root) and model == root / MODEL
-    return sequence_of_lenses(name, "colmap", frames, lenses, path, options, times=times, metric=metric)
+    return sequence_of_lenses(path.resolve().name, "colmap", frames, lenses, path, options, metric=metric)
 
 
 def read_landmarks(path: Path) -> dict[str, np.ndarray]:
@@ -128,9 +118,7 @@ def _metric(root: Path) -> bool:
 def _pose(view: _View, model: Path) -> np.ndarray:
     """[4, 4] camera-to-world, NaN where it is not finite."""
     quaternion, position = np.array(view.pose[:4]), np.array(view.pose[4:])
-    if not np.isfinite(view.pose).all():
-        return np.full((4, 4), np.nan)
-    if abs(np.linalg.norm(quaternion) - 1) > _NORM_TOLERANCE:
+    if np.isfinite(view.pose).all() and abs(np.linalg.norm(quaternion) - 1) > _NORM_TOLERANCE:
         raise ValueError(f"{model}: the quaternion of image {view.name!r} is {quaternion}, expected a norm of 1")
     return np.asarray(np.linalg.inv(poses_from_quaternions(position[None], np.roll(quaternion, -1)[None])[0]))
 
@@ -151,29 +139,24 @@ def _lens(file: Path, model: str, size: tuple[int, int], values: tuple[float, ..
 
 
 class _Bytes:
-    """The values of a binary file, one after the other."""
+    """The values of a binary file, one after the other. Raises ValueError: the file ends before."""
 
     def __init__(self, file: Path) -> None:
         self.file, self.data, self.at = file, file.read_bytes(), 0
 
     def take(self, form: str) -> tuple[Any, ...]:
-        """Raises ValueError: the file ends before."""
-        size = struct.calcsize("<" + form)
-        if self.at + size > len(self.data):
-            raise ValueError(f"{self.file} is truncated: {len(self.data):,} bytes, more are stated")
-        self.at += size
-        return struct.unpack_from("<" + form, self.data, self.at - size)
+        """The values of a format of ``struct``."""
+        return struct.unpack("<" + form, self.bytes(struct.calcsize("<" + form)))
 
-    def array(self, dtype: list[tuple[str, str]], count: int) -> np.ndarray:
-        """[count] records. Raises ValueError: the file ends before."""
-        size = np.dtype(dtype).itemsize * count
+    def bytes(self, size: int) -> bytes:
+        """The next bytes as they are."""
         if self.at + size > len(self.data):
             raise ValueError(f"{self.file} is truncated: {len(self.data):,} bytes, more are stated")
         self.at += size
-        return np.frombuffer(self.data, dtype, count, self.at - size)
+        return self.data[self.at - size : self.at]
 
     def text(self) -> str:
-        """Up to a zero. Raises ValueError: there is none, or it is no UTF-8."""
+        """Up to a zero."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise ValueError(f"{self.file} is truncated within an image's name")
@@ -207,7 +190,7 @@ def _views(file: Path) -> Iterator[_View]:
     for _ in range(stored.take("Q")[0]):
         _, *pose, camera = stored.take("I7dI")
         name, count = stored.text(), stored.take("Q")[0]
-        points = stored.array([("x", "<f8"), ("y", "<f8"), ("id", "<u8")], count)["id"]
+        points = np.frombuffer(stored.bytes(24 * count), "<u8")[2::3]  # x, y and the point's id
         yield _View(name, camera, tuple(pose), points[points != _NO_POINT].astype(np.int64))
 
 
@@ -240,7 +223,7 @@ def _points(file: Path) -> dict[int, np.ndarray]:
     stored = _Bytes(file)
     for _ in range(stored.take("Q")[0]):
         key, x, y, z, *_, length = stored.take("Q3d3BdQ")
-        stored.array([("image", "<u4"), ("index", "<u4")], length)
+        stored.bytes(8 * length)
         points[key] = np.array([x, y, z])
     return points
 

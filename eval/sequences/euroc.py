@@ -8,18 +8,19 @@ https://projects.asl.ethz.ch/datasets/kmavvisualinertialdatasets
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach
-from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped
-from ufmstar_torch.eval.sequences.images import first_image_size, read_color
+from ufmstar_torch.eval.sequences.attach import frame_of_image
+from ufmstar_torch.eval.sequences.frame import FrameSequence, Size
+from ufmstar_torch.eval.sequences.images import first_image_size
 from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens, sequence_of_lenses
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import csv_numbers, csv_rows, poses_from_quaternions
+from ufmstar_torch.eval.sequences.poses import csv_numbers, csv_rows, trajectory_of
 from ufmstar_torch.trajectory import Trajectory
 
 LOOKED_FOR = "mav0/cam0/data.csv and sensor.yaml (also in mav0, or in a camera's folder itself)"
@@ -36,29 +37,18 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens the recording of one camera; ``path`` may be the folder of another one than ``cam0``.
-
-    Raises:
-        ValueError: a malformed file (named), no ground truth and no ``trajectory``, or no usable frame.
-    """
+    """Opens the recording of one camera; ``path`` may be the folder of another one than ``cam0``. Raises ValueError: a
+    malformed file (named), no ground truth and no ``trajectory``, or no usable frame."""
     folder = _camera_folder(path)
     assert folder is not None
-    rows = csv_rows(folder / "data.csv")
-    frames: list[Entry | Skipped] = []
-    times = []
-    for words, where in rows:
-        image = folder / "data" / (words[1] if len(words) > 1 else f"{words[0]}.png")
-        times.append(csv_numbers(words[:1], where)[0] * _NANOSECOND)
-        if image.is_file():
-            frames.append(Entry(image.stem, UNKNOWN, partial(read_color, image), timestamp=times[-1]))
-        else:
-            frames.append(Skipped(image.stem, "missing image file"))
-    stamps = np.array(times)
-    if options.trajectory is None and frames:
-        frames = attach(frames, stamps + options.time_offset, _trajectory(folder), options)
-    lens = _lens(folder / "sensor.yaml", first_image_size(folder / "data" / words[-1] for words, _ in rows))
+    images, frames = [], []
+    for words, where in csv_rows(folder / "data.csv"):
+        images.append(folder / "data" / (words[1] if len(words) > 1 else f"{words[0]}.png"))
+        time = csv_numbers(words[:1], where)[0] * _NANOSECOND
+        frames.append(frame_of_image(images[-1].stem, images[-1], timestamp=time))
+    lens = _lens(folder / "sensor.yaml", first_image_size(images))
     name = folder.parent.parent.resolve().name if folder.parent.name == "mav0" else folder.resolve().name
-    return sequence_of_lenses(name, "euroc", frames, lens, path, options, times=stamps)
+    return sequence_of_lenses(name, "euroc", frames, lens, path, options, own=partial(_trajectory, folder))
 
 
 def _camera_folder(path: Path) -> Path | None:
@@ -79,14 +69,12 @@ def _trajectory(camera: Path) -> Trajectory:
             raise ValueError(f"{where}: expected a time [ns], x y z [m] and qw qx qy qz; pass trajectory")
     table = np.array([values for values, _ in rows]).reshape(-1, 8)
     table = table[np.isfinite(table).all(axis=1) & (np.linalg.norm(table[:, 4:], axis=1) > 0.5)]
-    stamps, first = np.unique(table[:, 0], return_index=True)
-    if not stamps.size:
-        raise ValueError(f"{truth / 'data.csv'}: no pose with finite values")
-    T_world_sensor = poses_from_quaternions(table[first, 1:4], np.roll(table[first, 4:], -1, axis=1))
+    quaternions = np.roll(table[:, 4:], -1, axis=1)
+    of_sensor = trajectory_of(table[:, 0] * _NANOSECOND, table[:, 1:4], quaternions, truth / "data.csv")
     to_camera = _extrinsics(camera / "sensor.yaml")
     if (truth / "sensor.yaml").is_file():
         to_camera = np.linalg.inv(_extrinsics(truth / "sensor.yaml")) @ to_camera
-    return Trajectory(stamps * _NANOSECOND, T_world_sensor @ to_camera)
+    return replace(of_sensor, T_world_cam=of_sensor.T_world_cam @ to_camera)
 
 
 def _extrinsics(file: Path) -> np.ndarray:

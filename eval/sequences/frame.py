@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,27 +25,20 @@ _MAX_PIXELS = 2**27
 
 
 def parse_size(text: str | None, option: str = "--size") -> Size | None:
-    """HxW as (H, W), None for None. Raises ValueError: another form, or more pixels than an image can have; the message
-    names ``option``."""
+    """HxW as (H, W), None for None. Raises ValueError: another form, or more pixels than an image can have."""
     if text is None:
         return None
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdigit() and int(part) for part in parts):
+    height, _, width = text.lower().partition("x")
+    if not (height.isdigit() and width.isdigit() and int(height) and int(width)):
         raise ValueError(f"{option} must be HxW in pixels, 240x320 say, got {text!r}")
-    if int(parts[0]) * int(parts[1]) > _MAX_PIXELS:
+    if int(height) * int(width) > _MAX_PIXELS:
         raise ValueError(f"{option} must be at most {_MAX_PIXELS / 1e6:.0f} million pixels, got {text!r}")
-    return int(parts[0]), int(parts[1])
+    return int(height), int(width)
 
 
 class FrameError(Exception):
-    """A frame's file is missing, truncated, corrupt, or not of the sequence's size; found when decoding.
-
-    Callers may count such frames and go on (:meth:`FrameSequence.readable` does).
-
-    Attributes:
-        path: the file, or the frame's name where the file decodes but does not belong to the sequence.
-        reason: what is wrong with it.
-    """
+    """A file (or frame) ``path`` is missing, truncated, corrupt, or not of the sequence's size: ``reason``. Callers may
+    count such frames and go on (:meth:`FrameSequence.readable` does)."""
 
     def __init__(self, path: str | Path, reason: str) -> None:
         super().__init__(str(path), reason)  # both in args, so that it survives pickling by a worker
@@ -81,10 +73,8 @@ class Skipped:
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """A frame before it is decoded: ``load_image`` and ``load_depth`` return what :class:`Frame` holds.
-
-    A ``T_world_cam`` with a non-finite entry makes :func:`make_sequence` skip and count the frame.
-    """
+    """A frame before it is decoded: ``load_image`` and ``load_depth`` return what :class:`Frame` holds. One whose pose
+    is not finite is skipped and counted."""
 
     name: str
     T_world_cam: np.ndarray
@@ -131,13 +121,10 @@ class FrameSequence:
         return len(self.entries)
 
     def __getitem__(self, index: int) -> Frame:
-        """Decodes one frame (negative indices count from the end).
-
-        Raises:
-            IndexError: beyond the end.
-            FrameError: a file is missing, cannot be decoded, or has not the sequence's size.
-        """
+        """Decodes one frame (negative indices count from the end). Raises FrameError: a file is missing, cannot be
+        decoded, or has not the sequence's size."""
         entry = self.entries[index]
+        K_depth = self.depth_intrinsics if entry.depth_intrinsics is None else entry.depth_intrinsics
         return Frame(
             index=index % len(self.entries),
             name=entry.name,
@@ -145,7 +132,7 @@ class FrameSequence:
             depth=_load(entry.name, "depth map", entry.load_depth, self.depth_size),
             T_world_cam=entry.T_world_cam.copy(),
             intrinsics=self.intrinsics_of(entry).copy(),
-            depth_intrinsics=_copy(self.depth_intrinsics if entry.depth_intrinsics is None else entry.depth_intrinsics),
+            depth_intrinsics=None if K_depth is None else K_depth.copy(),
             timestamp=entry.timestamp,
         )
 
@@ -181,25 +168,21 @@ def make_sequence(
     metric: bool = True,
 ) -> FrameSequence:
     """Sorts frames into usable and skipped and checks that the intrinsics fit the sizes (H, W); ``posed`` and
-    ``metric`` as there.
-
-    Raises:
-        ValueError: no frame is usable (the reasons are counted in the message); two frames share a name;
-            the intrinsics are malformed or belong to another image size.
-    """
-    listed = [
-        Skipped(frame.name, "non-finite pose")
-        if isinstance(frame, Entry) and not np.isfinite(frame.T_world_cam).all()
-        else frame
-        for frame in frames
-    ]
-    entries = tuple(frame for frame in listed if isinstance(frame, Entry))
-    skipped = tuple(frame for frame in listed if isinstance(frame, Skipped))
+    ``metric`` as there. Raises ValueError: no frame is usable (the reasons are counted); two frames share a name; the
+    intrinsics are malformed or belong to another image size."""
+    names, entries, skipped = list[str](), list[Entry](), list[Skipped]()
+    for frame in frames:
+        names.append(frame.name)
+        if isinstance(frame, Skipped):
+            skipped.append(frame)
+        elif np.isfinite(frame.T_world_cam).all():
+            entries.append(frame)
+        else:
+            skipped.append(Skipped(frame.name, "non-finite pose"))
     if not entries:
         reasons = Counter(frame.reason for frame in skipped).most_common(3)
         summary = "; ".join(f"{count} x {reason}" for reason, count in reasons) or "no frame was found"
         raise ValueError(f"{layout} sequence {name!r} has no usable frame: {summary}")
-    names = tuple(frame.name for frame in listed)
     repeated = [frame_name for frame_name, count in Counter(names).items() if count > 1]
     if repeated:
         raise ValueError(f"{layout} sequence {name!r}: frame names must be unique, {repeated[:3]} occur twice")
@@ -212,13 +195,13 @@ def make_sequence(
     return FrameSequence(
         name,
         layout,
-        entries,
+        tuple(entries),
         intrinsics,
         image_size,
         depth_intrinsics,
         depth_size,
-        skipped,
-        names,
+        tuple(skipped),
+        tuple(names),
         posed,
         metric=metric,
     )
@@ -229,19 +212,11 @@ def in_memory(sequence: FrameSequence, progress: Callable[[int], object] = lambd
     FrameError: a frame cannot be decoded."""
     entries = []
     for frame, entry in zip(sequence, sequence.entries, strict=True):
-        load_image = entry.load_image and partial(_same, frame.image)
-        load_depth = entry.load_depth and partial(_same, frame.depth)
+        load_image = entry.load_image and partial(np.asarray, frame.image)
+        load_depth = entry.load_depth and partial(np.asarray, frame.depth)
         entries.append(replace(entry, load_image=load_image, load_depth=load_depth))
         progress(len(entries))
     return replace(sequence, entries=tuple(entries))
-
-
-def _same(array: Any) -> Any:
-    return array
-
-
-def _copy(array: np.ndarray | None) -> np.ndarray | None:
-    return None if array is None else array.copy()
 
 
 def parse_slice(text: str | None) -> slice:
@@ -277,10 +252,8 @@ def fits(K: np.ndarray, size: Size) -> bool:
 
 
 def _load(name: str, what: str, load: Loader | None, size: Size | None) -> np.ndarray | None:
-    if load is None:
-        return None
-    array = load()
-    if size is not None and array.shape[:2] != size:
+    array = None if load is None else load()
+    if array is not None and size is not None and array.shape[:2] != size:
         raise FrameError(
             name,
             f"the {what} is {array.shape[1]}x{array.shape[0]}, the sequence's are {size[1]}x{size[0]} "

@@ -62,15 +62,11 @@ def read(path: Path, options: Options) -> FrameSequence:
     ``time_offset``. The pose is interpolated as for TUM RGB-D.
     Depth maps belong to the image with the same stem or the same numbers in their names, or else, where
     their names are timestamps too, to the nearest within ``max_time_difference``, one-to-one.
-
-    Raises:
-        ValueError: images, trajectory or intrinsics are not found or found twice; more or fewer poses than
-            images; no image has a pose (both time ranges are given); depth maps that fit no image.
     """
     root = path if path.is_dir() else path.parent
-    images, size, times = open_images(path, options)
+    images, size = open_images(path, options)
     trajectory = read_trajectory(_given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
-    frames = attach(_with_depth(images, root, times, options, options.depth_scale), times, trajectory, options)
+    frames = attach(_with_depth(images, root, options, options.depth_scale), trajectory, options)
     K, size_of_depth = _intrinsics(root, options), depth_size(frames)
     return make_sequence(
         path.resolve().stem if path.is_file() else path.resolve().name,
@@ -89,28 +85,20 @@ def has_images_and_depth(path: Path) -> bool:
 
 
 def open_unposed(path: Path, options: Options) -> FrameSequence:
-    """Opens images with depth maps for uses that need no poses, such as training.
-
-    As :func:`read` without a trajectory. Images without a depth map are skipped. Without ``depth_scale``, maps
-    beside TUM's ``depth.txt`` are in 1/5000 m.
-
-    Returns:
-        A sequence with ``posed`` False; its poses are the identity and mean nothing.
-
-    Raises:
-        ValueError: images, depth maps or intrinsics are not found, or no depth map fits an image.
-    """
+    """Opens images with depth maps for uses that need no poses, such as training: a sequence with ``posed`` False.
+    Images without a depth map are skipped. Without ``depth_scale``, maps beside TUM's ``depth.txt`` are in 1/5000 m.
+    Raises ValueError: images, depth maps or intrinsics are not found, or no depth map fits an image."""
     options.reject("unposed", "trajectory", "T_color_depth")
     if not has_images_and_depth(path):
         raise ValueError(f"{path} must hold one of {', '.join(IMAGES)} and one of {', '.join(DEPTHS)}")
     first = next(name for name in IMAGES if (path / name).is_dir())
-    images, size, times = open_images(path, replace(options, images=options.images or path / first))
+    images, size = open_images(path, replace(options, images=options.images or path / first))
     scale = options.depth_scale
     if scale is None and (path / "depth.txt").is_file():
         scale = TUM_SCALE
     frames = [
         replace(image, T_world_cam=np.eye(4)) if image.load_depth is not None else Skipped(image.name, "no depth map")
-        for image in _with_depth(images, path, times, options, scale)
+        for image in _with_depth(images, path, options, scale)
     ]
     return make_sequence(
         path.resolve().name,
@@ -128,8 +116,8 @@ def _intrinsics(root: Path, options: Options) -> np.ndarray:
     return read_intrinsics(_given_or_found(root, None, INTRINSICS, "intrinsics") if given is None else given)
 
 
-def open_images(path: Path, options: Options) -> tuple[list[Entry], Size | None, np.ndarray | None]:
-    """The images without poses and depth, their (H, W), and timestamps [N] [s] (None where they are not known)."""
+def open_images(path: Path, options: Options) -> tuple[list[Entry], Size | None]:
+    """The images without poses and depth, with their times where they are known, and their (H, W)."""
     source = path
     if options.images is not None:
         source = resolve(path, options.images)
@@ -141,14 +129,21 @@ def open_images(path: Path, options: Options) -> tuple[list[Entry], Size | None,
         source = result[0]
     if source.is_file():
         video = Video(source)
-        images = [Entry(f"{i:06d}", UNKNOWN, partial(video.read, i)) for i in range(len(video))]
         times = video.times() if options.fps is None else np.arange(len(video)) / options.fps
-        return images, video.size, times + options.time_offset
+        loaders = [partial(video.read, i) for i in range(len(video))]
+        images = [Entry(f"{i:06d}", UNKNOWN, loaders[i], None, time) for i, time in enumerate(times.tolist())]
+        return images, video.size
     files = list_images(source)
     if not files:
         raise ValueError(f"{source} holds no image ({', '.join(IMAGE_SUFFIXES)})")
-    images = [Entry(file.stem, UNKNOWN, partial(read_color, file)) for file in files]
-    return images, first_image_size(files), _image_times(source, files, options)
+    known = listed_times(source, files)
+    if known is None and options.fps is not None:
+        known = np.arange(len(files)) / options.fps
+    elif known is None:
+        known = stem_times([file.stem for file in files])
+    stamps = [None] * len(files) if known is None else known.tolist()
+    images = [Entry(f.stem, UNKNOWN, partial(read_color, f), None, t) for f, t in zip(files, stamps, strict=True)]
+    return images, first_image_size(files)
 
 
 def _image_sources(path: Path) -> list[Path]:
@@ -170,37 +165,30 @@ def listed_times(folder: Path, files: list[Path]) -> np.ndarray | None:
     return np.array([listed[file.name] for file in files])
 
 
-def _image_times(folder: Path, files: list[Path], options: Options) -> np.ndarray | None:
-    times = listed_times(folder, files)
-    if times is None and options.fps is not None:
-        times = np.arange(len(files)) / options.fps
-    elif times is None:
-        times = stem_times([file.stem for file in files])
-    return None if times is None else times + options.time_offset
+def depth_folder(root: Path, inside: Path, options: Options) -> Path | None:
+    """The folder of depth maps: ``options.depth``, or else one of ``DEPTHS`` in a folder; None without any."""
+    if options.depth is not None:
+        return resolve(root, options.depth)
+    return next((inside / name for name in DEPTHS if (inside / name).is_dir()), None)
 
 
-def _with_depth(
-    images: list[Entry], root: Path, times: np.ndarray | None, options: Options, scale: float | None
-) -> list[Entry]:
+def _with_depth(images: list[Entry], root: Path, options: Options, scale: float | None) -> list[Entry]:
     """The images with their depth maps, in ``scale`` [m per unit], where they have one."""
-    files = _depth_files(root, [image.name for image in images], times, options)
+    folder = depth_folder(root, root, options)
+    files = {} if folder is None else _depth_files(folder, images, options)
     return [replace(image, load_depth=depth_loader(files.get(image.name), scale)) for image in images]
 
 
-def _depth_files(root: Path, names: list[str], times: np.ndarray | None, options: Options) -> dict[str, Path]:
-    folder = next((root / name for name in DEPTHS if (root / name).is_dir()), None)
-    if options.depth is not None:
-        folder = resolve(root, options.depth)
-    if folder is None:
-        return {}
+def _depth_files(folder: Path, images: list[Entry], options: Options) -> dict[str, Path]:
+    names, times = [image.name for image in images], [image.timestamp for image in images]
     try:
         return pair_depth(names, folder)
     except ValueError:
         files = list_files(folder, DEPTH_SUFFIXES)
         depth_times = stem_times([file.stem for file in files])
-        if depth_times is None or times is None:
+        if depth_times is None or None in times:
             raise
-        near = associate(times, depth_times + options.time_offset, options.max_time_difference)
+        near = associate(np.array(times), depth_times, options.max_time_difference)
         if not near:
             raise
         return {names[i]: files[j] for i, j in near.items()}

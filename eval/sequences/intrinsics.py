@@ -43,17 +43,20 @@ def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | N
     if len(words) <= 1:
         return words[0] if words else None
     try:
-        numbers = [float(word) for word in words]
+        fx, fy, cx, cy = map(float, words)
     except ValueError:
-        numbers = []
-    if len(numbers) != 4:
-        raise ValueError(f"{option} must be a file, or the four numbers fx fy cx cy, got {' '.join(words)!r}")
-    return numbers
+        raise ValueError(f"{option} must be a file, or the four numbers fx fy cx cy, got {' '.join(words)!r}") from None
+    return [fx, fy, cx, cy]
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     """The matrix [3, 3] of a pinhole camera [px]."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def pinhole_values(K: np.ndarray) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy [px] of a matrix [3, 3]."""
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
 def camera_matrix(given: IntrinsicsLike | None, known: np.ndarray, known_size: Size, size: Size | None) -> np.ndarray:

@@ -3,7 +3,8 @@
 ``data_2d_raw/DRIVE/image_00/data_rect/NNNNNNNNNN.png`` (or image_01), ``data_poses/DRIVE/cam0_to_world.txt`` (the
 rectified camera 00) or ``poses.txt`` (the car), by frame number, ``calibration/``, and
 ``data_3d_raw/DRIVE/velodyne_points/data/*.bin``. Frames without a pose, where the car stood still, are skipped.
-image_02 and image_03 are fisheye cameras, which a pinhole model does not describe. https://www.cvlibs.net/datasets/kitti-360/documentation.php
+image_02 and image_03 are fisheye cameras, which a pinhole model does not describe.
+https://www.cvlibs.net/datasets/kitti-360/documentation.php
 
 Calibration: ``perspective.txt`` has for each camera NN of the stereo pair ``P_rect_NN`` (3x4), ``R_rect_NN`` (3x3, from
 the camera as it is mounted to the rectified one) and ``S_rect_NN`` (width, height); ``calib_cam_to_pose.txt`` has the
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -25,10 +27,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given, pair_depth
+from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given, frame_of_image, pair_depth
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.ground_truth import project
-from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, list_images, read_color
+from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, list_images
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, depth_camera_matrix
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import numbered_lines, read_matrix, read_trajectory
@@ -46,12 +48,12 @@ _MIN_RANGE = 2.0  # [m] nearer returns are the car's own roof
 def detect(path: Path) -> bool:
     """True if the path is the dataset's root, a drive or a camera of one."""
     if (path / _RAW).is_dir():
-        return bool(drives(path))
+        return bool(parts(path))
     camera = _camera(path)
     return camera is not None and camera.is_dir()
 
 
-def drives(root: Path) -> list[Path]:
+def parts(root: Path) -> list[Path]:
     """The drives of a root that have rectified images, sorted; a drive or camera itself."""
     if not (root / _RAW).is_dir():
         return [root]
@@ -60,15 +62,10 @@ def drives(root: Path) -> list[Path]:
 
 def read(path: Path, options: Options) -> FrameSequence:
     """Opens a drive: ``path`` is the root (with the option ``drive``, unless there is only one), or the drive's folder
-    (its first rectified camera), or the camera's.
-
-    Depth comes from the folder ``depth`` (16 bits, 1/256 m), or else from the laser: the frame's own scan, unrolled,
-    and those of ``scans`` frames before and after it. Poses are camera 00's, moved to the camera opened.
-
-    Raises:
-        FileNotFoundError: no poses, or a calibration file that is needed is missing.
-        ValueError: no or several drives fit; a fisheye camera; no usable frame; malformed files.
-    """
+    (its first rectified camera), or the camera's. Depth comes from the folder ``depth`` (16 bits, 1/256 m), or else
+    from the laser: the frame's own scan, unrolled, and those of ``scans`` frames before and after it. Raises
+    FileNotFoundError: no poses or calibration; ValueError: no or several drives fit, a fisheye camera, malformed
+    files."""
     folder = _camera(_drive(path, options.drive))
     if folder is None or folder.name not in _CAMERAS:
         raise ValueError(f"{path}: of KITTI-360, {' and '.join(_CAMERAS)} can be read; the others are fisheye cameras")
@@ -81,30 +78,28 @@ def read(path: Path, options: Options) -> FrameSequence:
     width, height = (int(value) for value in _values(perspective, f"S_rect_{camera}", 2))
     P = _values(perspective, f"P_rect_{camera}", 12).reshape(3, 4)
     K = camera_matrix(options.intrinsics, P[:, :3].copy(), (height, width), size)
-    numbers = [_number(image) for image in images]
+    for image in images:
+        if not image.stem.isdecimal():
+            raise ValueError(f"{image}: expected a frame number as the file's name")
+    numbers = [int(image.stem) for image in images]
     times = _times(folder / "timestamps.txt", numbers)
     poses = _poses(root, drive, camera) if options.trajectory is None else dict.fromkeys(numbers, UNKNOWN)
-    frames: list[Entry | Skipped] = [
-        Entry(image.stem, poses[number], partial(read_color, image), None, None if times is None else float(times[i]))
+    frames = [
+        frame_of_image(image.stem, image, None, poses[number], time)
         if number in poses
         else Skipped(image.stem, "no pose for this frame number")
-        for i, (image, number) in enumerate(zip(images, numbers, strict=True))
+        for image, number, time in zip(images, numbers, times, strict=True)
     ]
-    frames = attach_given(frames, folder, options, times)
+    frames = attach_given(frames, folder, options)
     if options.trajectory is not None:
         poses = {int(frame.name): frame.T_world_cam for frame in frames if isinstance(frame, Entry)}
     loaders = _depth(folder, poses, [image.stem for image in images], options, K, size or (height, width))
     frames = [replace(f, load_depth=loaders.get(f.name)) if isinstance(f, Entry) else f for f in frames]
     maps_size = size if options.depth is None else depth_size(frames)
-    return make_sequence(
-        drive if camera == "00" else f"{drive}_{folder.name}",
-        "kitti360",
-        frames,
-        K,
-        image_size=size,
-        depth_intrinsics=depth_camera_matrix(options.depth_intrinsics, K, size, maps_size),
-        depth_size=maps_size if loaders else None,
-    )
+    name = drive if camera == "00" else f"{drive}_{folder.name}"
+    K_depth = depth_camera_matrix(options.depth_intrinsics, K, size, maps_size)
+    maps_size = maps_size if loaders else None
+    return make_sequence(name, "kitti360", frames, K, image_size=size, depth_intrinsics=K_depth, depth_size=maps_size)
 
 
 def _camera(path: Path) -> Path | None:
@@ -124,44 +119,37 @@ def _drive(path: Path, drive: str | int | None) -> Path:
         if drive is not None:
             raise ValueError(f"drive goes with the dataset's root, which holds {_RAW}; {path} does not")
         return path
-    fitting = [d for d in drives(path) if drive is None or str(drive) == d.name or _same_number(str(drive), d.name)]
+    number = int(drive) if drive is not None and str(drive).isdecimal() else -1
+    fitting = [d for d in parts(path) if drive is None or str(drive) == d.name or number == _number(d)]
     if len(fitting) != 1:
-        known = [d.name for d in drives(path)]
+        known = [d.name for d in parts(path)]
         raise ValueError(f"{path}: drive must name one of {known}, by name or number: {drive!r}")
     return fitting[0]
 
 
-def _same_number(drive: str, name: str) -> bool:
-    result = re.search(r"drive_(\d+)", name)
-    return result is not None and drive.isdecimal() and int(drive) == int(result[1])
+def _number(drive: Path) -> int | None:
+    """The number behind "drive_" in a drive's name."""
+    found = re.search(r"drive_(\d+)", drive.name)
+    return int(found[1]) if found else None
 
 
-def _number(image: Path) -> int:
-    if not image.stem.isdecimal():
-        raise ValueError(f"{image}: expected a frame number as the file's name")
-    return int(image.stem)
-
-
-def _times(path: Path, numbers: list[int]) -> np.ndarray | None:
-    """[N] times of the frames [s since 1970], of lines ``2013-05-28 08:46:02.904546304``; None if not known."""
-    if not path.is_file():
-        return None
-    lines = [text for _, text in numbered_lines(path)]
+def _times(path: Path, numbers: list[int]) -> Sequence[float | None]:
+    """Times of the frames [s since 1970], of lines ``2013-05-28 08:46:02.904546304``; None if not known."""
+    lines = [text for _, text in numbered_lines(path)] if path.is_file() else []
     if max(numbers) >= len(lines):
-        return None
+        return [None] * len(numbers)
     try:
-        stamps = [datetime.fromisoformat(lines[n].strip()).replace(tzinfo=UTC).timestamp() for n in numbers]
+        return [datetime.fromisoformat(lines[n].strip()).replace(tzinfo=UTC).timestamp() for n in numbers]
     except ValueError as error:
         raise ValueError(f"{path}: expected lines of date and time: {error}") from error
-    return np.array(stamps)
 
 
 def _poses(root: Path, drive: str, camera: str) -> dict[int, np.ndarray]:
     """T_world_cam of the rectified camera by frame number."""
-    of_camera, of_car = (root / "data_poses" / drive / name for name in ("cam0_to_world.txt", "poses.txt"))
-    if not of_camera.is_file() and not of_car.is_file():
+    of_camera, of_car = files = [root / "data_poses" / drive / name for name in ("cam0_to_world.txt", "poses.txt")]
+    file = next((file for file in files if file.is_file()), None)
+    if file is None:
         raise FileNotFoundError(f"{of_car.parent} has neither {of_camera.name} nor {of_car.name}: pass trajectory")
-    file = of_camera if of_camera.is_file() else of_car
     trajectory = read_trajectory(file)
     if trajectory.timestamps is None:
         raise ValueError(f"{file}: expected the frame's number before each pose")
@@ -184,14 +172,10 @@ def _depth(
     scans_folder = folder.parents[2] / "data_3d_raw" / folder.parent.name / "velodyne_points" / "data"
     if not scans_folder.is_dir() or not (calibration / _LASER).is_file():
         return {}
-    laser = _Laser(
-        scans={int(file.stem): file for file in scans_folder.glob("*.bin") if file.stem.isdecimal()},
-        poses={number: T for number, T in poses.items() if np.isfinite(T).all()},
-        T_cam_laser=_T_rect_laser(calibration, folder.name.removeprefix("image_")),
-        K=K,
-        size=size,
-        beside=options.scans or 0,
-    )
+    scans = {int(file.stem): file for file in scans_folder.glob("*.bin") if file.stem.isdecimal()}
+    finite = {number: T for number, T in poses.items() if np.isfinite(T).all()}
+    T_cam_laser = _T_rect_laser(calibration, folder.name.removeprefix("image_"))
+    laser = _Laser(scans, finite, T_cam_laser, K, size, options.scans or 0)
     return {name: partial(laser.depth, int(name)) for name in names if laser.sees(int(name))}
 
 
@@ -264,8 +248,7 @@ def _affine(values: np.ndarray) -> np.ndarray:
 
 
 def _values(path: Path, key: str, count: int) -> np.ndarray:
-    """[count] the numbers behind ``key:`` in a calibration file. Raises FileNotFoundError: no such file; ValueError: no
-    such line, or not as many numbers in it."""
+    """[count] the numbers behind ``key:`` in a calibration file."""
     if not path.is_file():
         raise FileNotFoundError(f"KITTI-360's calibration is missing: no file {path}")
     for number, line in numbered_lines(path):
@@ -297,11 +280,8 @@ def read_scan(path: Path) -> np.ndarray:
 
 
 def unroll(points: np.ndarray, T_laser_before: np.ndarray) -> np.ndarray:
-    """Points [3, N] of one turn as if all had been measured at the scan's time, when the head looks forward.
-
-    The motion of one turn, ``T_laser_before`` [4, 4], is taken as even: a point measured a share s of a turn earlier
-    is moved by that share of it (rotation vector and translation).
-    """
+    """Points [3, N] of one turn as if all had been measured at the scan's time, when the head looks forward. The motion
+    of one turn, ``T_laser_before`` [4, 4], is taken as even (rotation vector and translation)."""
     share = np.arctan2(points[1], points[0]) / (2 * np.pi)
     turn = Rotation.from_matrix(T_laser_before[:3, :3]).as_rotvec()
     moved = Rotation.from_rotvec(share[:, None] * turn).apply(points.T).T

@@ -3,45 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
-from ufmstar_torch.eval.sequences import (
-    arkitscenes,
-    bag,
-    colmap,
-    euroc,
-    generic,
-    kitti360,
-    nyu,
-    scannet,
-    sens,
-    seven_scenes,
-    stray,
-    tartanair,
-    transforms,
-    tum,
-)
 from ufmstar_torch.eval.sequences.plugins import load_plugins
 
 # Each module has ``detect(path)``, ``read(path, options)`` and LOOKED_FOR, the files that it detects.
-READERS: dict[str, ModuleType] = {
-    "tum": tum,
-    "7scenes": seven_scenes,
-    "scannet": scannet,
-    "sens": sens,
-    "tartanair": tartanair,
-    "kitti360": kitti360,
-    "nyu": nyu,
-    "colmap": colmap,
-    "transforms": transforms,
-    "euroc": euroc,
-    "bag": bag,
-    "stray": stray,
-    "arkitscenes": arkitscenes,
-    "generic": generic,
+_MODULES = (
+    *("tum", "seven_scenes", "scannet", "sens", "tartanair", "kitti360", "nyu", "colmap", "transforms", "euroc"),
+    *("bag", "stray", "arkitscenes", "generic"),
+)
+READERS: dict[str, Any] = {
+    "7scenes" if name == "seven_scenes" else name: import_module(f"ufmstar_torch.eval.sequences.{name}")
+    for name in _MODULES
 }
+_WITH_PARTS = ("tartanair", "kitti360", "nyu")
 # Folders within one another have one name: ROOT/chess/seq-01 is "chess__seq-01".
 _BETWEEN = "__"
 
@@ -57,33 +34,24 @@ def readers(plugin: Sequence[str] = ()) -> dict[str, Any]:
 
 def require_layout(layout: str, plugin: Sequence[str] = ()) -> None:
     """Raises ValueError: no reader is called so."""
-    names = ("auto", *readers(plugin))
-    if layout not in names:
+    if layout not in (names := ("auto", *readers(plugin))):
         raise ValueError(f"layout must be one of {', '.join(names)}, got {layout!r}")
 
 
 def layout_of(layout: str, path: Path, explicit: bool, plugin: Sequence[str] = ()) -> str:
     """The layout by name, or detected for "auto". Raises ValueError: unknown, ambiguous, or not that of the path."""
     require_layout(layout, plugin)
-    known = readers(plugin)
     if layout == "auto":
-        layout = detect_layout(path, explicit, plugin)
-    if layout != "generic" and not known[layout].detect(path):
-        raise ValueError(f"{path} has not the layout {layout!r}: looked for {known[layout].LOOKED_FOR}")
+        return detect_layout(path, explicit, plugin)
+    reader = readers(plugin)[layout]
+    if layout != "generic" and not reader.detect(path):
+        raise ValueError(f"{path} has not the layout {layout!r}: looked for {reader.LOOKED_FOR}")
     return layout
 
 
 def detect_layout(path: Path, explicit: bool = False, plugin: Sequence[str] = ()) -> str:
-    """The one layout whose files lie in ``path``; ``generic`` only where no other fits.
-
-    Args:
-        path: existing folder or video file.
-        explicit: the user names the images or the trajectory, so that generic always fits.
-        plugin: files with readers of one's own.
-
-    Raises:
-        ValueError: none or several fit.
-    """
+    """The one layout whose files lie in ``path``; ``generic`` where no other fits, always if ``explicit``: the user
+    names the images or the trajectory. Raises ValueError: none or several fit."""
     fitting = layouts_of(path, plugin)
     if not fitting and explicit:
         return "generic"
@@ -99,13 +67,13 @@ def detect_layout(path: Path, explicit: bool = False, plugin: Sequence[str] = ()
 def layouts_of(path: Path, plugin: Sequence[str] = ()) -> list[str]:
     """The layouts whose files lie in ``path``, all of them; ``generic`` only where no other fits."""
     fitting = [name for name, reader in readers(plugin).items() if name != "generic" and reader.detect(path)]
-    return fitting or (["generic"] if generic.detect(path) else [])
+    return fitting or (["generic"] if READERS["generic"].detect(path) else [])
 
 
 def parts_of(path: Path, layout: str) -> list[Path]:
     """The single sequences of a path that has this layout: itself, or folders in it that hold one each."""
-    holding = {"tartanair": tartanair.trajectory_folders, "kitti360": kitti360.drives, "nyu": nyu.parts}
-    return holding[layout](path) if layout in holding else [path]
+    parts: list[Path] = READERS[layout].parts(path) if layout in _WITH_PARTS else [path]
+    return parts
 
 
 class Found(NamedTuple):
@@ -120,20 +88,17 @@ class Found(NamedTuple):
 def find_sequences(
     root: str | Path, max_depth: int = 4, layout: str = "auto", plugin: Sequence[str] = ()
 ) -> list[Found]:
-    """All sequences at or below ``root``, sorted by name.
+    """All sequences at or below ``root``, a folder or the file of one, sorted by name; empty where there is none.
 
     A folder that is a sequence is not looked into, so that its own folders of images are none. Each folder on disk
     counts once, whatever links lead to it (a folder before a link to it), so that links in a circle end too. Hidden
     folders and those that may not be read are left out.
 
     Args:
-        root: folder, or the file of one sequence.
+        root: where.
         max_depth: levels of folders below ``root`` that are looked at, at least 0.
         layout: the only layout to look for; "auto": any.
         plugin: files with readers of one's own.
-
-    Returns:
-        The sequences; empty where there is none.
 
     Raises:
         FileNotFoundError: no such root.

@@ -6,19 +6,25 @@ lenses, with OpenCV's coefficients: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import attach_given
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Loader, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import depth_size
-from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.intrinsics import (
+    depth_camera_matrix,
+    pinhole,
+    pinhole_values,
+    read_intrinsics,
+    scale_intrinsics,
+)
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.trajectory import Trajectory
 
 FISHEYE, NONE = "fisheye", "none"
 # The undistorted camera's focal lengths over the lens's: a fisheye of over 120 degrees is cut, so that its middle keeps
@@ -30,22 +36,13 @@ _MOST_APART = 2.0  # [px] of a border point and the image of its ray; more where
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera with the images that its lens made.
+    """A camera with the images that its lens made. Raises ValueError: a wrong number of coefficients, or some that are
+    not finite."""
 
-    Attributes:
-        intrinsics: fx, fy, cx, cy [px]; the centre of the first pixel is (0, 0).
-        size: (H, W) of its images.
-        coefficients: of the distortion; () = none.
-        fisheye: whether they are a fisheye's.
-
-    Raises:
-        ValueError: a wrong number of coefficients, or some that are not finite.
-    """
-
-    intrinsics: tuple[float, float, float, float]
-    size: Size
-    coefficients: tuple[float, ...] = ()
-    fisheye: bool = False
+    intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy [px]; the centre of the first pixel is (0, 0)
+    size: Size  # (H, W) of its images
+    coefficients: tuple[float, ...] = ()  # of the distortion; () = none
+    fisheye: bool = False  # whether they are a fisheye's
 
     def __post_init__(self) -> None:
         allowed = (0, 4) if self.fisheye else (0, 4, 5, 8)
@@ -55,29 +52,28 @@ class Lens:
             raise ValueError(f"distortion: {kind} lens has {counts} finite coefficients, got {self.coefficients}")
 
     @property
-    def distorts(self) -> bool:
-        """True if its images differ from a pinhole camera's."""
-        return any(self.coefficients)
-
-    @property
     def K(self) -> np.ndarray:
         """[3, 3] of the undistorted images [px]: the lens's centre, and its focal lengths times the least factor with
         which every pixel of the result lies in the image. Raises ValueError: no lens has these coefficients."""
         K = pinhole(*self.intrinsics)
-        K[:2, :2] *= _zoom(self) if self.distorts else 1.0
+        K[:2, :2] *= _zoom(self) if any(self.coefficients) else 1.0
         return K
 
     def see(self, entry: Entry, depth_size: Size | None = None) -> Entry:
         """The entry of an image of this camera, undistorted, with its intrinsics. A depth map of ``depth_size`` (H, W)
         shows the same view, and each pixel of the result is one of its pixels, never a mean."""
-        image, depth, K_depth = entry.load_image, entry.load_depth, None
-        if depth_size is not None and depth_size != self.size:
-            K_depth = scale_intrinsics(self.K, self.size, depth_size)
-        if self.distorts:
+        image, depth = entry.load_image, entry.load_depth
+        if any(self.coefficients):
             image = image and partial(_undistorted, image, self, self.size, False)
             depth = depth and partial(_undistorted, depth, self, depth_size or self.size, True)
-        cameras: dict[str, Any] = {"intrinsics": self.K, "depth_intrinsics": K_depth, "image_size": self.size}
-        return replace(entry, load_image=image, load_depth=depth, **cameras)
+        return replace(
+            entry,
+            load_image=image,
+            load_depth=depth,
+            intrinsics=self.K,
+            depth_intrinsics=depth_camera_matrix(None, self.K, self.size, depth_size),
+            image_size=self.size,
+        )
 
 
 def parse_distortion(words: str | Sequence[str | float]) -> tuple[tuple[float, ...], bool]:
@@ -105,7 +101,7 @@ def undistort(
     entries = []
     for entry in sequence.entries:
         K, size = sequence.intrinsics_of(entry), entry.image_size or sequence.image_size
-        lens = Lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), size, coefficients, fisheye)
+        lens = Lens(pinhole_values(K), size, coefficients, fisheye)
         seen = lens.see(entry, sequence.depth_size)
         entries.append(seen if depth_too else replace(seen, load_depth=entry.load_depth, depth_intrinsics=None))
     K_depth = entries[0].depth_intrinsics if depth_too else sequence.depth_intrinsics
@@ -121,29 +117,18 @@ def sequence_of_lenses(
     root: Path,
     options: Options,
     *,
-    times: np.ndarray | None = None,
+    own: Callable[[], Trajectory] | None = None,
     metric: bool = True,
 ) -> FrameSequence:
-    """A sequence of cameras that a recording calibrates, its images undistorted.
-
-    Args:
-        name, layout: of the sequence.
-        frames: all on disk, in order.
-        lenses: of the entries' images, one or by frame name. ``options.intrinsics`` replaces them by a pinhole camera.
-        root: its folder, for ``options.trajectory``.
-        options: of the user.
-        times: [N] of the frames [s], for a trajectory; None = not known.
-        metric: whether the frames' own poses are in metres.
-
-    Raises:
-        FileNotFoundError, ValueError: see ``attach_given`` and ``make_sequence``.
-    """
+    """A sequence of cameras that a recording calibrates, its images undistorted; ``frames`` are all on disk, in order.
+    The ``lenses`` are one, or by frame name; ``options.intrinsics`` replaces them by a pinhole camera. ``own`` is the
+    recording's trajectory, see ``attach_given``; ``metric``: whether its poses are in metres."""
     if isinstance(lenses, Lens):
         lenses = dict.fromkeys((frame.name for frame in frames), lenses)
     if options.intrinsics is not None:
-        K = read_intrinsics(options.intrinsics)
-        lenses = {key: Lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), lens.size) for key, lens in lenses.items()}
-    attached = attach_given(frames, root, options, times)
+        values = pinhole_values(read_intrinsics(options.intrinsics))
+        lenses = {key: Lens(values, lens.size) for key, lens in lenses.items()}
+    attached = attach_given(frames, root, options, own)
     size = depth_size(attached)
     seen = [lenses[frame.name].see(frame, size) if isinstance(frame, Entry) else frame for frame in attached]
     first = next((frame for frame in seen if isinstance(frame, Entry)), Entry(name, np.eye(4), None))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.eval.sequences.attach import stem_times
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, read_color
-from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS, parse_pose
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS, in_metres, parse_pose, poses_from_columns
 
 _FPS = 30.0  # of a recording without timestamps
 _POLL = 0.01  # [s] between two looks at a folder
@@ -40,13 +40,8 @@ class LiveEvent:
 
 
 class PoseFile:
-    """A text file of poses (``poses.py`` has its formats, those with timestamps) to which lines are added.
-
-    Args:
-        path: the file, which need not exist yet.
-        convention: of its poses, a key of ``CONVENTIONS``.
-        scale: metres per unit of its positions.
-    """
+    """A text file of poses (``poses.py`` has its formats, those with timestamps) to which lines are added; it need not
+    exist yet. Its poses have a ``convention`` of ``CONVENTIONS``, and positions in units of ``scale`` metres."""
 
     def __init__(self, path: str | Path, convention: str = OURS, scale: float = 1.0) -> None:
         self.path, self._convert, self._scale = Path(path), CONVENTIONS[convention].convert, scale
@@ -68,20 +63,9 @@ class PoseFile:
                 yield LiveEvent(found[0], T_world_cam=in_metres(self._convert(found[1]), self._scale))
 
 
-def in_metres(T_world_cam: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-    """A pose [4, 4] whose positions have units of ``scale`` metres."""
-    T = T_world_cam.copy()
-    T[:3, 3] *= scale
-    return T
-
-
 def replay(sequence: FrameSequence, speed: float = 1.0) -> Iterator[LiveEvent]:
-    """A recording's frames with their poses, each when its time has come; a frame that cannot be decoded is left out.
-
-    Args:
-        sequence: without timestamps, 30 frames a second.
-        speed: 2 = twice as fast; infinity: without waiting.
-    """
+    """A recording's frames with their poses, each when its time has come, without timestamps 30 a second; ``speed`` 2
+    is twice as fast, infinity without waiting. A frame that cannot be decoded is left out."""
     stamps = [entry.timestamp for entry in sequence.entries]
     known = [stamp for stamp in stamps if stamp is not None]
     timed = len(known) == len(stamps) and all(a < b for a, b in pairwise(known))
@@ -100,11 +84,8 @@ def replay(sequence: FrameSequence, speed: float = 1.0) -> Iterator[LiveEvent]:
 
 def camera(index: int, poses: PoseFile) -> Iterator[LiveEvent]:
     """The images of a camera of this computer, stamped with the system's clock (``time.time()``), and the poses of a
-    file that another program writes, with stamps of the same clock.
-
-    Raises:
-        OSError: the camera cannot be opened, or stops.
-    """
+    file that another program writes, with stamps of the same clock. Raises OSError: the camera cannot be opened, or
+    stops."""
     import cv2
 
     capture = cv2.VideoCapture(index)
@@ -123,15 +104,9 @@ def camera(index: int, poses: PoseFile) -> Iterator[LiveEvent]:
 def growing_folder(
     folder: str | Path, poses: PoseFile, idle: float = math.inf, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[LiveEvent]:
-    """The images that are added to a folder from now on, in the order of their names, and the poses of a file.
-
-    A name that is a number is the time of the image ([s], or [ns], [us] as ``stem_times``); of others it is that of the
-    file. Ends after ``idle`` seconds without a new image.
-
-    Raises:
-        FileNotFoundError: no such folder.
-        ValueError: a line of the poses is none.
-    """
+    """The images that are added to a folder from now on, in the order of their names, and the poses of a file. A name
+    that is a number is the time of the image ([s], or [ns], [us] as ``stem_times``); of others it is that of the file.
+    Ends after ``idle`` seconds without a new image. Raises FileNotFoundError: no such folder."""
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"no such folder: {folder}")
@@ -164,14 +139,8 @@ def json_lines(
 
     ``pose`` has 7 numbers, or the 12 or 16 of a matrix (nested or not); ``image`` is a file, or the content of one as
     ``"data:;base64,..."``; ``intrinsics`` are fx, fy, cx, cy. A line has a stamp and at least one of pose and image.
-
-    Args:
-        lines: of text.
-        folder: in which relative files lie.
-        convention, scale: of the poses, as :class:`PoseFile`.
-
-    Raises:
-        ValueError: a line is something else; names its number.
+    Relative files lie in ``folder``; poses are as those of :class:`PoseFile`. Raises ValueError: a line is something
+    else; names its number.
     """
     convert = CONVENTIONS[convention].convert
     for number, line in enumerate(lines, start=1):
@@ -188,8 +157,7 @@ def json_lines(
                 raise ValueError("a stamp and a pose or an image are needed")
             if not isinstance(stamp := about["stamp"], int | float):
                 raise ValueError(f"a stamp is a number [s], got {stamp!r:.40}")
-            stamp = float(stamp)
-            if not math.isfinite(stamp):
+            if not math.isfinite(stamp := float(stamp)):
                 raise ValueError(f"stamp must be finite [s], got {stamp}")
             pose = _pose(about["pose"], convert, scale) if "pose" in about else None
             image = _image(about["image"], Path(folder)) if "image" in about else None
@@ -204,9 +172,7 @@ def _pose(values: Any, convert: Callable[[np.ndarray], np.ndarray], scale: float
     if len(numbers) not in _NUMBERS:
         forms = " or ".join(f"{count} ({form})" for count, form in _NUMBERS.items())
         raise ValueError(f"a pose has {forms} numbers, got {values}")
-    found = parse_pose(" ".join(["0", *map(repr, numbers.tolist())]), "pose")
-    assert found is not None
-    return in_metres(convert(found[1]), scale)
+    return in_metres(convert(poses_from_columns(numbers[None], ["pose"])[0]), scale)
 
 
 def _image(text: Any, folder: Path) -> NDArray[np.uint8]:

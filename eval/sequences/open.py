@@ -3,36 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.images import within
-from ufmstar_torch.eval.sequences.layout import layout_of, readers
+from ufmstar_torch.eval.sequences.layout import READERS, layout_of, readers
 from ufmstar_torch.eval.sequences.lens import parse_distortion, undistort
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS, in_metres
 
-# By prefix of the path, the module and function that render such a sequence; imported on use, since that package
-# imports this one.
-_RENDERED = {"tour:": ("ufmstar_torch.eval.tour.sequence", "open_tour")}
-# Options that a layout has no use for, beside those of KITTI-360 alone.
-_REFUSED = {
-    "tum": "images depth depth_intrinsics fps T_color_depth",
-    "7scenes": "images depth",
-    "scannet": "images depth T_color_depth",
-    "sens": "images depth T_color_depth",
-    "tartanair": "images depth depth_intrinsics T_color_depth",
-    "kitti360": "images T_color_depth",
-    "nyu": "trajectory images depth depth_intrinsics fps T_color_depth distortion",
-    "colmap": "depth_intrinsics T_color_depth distortion",
-    "transforms": "images depth depth_intrinsics T_color_depth distortion",
-    "euroc": "images depth depth_intrinsics T_color_depth distortion",
-    "bag": "images depth depth_intrinsics T_color_depth distortion",
-    "stray": "images depth depth_intrinsics T_color_depth distortion",
-    "arkitscenes": "images depth depth_intrinsics T_color_depth distortion",
-    "generic": "T_color_depth",
+# The layouts that have a use for an option which not all have.
+_TAKEN_BY = {
+    "images": ("colmap", "generic"),
+    "depth": ("kitti360", "colmap", "generic"),
+    "depth_intrinsics": ("7scenes", "scannet", "sens", "kitti360", "generic"),
+    "T_color_depth": ("7scenes",),
+    "distortion": ("tum", "7scenes", "scannet", "sens", "tartanair", "kitti360", "generic"),
+    "topics": ("bag",),
+    "drive": ("kitti360",),
+    "scans": ("kitti360",),
 }
 
 
@@ -58,51 +50,48 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
         ValueError: unknown or ambiguous layout (with what was looked for), an option out of range or of no
             use for the layout, malformed files (named by file and line), or no usable frame.
     """
-    for prefix, (module, name) in _RENDERED.items():
-        if str(path).startswith(prefix):
-            if layout != "auto":
-                raise ValueError(f"layout must be auto for {path!r}, got {layout!r}")
-            if options:
-                raise ValueError(f"{path!r} takes no {', '.join(options)}: a tour's options stand in its name")
-            return convert_poses(getattr(import_module(module), name)(str(path)), poses)
+    if poses not in CONVENTIONS:
+        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
+    if str(path).startswith("tour:"):
+        if layout != "auto":
+            raise ValueError(f"layout must be auto for {path!r}, got {layout!r}")
+        if options:
+            raise ValueError(f"{path!r} takes no {', '.join(options)}: a tour's options stand in its name")
+        # Imported on use, since that package imports this one.
+        return convert_poses(import_module("ufmstar_torch.eval.tour.sequence").open_tour(str(path)), poses)
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"path: no such file or folder: {path}")
     chosen = Options(**options)
-    if poses not in CONVENTIONS:
-        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
     explicit = chosen.images is not None or chosen.trajectory is not None
     layout = layout_of(layout, path, explicit, chosen.plugin)
-    chosen.reject(layout, *_REFUSED.get(layout, "").split(), *(("drive", "scans") if layout != "kitti360" else ()))
-    chosen.reject(layout, *(("topics",) if layout != "bag" else ()))
-    if chosen.trajectory is None and layout != "generic":
-        chosen.reject(layout, "fps")
+    refused = [name for name, layouts in _TAKEN_BY.items() if layout in READERS and layout not in layouts]
+    refused += ["trajectory", "fps"] if layout == "nyu" else []
+    refused += ["fps"] if layout == "tum" or (layout != "generic" and chosen.trajectory is None) else []
+    chosen.reject(layout, *refused)
     sequence = readers(chosen.plugin)[layout].read(path, chosen)
     if chosen.distortion is not None:
         coefficients = parse_distortion(chosen.distortion)
         sequence = undistort(sequence, *coefficients, depth_too=chosen.depth_intrinsics is None)
     sequence = convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), poses)
     if chosen.max_truth is not None:
-        entries = [replace(entry, load_depth=within(entry.load_depth, chosen.max_truth)) for entry in sequence.entries]
+        entries = []
+        for entry in sequence.entries:
+            load_depth = entry.load_depth and partial(within, entry.load_depth, chosen.max_truth)
+            entries.append(replace(entry, load_depth=load_depth))
         sequence = replace(sequence, entries=tuple(entries))
     return sequence if chosen.pose_scale is None else scale_poses(sequence, chosen.pose_scale)
 
 
 def scale_poses(sequence: FrameSequence, metres: float) -> FrameSequence:
     """The sequence with positions in metres, of which a unit of its poses has ``metres``."""
-    scaled = []
-    for entry in sequence.entries:
-        T = entry.T_world_cam.copy()
-        T[:3, 3] *= metres
-        scaled.append(replace(entry, T_world_cam=T))
-    return replace(sequence, entries=tuple(scaled), metric=True, pose_scale=metres * sequence.pose_scale)
+    scaled = tuple(replace(entry, T_world_cam=in_metres(entry.T_world_cam, metres)) for entry in sequence.entries)
+    return replace(sequence, entries=scaled, metric=True, pose_scale=metres * sequence.pose_scale)
 
 
 def convert_poses(sequence: FrameSequence, convention: str) -> FrameSequence:
-    """The sequence with its poses, which were written so, as camera-to-world ones with our axes. Raises ValueError: an
-    unknown convention, or a sequence without poses."""
-    if convention not in CONVENTIONS:
-        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {convention!r}")
+    """The sequence with its poses, which were written so, as camera-to-world ones with our axes. Raises ValueError: a
+    sequence without poses."""
     if convention == OURS:
         return sequence
     if not sequence.posed:

@@ -56,16 +56,17 @@ CONVENTIONS = {
 }
 
 
+def in_metres(T_world_cam: np.ndarray, scale: float) -> np.ndarray:
+    """A pose [4, 4] whose positions have units of ``scale`` metres."""
+    T = T_world_cam.copy()
+    T[:3, 3] *= scale
+    return T
+
+
 def read_trajectory(path: str | Path) -> Trajectory:
-    """Reads a trajectory in any of the formats of this module; ``#`` starts a comment.
-
-    Samples are sorted by time; of two alike with the same timestamp the first is kept.
-
-    Raises:
-        ValueError: a line (named by file and number) is no pose of a known format, the number of columns
-            changes, a quaternion's norm is not 1, a bottom row is not 0 0 0 1, two poses with one timestamp contradict
-            each other; or there is no pose at all.
-    """
+    """Reads a trajectory in any of the formats of this module; ``#`` starts a comment. Samples are sorted by time; of
+    two alike with the same timestamp the first is kept. Raises ValueError: a line (named by file and number) is no pose
+    of a known format, or contradicts another one; or there is no pose at all."""
     rows, lines = _numbers(path)
     for row, where in zip(rows, lines, strict=True):
         if len(row) not in (7, 8, 12, 13, 16, 17):
@@ -105,11 +106,8 @@ def parse_pose(text: str, where: str) -> tuple[float, np.ndarray] | None:
 
 
 def associate(first: np.ndarray, second: np.ndarray, max_difference: float) -> dict[int, int]:
-    """One-to-one pairs {i: j} of timestamps [N] and [M] [s] that differ by at most ``max_difference``.
-
-    As TUM's tool pairs colour and depth: of all admissible pairs the closest comes first, and each
-    timestamp is used once (ties: the earlier one).
-    """
+    """One-to-one pairs {i: j} of timestamps [N] and [M] [s] that differ by at most ``max_difference``, as TUM's tool
+    pairs colour and depth: the closest pair comes first (ties: the earlier one)."""
     order = np.argsort(second, kind="stable")
     ordered = second[order]
     low = np.searchsorted(ordered, first - max_difference, side="left")
@@ -146,11 +144,24 @@ def read_pose(path: str | Path) -> np.ndarray:
 
 
 def poses_from_quaternions(position: np.ndarray, quaternion_xyzw: np.ndarray) -> np.ndarray:
-    """[N, 4, 4] poses from positions [N, 3] [m] and finite quaternions [N, 4], normalised here."""
-    T = np.tile(np.eye(4), (len(position), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(quaternion_xyzw).as_matrix()
-    T[:, :3, 3] = position
+    """[N, 4, 4] poses from positions [N, 3] [m] and quaternions [N, 4], normalised here; NaN where they are not
+    finite."""
+    T = np.full((len(position), 4, 4), np.nan)
+    finite = np.isfinite(position).all(axis=1) & np.isfinite(quaternion_xyzw).all(axis=1)
+    if finite.any():
+        T[finite] = np.eye(4)
+        T[finite, :3, :3] = Rotation.from_quat(quaternion_xyzw[finite]).as_matrix()
+        T[finite, :3, 3] = position[finite]
     return T
+
+
+def trajectory_of(stamps: np.ndarray, position: np.ndarray, quaternion_xyzw: np.ndarray, source: object) -> Trajectory:
+    """Poses as :func:`poses_from_quaternions` in the order of their times [N], one of each. Raises ValueError: there is
+    none in the ``source``."""
+    times, first = np.unique(stamps, return_index=True)
+    if not times.size:
+        raise ValueError(f"{source}: no pose with finite values")
+    return Trajectory(times, poses_from_quaternions(position[first], quaternion_xyzw[first]))
 
 
 def numbered_lines(path: str | Path) -> list[tuple[int, str]]:
@@ -183,35 +194,27 @@ def csv_numbers(words: list[str], where: str) -> list[float]:
 def poses_from_columns(values: np.ndarray, lines: list[str]) -> np.ndarray:
     """[N, 4, 4] from rows of 7 (position, quaternion), 12 or 16 numbers; non-finite rows become NaN. Raises ValueError:
     no rotation in a row, whose FILE:LINE is in ``lines``."""
-    T = np.full((len(values), 4, 4), np.nan)
     finite = np.isfinite(values).all(axis=1)
     if values.shape[1] == 7:
         norm = np.linalg.norm(values[:, 3:], axis=1)
         bad = np.flatnonzero(finite & (np.abs(norm - 1) > _QUATERNION_TOLERANCE))
         if bad.size:
             raise ValueError(f"{lines[bad[0]]}: the quaternion's norm is {norm[bad[0]]:.4g}, expected 1")
-        if finite.any():
-            T[finite] = poses_from_quaternions(values[finite, :3], values[finite, 3:])
-        return T
+        return poses_from_quaternions(values[:, :3], values[:, 3:])
     rows = values.reshape(len(values), -1, 4)
     if rows.shape[1] == 4:
         bad = np.flatnonzero(finite & (np.abs(rows[:, 3] - [0, 0, 0, 1]).max(axis=1) > 1e-6))
         if bad.size:
             raise ValueError(f"{lines[bad[0]]}: a pose's bottom row must be 0 0 0 1, got {rows[bad[0], 3]}")
+    T = np.full((len(values), 4, 4), np.nan)
     T[finite, :3] = rows[finite, :3]
     T[finite, 3] = [0, 0, 0, 1]
     return T
 
 
 def _require_consistent(T_world_cam: np.ndarray, first: np.ndarray, same: np.ndarray, lines: list[str]) -> None:
-    """Raise ValueError where poses [N, 4, 4] with one timestamp contradict each other.
-
-    Args:
-        T_world_cam: in the order of the file.
-        first: [M] index of each timestamp's first pose.
-        same: [N] which of the M timestamps a pose has.
-        lines: FILE:LINE of each pose.
-    """
+    """Raise ValueError where poses [N, 4, 4] with one timestamp contradict each other; ``first`` [M] is the index of
+    each timestamp's first pose, ``same`` [N] which of the M timestamps a pose has, ``lines`` FILE:LINE of each."""
     kept = T_world_cam[first]
     step = np.linalg.norm(np.diff(kept[:, :3, 3], axis=0), axis=1)
     step = step[np.isfinite(step)]

@@ -18,11 +18,10 @@ from PIL import Image
 from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.eval.sequences.images import positive, read_color
 from ufmstar_torch.eval.sequences.lens import Lens
-from ufmstar_torch.eval.sequences.poses import poses_from_quaternions
+from ufmstar_torch.eval.sequences.poses import trajectory_of
 from ufmstar_torch.trajectory import Trajectory, interpolate_pose
 
-DEPTH_ENCODINGS = {"16UC1": "u2", "32FC1": "f4"}
-COMPRESSED_DEPTH = "compressedDepth"
+_DEPTHS = {"16UC1": "u2", "32FC1": "f4"}
 # Encoding: bytes of a pixel, and OpenCV's conversion to RGB (None: it is RGB).
 _COLOURS: dict[str, tuple[int, str | None]] = {
     "rgb8": (3, None),
@@ -62,14 +61,19 @@ def colour(message: Any, path: Path) -> np.ndarray:
     return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}")))
 
 
+def is_depth(message: Any) -> bool:
+    """Whether an Image or CompressedImage is a depth map."""
+    return getattr(message, "encoding", "") in _DEPTHS or "compressedDepth" in getattr(message, "format", "")
+
+
 def depth(message: Any, scale: float | None, path: Path) -> np.ndarray:
     """[H, W] float32 [m], 0 = invalid, of an Image or a CompressedImage of ``compressed_depth_image_transport``;
-    ``scale`` in metres per unit instead of REP 118's. Raises FrameError: it cannot be decoded."""
+    ``scale`` in metres per unit instead of REP 118's."""
     if hasattr(message, "encoding"):
-        if message.encoding not in DEPTH_ENCODINGS:
+        if message.encoding not in _DEPTHS:
             raise FrameError(path, f"depth must be 16UC1 or 32FC1, got {message.encoding!r}")
         order = ">" if message.is_bigendian else "<"
-        values = _rows(message, np.dtype(order + DEPTH_ENCODINGS[message.encoding]), 1, path)
+        values = _rows(message, np.dtype(order + _DEPTHS[message.encoding]), 1, path)
     else:
         values = _compressed_depth(bytes(message.data), str(message.format), path)
     scale = scale or (1e-3 if values.dtype.kind == "u" else 1.0)
@@ -144,13 +148,8 @@ def sample(stamp: float, position: Any, rotation: Any) -> Sample:
 def trajectory(samples: Sequence[Sample]) -> Trajectory:
     """Poses of one frame in another in the order of time, one of each; NaN where the quaternion is none."""
     values = np.array(samples, dtype=np.float64)
-    stamps, first = np.unique(values[:, 0], return_index=True)
-    values = values[first, 1:]
-    usable = np.isfinite(values).all(axis=1) & (np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1) < _NORM_TOLERANCE)
-    T = np.full((len(stamps), 4, 4), np.nan)
-    if usable.any():
-        T[usable] = poses_from_quaternions(values[usable, :3], values[usable, 3:])
-    return Trajectory(stamps, T)
+    values[np.abs(np.linalg.norm(values[:, 4:], axis=1) - 1) >= _NORM_TOLERANCE, 1:] = np.nan
+    return trajectory_of(values[:, 0], values[:, 1:4], values[:, 4:], "tf")
 
 
 class FrameTree:
@@ -182,9 +181,8 @@ class FrameTree:
         """True if any of these frames moves in its parent."""
         return any(len(self._edge(frame)) > 1 for frame in frames)
 
-    def at(self, frame: str, above: str, time: float, max_gap: float) -> np.ndarray | None:
-        """[4, 4] the pose of ``frame`` in ``above``, one of its chain, at ``time`` [s]; None where a sample is missing
-        (``interpolate_pose``)."""
+    def _at(self, frame: str, above: str, time: float, max_gap: float) -> np.ndarray | None:
+        """[4, 4] the pose of ``frame`` in ``above``, one of its chain."""
         T, listed = np.eye(4), self.chain(frame)
         for child in listed[: listed.index(above)]:
             edge = self._edge(child)
@@ -195,13 +193,12 @@ class FrameTree:
         return T
 
     def between(self, frame: str, other: str, time: float, max_gap: float) -> np.ndarray | None:
-        """[4, 4] the pose of ``frame`` in ``other``, as :meth:`at`. Raises ValueError: nothing connects them."""
+        """[4, 4] the pose of ``frame`` in ``other``, with which tf connects it, at ``time`` [s]; None where a sample is
+        missing (``interpolate_pose``)."""
         above = self.chain(other)
-        common = next((name for name in self.chain(frame) if name in above), None)
-        if common is None:
-            raise ValueError(f"tf does not connect the frames {other!r} and {frame!r}")
-        T_common_frame = self.at(frame, common, time, max_gap)
-        T_common_other = self.at(other, common, time, max_gap)
+        common = next(name for name in self.chain(frame) if name in above)
+        T_common_frame = self._at(frame, common, time, max_gap)
+        T_common_other = self._at(other, common, time, max_gap)
         if T_common_frame is None or T_common_other is None:
             return None
         return np.asarray(np.linalg.inv(T_common_other) @ T_common_frame)

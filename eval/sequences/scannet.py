@@ -26,15 +26,9 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a SensReader export; depth comes as it is, with ``depth_intrinsics``.
-
-    Exports with resized images keep the original ``intrinsic_color.txt``: intrinsics that fit 1296x968
-    (depth: 640x480) but not the files' size are scaled to it.
-
-    Raises:
-        ValueError: no usable frame, intrinsics that fit neither size, a malformed pose file.
-        FileNotFoundError: no ``intrinsic_color.txt`` and ``intrinsics`` is not given.
-    """
+    """Opens a SensReader export; depth comes as it is, with ``depth_intrinsics``. Exports with resized images keep the
+    original ``intrinsic_color.txt``: intrinsics that fit 1296x968 (depth: 640x480) but not the files' size are scaled
+    to it. Raises ValueError: no usable frame, intrinsics that fit neither size, a malformed pose file."""
     images = list_images(path / "color")
     frames = [_frame(path, image, options) for image in images]
     if not images:
@@ -43,10 +37,8 @@ def read(path: Path, options: Options) -> FrameSequence:
     color_size = first_image_size(images) or _NATIVE_COLOR
     size = depth_size(frames)
     K = _intrinsics(options.intrinsics, path / "intrinsic" / "intrinsic_color.txt", _NATIVE_COLOR, color_size)
-    K_depth = None
-    if size is not None:
-        file = path / "intrinsic" / "intrinsic_depth.txt"
-        K_depth = _intrinsics(options.depth_intrinsics, file, _NATIVE_DEPTH, size)
+    file = path / "intrinsic" / "intrinsic_depth.txt"
+    K_depth = None if size is None else _intrinsics(options.depth_intrinsics, file, _NATIVE_DEPTH, size)
     return make_sequence(
         path.resolve().name, "scannet", frames, K, image_size=color_size, depth_intrinsics=K_depth, depth_size=size
     )
@@ -62,6 +54,4 @@ def _intrinsics(given: IntrinsicsLike | None, file: Path, native: Size, size: Si
     if given is not None:
         return read_intrinsics(given)
     K = read_intrinsics(file)
-    if not fits(K, size) and fits(K, native):
-        return scale_intrinsics(K, native, size)
-    return K
+    return scale_intrinsics(K, native, size) if not fits(K, size) and fits(K, native) else K

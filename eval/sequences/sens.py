@@ -18,7 +18,7 @@ from typing import BinaryIO
 import numpy as np
 
 from ufmstar_torch.eval.sequences import scannet
-from ufmstar_torch.eval.sequences.attach import attach_given
+from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import read_color
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix
@@ -55,14 +55,9 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a ``.sens`` file; depth comes as it is, with ``depth_intrinsics``, as from a SensReader export.
-
-    Frames are called by their number. In a truncated file, those before the break are used and the others skipped.
-
-    Raises:
-        ValueError: not version 4; compressions other than jpeg or png and zlib_ushort; a broken header; no usable
-            frame.
-    """
+    """Opens a ``.sens`` file; depth comes as it is, with ``depth_intrinsics``, as from a SensReader export. Frames are
+    called by their number. In a truncated file, those before the break are used and the others skipped. Raises
+    ValueError: another version or compression, a broken header, or no usable frame."""
     file = _files(path)[0] if path.is_dir() else path
     with file.open("rb") as opened:
         header = _read_header(opened, file)
@@ -72,8 +67,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         color_size, depth_size = (tuple(header[key].tolist()[::-1]) for key in ("color_size", "depth_size"))
         scale = options.depth_scale or 1 / float(header["units_per_metre"])
         frames = _frames(opened, file, int(header["frames"]), depth_size, scale)
-    times = [np.nan if isinstance(f, Skipped) or f.timestamp is None else f.timestamp for f in frames]
-    frames = attach_given(frames, file.parent, options, np.array(times) if np.isfinite(times).all() else None)
+    frames = attach_given(frames, file.parent, options)
     for number in range(len(frames), int(header["frames"])):
         frames.append(Skipped(str(number), "beyond the end of the truncated file"))
     K_color, K_depth = (header[key][:3, :3].astype(np.float64) for key in ("K_color", "K_depth"))
@@ -150,14 +144,11 @@ def _frames(file: BinaryIO, path: Path, count: int, depth_size: Size, scale: flo
         time = float(frame["times"][0]) * _MICROSECOND or None
         load_depth = partial(_read_depth, path, depth_at, depth_bytes, depth_size, scale) if depth_bytes else None
         load_color = partial(_read_color, path, color_at, color_bytes)
-        frames.append(Entry(name, _rigid(frame["T_world_cam"].astype(np.float64)), load_color, load_depth, time))
+        T = frame["T_world_cam"].astype(np.float64)
+        if not np.abs(T[3] - [0, 0, 0, 1]).max() < 1e-6:  # -inf or 0: it was not tracked
+            T = UNKNOWN
+        frames.append(Entry(name, T, load_color, load_depth, time))
     return frames
-
-
-def _rigid(T: np.ndarray) -> np.ndarray:
-    """The pose, all NaN if an entry is not finite or it is all 0, as frames that were not tracked are written."""
-    usable = np.isfinite(T).all() and np.abs(T[3] - [0, 0, 0, 1]).max() < 1e-6
-    return T if usable else np.full((4, 4), np.nan)
 
 
 def _read_color(path: Path, offset: int, size: int) -> np.ndarray:

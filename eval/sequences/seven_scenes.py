@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import attach_given, frame_of_files
-from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, make_sequence
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
 from ufmstar_torch.eval.sequences.images import depth_size, first_image_size, natural_key, read_map
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
@@ -44,13 +44,9 @@ def detect(path: Path) -> bool:
 def read(path: Path, options: Options) -> FrameSequence:
     """Opens a 7-Scenes sequence folder (``seq-NN``).
 
-    With ``register`` (the default) depth is warped into the colour camera, and ``T_world_cam`` is the
-    colour camera's: the file's pose, which is the depth camera's, times ``T_color_depth``'s inverse.
-    Without it, depth and pose are the depth camera's as on disk, with ``depth_intrinsics``, and the
-    2.5 cm to the colour camera are ignored. A given ``trajectory`` is the colour camera's in any case.
-
-    Raises:
-        ValueError: no usable frame, or a malformed pose file.
+    With ``register`` (the default) depth is warped into the colour camera, and ``T_world_cam`` is the colour camera's.
+    Without it, both are the depth camera's as on disk, with ``depth_intrinsics``, and the 2.5 cm to the colour camera
+    are ignored. A given ``trajectory`` is the colour camera's in any case.
     """
     files: dict[str, dict[str, Path]] = {}
     for file in sorted(path.iterdir(), key=natural_key):
@@ -58,16 +54,23 @@ def read(path: Path, options: Options) -> FrameSequence:
         if found:
             files.setdefault(found[1], {})[found[2].split(".")[0]] = file
     color_size = first_image_size(kinds["color"] for kinds in files.values() if "color" in kinds) or _NATIVE_SIZE
-    frames = [_frame(name, kinds, options.depth_scale or _MILLIMETRE, options) for name, kinds in files.items()]
+    frames = []
+    for name, kinds in files.items():
+        load = partial(_read_depth, kinds["depth"], options.depth_scale or _MILLIMETRE) if "depth" in kinds else None
+        frames.append(frame_of_files(name, kinds.get("color"), kinds.get("pose"), load, options))
     own_size = depth_size(frames)
     K_color = camera_matrix(options.intrinsics, pinhole(*_K_COLOR), _NATIVE_SIZE, color_size)
     K_depth = camera_matrix(options.depth_intrinsics, pinhole(*_K_DEPTH), _NATIVE_SIZE, own_size)
     T_color_depth = _T_COLOR_DEPTH if options.T_color_depth is None else options.T_color_depth
     if not isinstance(T_color_depth, np.ndarray):
         T_color_depth = read_pose(resolve(path, T_color_depth))
-    if options.register:
-        cameras = K_depth, K_color, T_color_depth, color_size
-        frames = [_registered(frame, *cameras) if isinstance(frame, Entry) else frame for frame in frames]
+    for i, frame in enumerate(frames if options.register else ()):
+        if isinstance(frame, Entry):
+            load = frame.load_depth and partial(
+                _registered, frame.load_depth, K_depth, K_color, T_color_depth, color_size
+            )
+            T_world_color = frame.T_world_cam @ np.linalg.inv(T_color_depth)
+            frames[i] = replace(frame, T_world_cam=T_world_color, load_depth=load)
     frames = attach_given(frames, path, options)
     return make_sequence(
         path.resolve().name,
@@ -88,16 +91,5 @@ def _read_depth(path: Path, scale: float) -> np.ndarray:
     return np.where(values == _NO_DEPTH, 0, values * scale).astype(np.float32)
 
 
-def _frame(name: str, kinds: dict[str, Path], scale: float, options: Options) -> Entry | Skipped:
-    load_depth = partial(_read_depth, kinds["depth"], scale) if "depth" in kinds else None
-    return frame_of_files(name, kinds.get("color"), kinds.get("pose"), load_depth, options)
-
-
-def _registered(frame: Entry, K_depth: np.ndarray, K_color: np.ndarray, T_color_depth: np.ndarray, size: Size) -> Entry:
-    """The frame of the depth camera as the colour camera's."""
-    load = frame.load_depth and partial(_load_registered, frame.load_depth, K_depth, K_color, T_color_depth, size)
-    return replace(frame, T_world_cam=frame.T_world_cam @ np.linalg.inv(T_color_depth), load_depth=load)
-
-
-def _load_registered(load: Loader, *cameras: Any) -> np.ndarray:
+def _registered(load: Loader, *cameras: Any) -> np.ndarray:
     return register_depth(load(), *cameras)

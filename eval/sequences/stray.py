@@ -32,11 +32,8 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a recording; frames are called by their number. Rows beyond the video's end are skipped.
-
-    Raises:
-        ValueError: a malformed file (named by line), no video, or no usable frame.
-    """
+    """Opens a recording; frames are called by their number. Rows beyond the video's end are skipped. Raises ValueError:
+    a malformed file (named by line), no video, or no usable frame."""
     rows = csv_rows(path / _ODOMETRY)
     names = [word.lower() for word in rows[0][0]] if rows else []
     if missing := [name for name in _COLUMNS if name not in names]:
@@ -70,8 +67,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         load = partial(_depth, file, path / "confidence" / file.name, options.depth_scale) if file.is_file() else None
         time = float(column["timestamp"][row])
         frames.append(Entry(name, T, partial(video.read, int(number)), load, time))
-    times = column["timestamp"]
-    return sequence_of_lenses(path.resolve().name, "stray", frames, lenses, path, options, times=times)
+    return sequence_of_lenses(path.resolve().name, "stray", frames, lenses, path, options)
 
 
 def _camera_matrix(file: Path) -> np.ndarray:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, depth_loader, image_size, read_color
 from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
@@ -27,7 +28,6 @@ LOOKED_FOR = f"{FILE}, also in one of its own name *.json"
 # Of a file or of one of its frames that structure from motion made.
 _NOT_METRIC = ("aabb_scale", "colmap_im_id")
 _SIGMA = "sigma_file_path"  # of a frame of `ufmstar export`
-_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
 _MODELS = (*_FISHEYES, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "")
 
@@ -38,16 +38,12 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens the frames in the file's order; one whose image is missing is skipped.
-
-    Raises:
-        ValueError: no JSON of this layout (the entry is named), an unknown camera model, or no usable frame.
-    """
+    """Opens the frames in the file's order. Raises ValueError: no JSON of this layout (the entry is named), an unknown
+    camera model, or no usable frame."""
     file = path if path.is_file() else path / FILE
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-        listed = content["frames"]
-        frames = [dict(frame) for frame in listed]
+        frames = [dict(frame) for frame in content["frames"]]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{file}: expected JSON with a list 'frames' of objects: {error}") from error
     scale = options.depth_scale or _number(content, "depth_unit_scale_factor", file, 0.001)
@@ -57,7 +53,9 @@ def read(path: Path, options: Options) -> FrameSequence:
     short = len({image.stem for image in paths}) == len(paths)
     for frame, image in zip(frames, paths, strict=True):
         name = image.stem if short else str(image.with_suffix("")).strip("/").replace("/", "__")
-        found = next((p for p in _candidates(file.parent / image) if p.is_file()), None)
+        whole = file.parent / image  # or without its ending, as in NeRF's synthetic scenes
+        candidates = (whole, *(whole.with_name(whole.name + suffix) for suffix in IMAGE_SUFFIXES))
+        found = next((path for path in candidates if path.is_file()), None)
         if found is None:
             entries.append(Skipped(name, "missing image file"))
             continue
@@ -83,11 +81,6 @@ def _path(frame: Mapping[str, Any], file: Path) -> Path:
     return Path(value)
 
 
-def _candidates(image: Path) -> list[Path]:
-    """The image, or with an ending, which NeRF's synthetic scenes leave out."""
-    return [image, *(image.with_name(image.name + suffix) for suffix in IMAGE_SUFFIXES)]
-
-
 def _pose(frame: Mapping[str, Any], file: Path) -> np.ndarray:
     """[4, 4] camera-to-world with our axes, NaN where it is not finite."""
     try:
@@ -98,7 +91,7 @@ def _pose(frame: Mapping[str, Any], file: Path) -> np.ndarray:
         raise ValueError(f"{file}: {frame['file_path']}: transform_matrix must be 4x4 numbers: {error}") from error
     T = np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
     if not np.isfinite(T).all():
-        return np.full((4, 4), np.nan)
+        return UNKNOWN
     if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
         raise ValueError(f"{file}: {frame['file_path']}: transform_matrix must be a rotation and a position, got {T}")
     return CONVENTIONS["opengl"].convert(T)
@@ -120,13 +113,9 @@ def _lens(values: Mapping[str, Any], size: Size, file: Path) -> Lens:
     cx, cy = _number(values, "cx", file, width / 2), _number(values, "cy", file, height / 2)
     sx, sy = size[1] / width, size[0] / height
     fisheye = model in _FISHEYES or values.get("is_fisheye") is True
-    known = [_number(values, key, file, 0.0) for key in _COEFFICIENTS]
-    k1, k2, p1, p2, k3, k4 = known
-    if fisheye:
-        coefficients: tuple[float, ...] = (k1, k2, k3, k4)
-    else:
-        coefficients = (k1, k2, p1, p2, k3, k4, 0.0, 0.0) if k4 else (k1, k2, p1, p2, k3)
-    return Lens((fx * sx, fy * sy, cx * sx - 0.5, cy * sy - 0.5), size, coefficients, fisheye)
+    k1, k2, p1, p2, k3, k4 = (_number(values, key, file, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4"))
+    coefficients = [k1, k2, k3, k4] if fisheye else [k1, k2, p1, p2, k3] + [k4, 0.0, 0.0] * bool(k4)
+    return Lens((fx * sx, fy * sy, cx * sx - 0.5, cy * sy - 0.5), size, tuple(coefficients), fisheye)
 
 
 def _number(values: Mapping[str, Any], key: str, file: Path, default: float) -> float:

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach
-from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, make_sequence
-from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, read_color
+from ufmstar_torch.eval.sequences.attach import attach_given, frame_of_image
+from ufmstar_torch.eval.sequences.frame import FrameSequence, make_sequence
+from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size
 from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.lens import undistort
-from ufmstar_torch.eval.sequences.options import Options, resolve
+from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import associate, numbered_lines, read_trajectory
 
 LOOKED_FOR = "rgb.txt and groundtruth.txt"
@@ -38,31 +38,23 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a TUM RGB-D sequence.
-
-    A colour image is skipped where it is missing on disk or no pose is known at its time (the samples
-    around it lie more than ``max_pose_gap`` apart, or it is outside the trajectory). One without a depth
-    map within ``max_time_difference`` stays, with ``depth`` None. The lens's published distortion is undone, in
-    images and depth, unless ``distortion`` or ``intrinsics`` is given.
-
-    Raises:
-        ValueError: no usable frame; the camera is not named by the folder or the files (``freiburgN``) and
-            ``intrinsics`` is not given; a malformed line (named by file and number).
-    """
-    given = options.trajectory
-    color_times, color_files = read_file_list(path / "rgb.txt")
-    trajectory = read_trajectory(path / "groundtruth.txt" if given is None else resolve(path, given))
-    depth_files = _paired_depth(path, color_times, options.max_time_difference)
-    frames: list[Entry | Skipped] = []
-    for i, file in enumerate(color_files):
-        if (path / file).is_file():
-            load_depth = depth_loader(depth_files.get(i), options.depth_scale, SCALE)
-            frames.append(Entry(Path(file).stem, UNKNOWN, partial(read_color, path / file), load_depth))
-        else:
-            frames.append(Skipped(Path(file).stem, "missing image file"))
-    frames = attach(frames, color_times + options.time_offset, trajectory, options)
-    size = first_image_size(path / file for file in color_files)
-    K = _default_intrinsics(path, size) if options.intrinsics is None else read_intrinsics(options.intrinsics)
+    """Opens a TUM RGB-D sequence. An image without a depth map within ``max_time_difference`` stays, with ``depth``
+    None. The lens's published distortion is undone, in images and depth, unless ``distortion`` or ``intrinsics`` is
+    given. Raises ValueError: no usable frame; neither the folder nor the files name the camera (``freiburgN``) and
+    ``intrinsics`` is not given; a malformed line."""
+    times, files = read_file_list(path / "rgb.txt")
+    depth_files = _paired_depth(path, times, options.max_time_difference)
+    loaders = [depth_loader(depth_files.get(i), options.depth_scale, SCALE) for i in range(len(files))]
+    frames = [
+        frame_of_image(Path(file).stem, path / file, load_depth, timestamp=float(time))
+        for file, load_depth, time in zip(files, loaders, times, strict=True)
+    ]
+    frames = attach_given(frames, path, options, partial(read_trajectory, path / "groundtruth.txt"))
+    size = first_image_size(path / file for file in files)
+    if options.intrinsics is None:
+        K = scale_intrinsics(pinhole(*_INTRINSICS[_robot(path)]), _NATIVE_SIZE, size)
+    else:
+        K = read_intrinsics(options.intrinsics)
     sequence = make_sequence(path.resolve().name, "tum", frames, K, image_size=size, depth_size=depth_size(frames))
     if options.distortion is not None or options.intrinsics is not None or size is None:
         return sequence
@@ -91,12 +83,7 @@ def _paired_depth(path: Path, color_times: np.ndarray, max_difference: float) ->
         return {}
     depth_times, depth_files = read_file_list(path / "depth.txt")
     pairs = associate(color_times, depth_times, max_difference)
-    files = {i: path / depth_files[j] for i, j in pairs.items()}
-    return {i: file for i, file in files.items() if file.is_file()}
-
-
-def _default_intrinsics(path: Path, size: Size | None) -> np.ndarray:
-    return scale_intrinsics(pinhole(*_INTRINSICS[_robot(path)]), _NATIVE_SIZE, size)
+    return {i: path / depth_files[j] for i, j in pairs.items() if (path / depth_files[j]).is_file()}
 
 
 def _robot(path: Path) -> str:

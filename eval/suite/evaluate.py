@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from ufmstar_torch.eval.engine.anchors import landmark_digests
 from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, evaluate_sequence
 from ufmstar_torch.eval.engine.judge import RowFigures, references
 from ufmstar_torch.eval.engine.progress import Progress
+from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.machine import hardware, versions
@@ -22,7 +24,6 @@ from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.work_items import WorkItem, content_digest
 from ufmstar_torch.recalibrate import Recalibration
 
-Evaluate = Callable[..., list[RowFigures]]
 _NO_POSES = "its images have no poses: the rows of networks alone are finished, {} that compare views cannot be had"
 _FITTED = "{} recalibrated rows were fitted to this sequence and are not judged on it"
 
@@ -34,7 +35,6 @@ def evaluate_item(
     *,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[Progress], object] = lambda _: None,
-    evaluate: Evaluate = evaluate_sequence,
 ) -> str:
     """Compute and store the missing rows of a sequence, or why they cannot be computed.
 
@@ -42,8 +42,8 @@ def evaluate_item(
         job: its folder is open.
         item: the sequence.
         judge: of the job.
-        stop, progress: see ``evaluate_sequence``; nothing is stored of a sequence that is stopped.
-        evaluate: computes rows on a sequence.
+        stop: see ``evaluate_sequence``; nothing is stored of a sequence that is stopped.
+        progress: likewise, with the sequence's label as the stage.
 
     Returns:
         A line about the sequence, "" where nothing was missing.
@@ -53,6 +53,8 @@ def evaluate_item(
         FolderError: earlier results were computed from another sequence of that name.
         CacheError, OSError: nothing can be written.
     """
+    if stop():
+        raise Stopped
     folder, started = EvalFolder(job.out), time.monotonic()
     missing = folder.begin(item, job.suite.rows)
     try:
@@ -70,8 +72,12 @@ def evaluate_item(
     if todo:
         sinks = [ExampleWriter(folder.sequence_folder(item))] if job.stores_examples(item) else []
         needed = with_references(todo, possible)
+
+        def shown(now: Progress) -> None:
+            progress(replace(now, stage=item.label))
+
         try:
-            results = evaluate(sequence, needed, judge, sinks=sinks, stop=stop, progress=progress)
+            results = evaluate_sequence(sequence, needed, judge, sinks=sinks, stop=stop, progress=shown)
         except BROKEN as error:
             return folder.fail(item, error, missing)
         for result in results:

@@ -1,38 +1,37 @@
-"""The division of an evaluation: static shards of its sequences.
+"""The division of an evaluation: static shards of its sequences, and a task for each sequence of a shard.
 
-A shard is chosen by ``--shard`` (one job of a cluster's array, say) or by torchrun's rank, and is divided among
-``--processes`` in the same way. A sequence belongs to one shard; a record that exists is not computed again, so that a
-killed evaluation continues where it was.
+A shard is chosen by ``--shard`` (one job of a cluster's array, say) or by torchrun's rank; ``--processes`` evaluates it
+in a pool of processes. A record that exists is not computed again, so that a killed evaluation continues where it was.
 """
 
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import os
 import re
 import signal
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
+from threading import Thread
 from typing import Any
 
 import torch
-from torch.multiprocessing import ProcessExitedException, ProcessRaisedException, spawn
 
-from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.run.machine import available_cores, device_of
-from ufmstar_torch.eval.suite.evaluate import Evaluate, evaluate_item
+from ufmstar_torch.eval.suite.evaluate import evaluate_item
 from ufmstar_torch.eval.suite.folder import EvalFolder
 from ufmstar_torch.eval.suite.job import EvalJob
-from ufmstar_torch.eval.suite.work_items import Shard
+from ufmstar_torch.eval.suite.work_items import Shard, WorkItem
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
 _POLL_SECONDS = 0.1
-KILLED = "a process was killed (for want of memory?), which ends the others too"
 
 Stop = Callable[[], bool]
 Report = Callable[[str], None]
@@ -60,40 +59,45 @@ def evaluate_suite(
     stop: Stop = lambda: False,
     report: Report = lambda _: None,
     progress: Shown = lambda _: None,
-    evaluate: Evaluate = evaluate_sequence,
 ) -> EvalOutcome:
     """Evaluate the sequences of a shard.
 
     Args:
         job: what is evaluated.
         shard: which part; None: torchrun's rank, or else everything.
-        processes: number of processes on this computer, each of which evaluates a part of the shard.
+        processes: number of processes on this computer that evaluate sequences of the shard.
         threads: of the CPU for each process; None: torch's choice for one process, all cores divided among several.
         resume, overwrite: see ``EvalFolder.open``. The shards of an evaluation start in any order, so that each of
             several resumes what the first one has begun.
         stop: called before every frame; True ends the work.
-        report: receives a line for every finished sequence; that of several processes goes to standard error.
-        progress: called after every frame, with the sequence's label as the stage; one process alone.
-        evaluate: see :func:`evaluate_item`; one process alone.
+        report: receives a line for every finished sequence.
+        progress: called after every frame, with the sequence's label as the stage; of several processes, after every
+            sequence.
 
     Raises:
         FolderError, FileNotFoundError, ValueError, ImportError: the work cannot be begun.
         CacheError, OSError: nothing can be written.
-        RuntimeError: one of several processes failed.
+        RuntimeError: one of several processes failed; the message names the sequence.
     """
     shard, local = (shard, 0) if shard is not None else rank_of(os.environ)
     if overwrite and shard.count > 1:
         raise ValueError("--overwrite goes without shards: another one may have begun")
+    if processes == 1 and threads is not None:
+        torch.set_num_threads(threads)
+    device = torch.device(device_of(job.device, local) if processes == 1 else "cpu")
+    networks, items, folder = job.load(device), shard.of(job.items), EvalFolder(job.out)
     how = {"resume": resume or shard.count > 1, "overwrite": overwrite}
-    if processes > 1:
-        with EvalFolder.open(job.out, job.about(job.load(torch.device("cpu"))), shard=shard, **how):
-            pass  # mistakes are reported once, before any process starts
-        threads = threads or max(1, available_cores() // processes)
-        part = partial(_evaluate_part, job, shard, local, processes, threads)
-        finished = in_processes(part, processes, stop, report)
-    else:
-        finished = _evaluate(job, shard, local, threads, how, stop, report, progress, evaluate)
-    folder = EvalFolder(job.out)
+    with EvalFolder.open(job.out, job.about(networks), shard=shard, **how), warned_once():
+        if processes > 1:
+            numbers = range(local * processes, (local + 1) * processes)
+            finished = _in_processes(job, items, numbers, threads, stop, report, progress)
+        else:
+            judge, finished = job.judge(networks, device), False
+            with suppress(Stopped):
+                for item in items:
+                    if line := evaluate_item(job, item, judge, stop=stop, progress=progress):
+                        report(line)
+                finished = True
     complete = all(folder.is_finished(item, job.suite.rows) for item in job.items)
     return EvalOutcome(finished, stop(), complete, folder.failures(job.items))
 
@@ -112,83 +116,75 @@ def rank_of(environment: Mapping[str, str]) -> tuple[Shard, int]:
     return Shard(rank + 1, world), local
 
 
-def in_processes(task: Callable[[int], object], processes: int, stop: Stop, report: Report) -> bool:
-    """Run a task in processes, with the number of each, and wait for them; whether all finished. They end with this
-    one, also when it is killed. Raises RuntimeError: one failed; the others are ended."""
-    context = spawn(_child, (task,), processes, join=False)
-    finished = False
-    try:
-        while not finished and not stop():
-            finished = context.join(_POLL_SECONDS)
-    except ProcessExitedException:
-        if not stop():  # a signal to all processes of a terminal or a cluster's job
-            report(KILLED)
-    except ProcessRaisedException as error:
-        if not stop():
-            raise RuntimeError(str(error).strip().splitlines()[-1]) from error
-    finally:
-        for process in context.processes:
-            process.terminate()
-            process.join()
-    return finished
-
-
-def _child(number: int, task: Callable[[int], object]) -> None:
-    """Run the task in its process."""
-    # torch sends SIGINT to a process whose parent has died; a shell's background jobs ignore it.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    task(number)
-
-
-def _evaluate_part(job: EvalJob, shard: Shard, local: int, processes: int, threads: int, number: int) -> None:
-    """Evaluate one of equal parts of a shard."""
-    part = Shard(shard.index + shard.count * number, shard.count * processes)
-    how = {"resume": True, "overwrite": False}
-
-    def report(line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
-
-    _evaluate(job, part, local * processes + number, threads, how, lambda: False, report)
-
-
-def _evaluate(
+def _in_processes(
     job: EvalJob,
-    shard: Shard,
-    local: int,
+    items: Sequence[WorkItem],
+    numbers: Sequence[int],
     threads: int | None,
-    how: Mapping[str, Any],
     stop: Stop,
     report: Report,
-    progress: Shown = lambda _: None,
-    evaluate: Evaluate = evaluate_sequence,
+    progress: Shown,
 ) -> bool:
-    """Evaluate one sequence of a shard after another in this process; whether all were done."""
-    if threads is not None:
-        torch.set_num_threads(threads)
-    device = torch.device(device_of(job.device, local))
-    networks = job.load(device)
-    try:
-        with EvalFolder.open(job.out, job.about(networks), shard=shard, **how), warned_once():
-            judge = job.judge(networks, device)
-            for item in shard.of(job.items):
-                if stop():
-                    return False
+    """Evaluate sequences in a pool of processes of these ``numbers``, a task each; whether all were done. Raises
+    RuntimeError: a task failed; the others end after their frame."""
+    context = multiprocessing.get_context("spawn")
+    stopped, queue = context.Event(), context.SimpleQueue()
+    for number in numbers:
+        queue.put(number)
+    threads = threads or max(1, available_cores() // len(numbers))
+    waiting, running = list(items), dict[Future[str], WorkItem]()
+    with ProcessPoolExecutor(len(numbers), context, _begin, (job, queue, threads, stopped)) as pool:
+        try:
+            while (waiting or running) and not stop():
+                while waiting and len(running) < len(numbers):
+                    item = waiting.pop(0)
+                    running[pool.submit(_evaluate, item)] = item
+                for future in wait(running, _POLL_SECONDS, FIRST_COMPLETED).done:
+                    error = future.exception()
+                    if error is not None and not isinstance(error, BrokenProcessPool):
+                        raise RuntimeError(f"{running[future].label}: {type(error).__name__}: {error}") from error
+                    if line := future.result():
+                        report(line)
+                    del running[future]
+                    progress(Progress("sequences", len(items) - len(waiting) - len(running), len(items)))
+        except BrokenProcessPool:
+            if not stop():  # a signal to all processes of a terminal or a cluster's job
+                labels = ", ".join(item.label for item in running.values())
+                report(f"a process was killed (for want of memory?) at one of {labels}, which ends the others too")
+        finally:
+            stopped.set()
+    return not (waiting or running)
 
-                def shown(now: Progress, label: str = item.label) -> None:
-                    progress(replace(now, stage=label))
 
-                if line := evaluate_item(job, item, judge, stop=stop, progress=shown, evaluate=evaluate):
-                    report(line)
-    except Stopped:
-        return False
-    return True
+_evaluate_here: Callable[[WorkItem], str]  # in a process of the pool
 
 
-@contextmanager
-def warned_once() -> Iterator[None]:
-    """Within the context, a warning of the package is logged once, whichever stream and numbers it names: the rows of a
-    suite are many streams."""
-    logger, logged = logging.getLogger("ufmstar_torch"), set[str]()
+def _begin(job: EvalJob, numbers: Any, threads: int, stopped: Any) -> None:
+    """Prepare a process of the pool."""
+    global _evaluate_here
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the parent as well, which sets ``stopped``
+    Thread(target=_end_with_parent, daemon=True).start()
+    torch.set_num_threads(threads)
+    logging.getLogger("ufmstar_torch").addFilter(_once())
+    device = torch.device(device_of(job.device, numbers.get()))
+    _evaluate_here = partial(evaluate_item, job, judge=job.judge(job.load(device), device), stop=stopped.is_set)
+
+
+def _evaluate(item: WorkItem) -> str:
+    return _evaluate_here(item)
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent has ended, however that happened: a process of a pool would wait for ever."""
+    if (parent := multiprocessing.parent_process()) is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _once() -> Callable[[logging.LogRecord], bool]:
+    """A filter that passes a warning once, whichever stream and numbers it names: the rows of a suite are many
+    streams."""
+    logged: set[str] = set()
 
     def first(record: logging.LogRecord) -> bool:
         text = re.sub(r"\d+", "", record.getMessage())
@@ -196,8 +192,15 @@ def warned_once() -> Iterator[None]:
         logged.add(text)
         return not known
 
-    logger.addFilter(first)
+    return first
+
+
+@contextmanager
+def warned_once() -> Iterator[None]:
+    """Within the context, a warning of the package is logged once."""
+    logger, once = logging.getLogger("ufmstar_torch"), _once()
+    logger.addFilter(once)
     try:
         yield
     finally:
-        logger.removeFilter(first)
+        logger.removeFilter(once)

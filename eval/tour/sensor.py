@@ -12,12 +12,8 @@ _EXPOSURE_SPREAD, _VIGNETTE, _SHOT, _READ = 0.08, 0.25, 0.012, 0.006
 
 
 def develop(color: Tensor, seed: int | None = None) -> Tensor:
-    """[H, W, 3] uint8 sRGB of linear light [3, H, W].
-
-    Args:
-        color: 1 is white.
-        seed: of the sensor's exposure, vignetting and noise; None = none of them.
-    """
+    """[H, W, 3] uint8 sRGB of linear light [3, H, W], where 1 is white; ``seed`` of the sensor's exposure, vignetting
+    and noise, None = none of them."""
     # A few pixels tell the brightness; so few are summed in one order for any number of threads.
     mean = float(color[:, ::_SPARSE, ::_SPARSE].mean())
     light = (_GREY / max(mean, _GREY / 8)) ** _ADAPTATION * color

@@ -44,7 +44,8 @@ def shade(tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin:
     own = surface[order]
     kinds, rooms = _merged(spans, _TEXTURES), _merged(spans, 4 * _TEXTURES)
     hits = _hits(tour, own, depth[order], direction.index_select(1, order), origin, pixel_angle, kinds)
-    light = torch.maximum(_light(tour, hits, rooms), s.look[:, 7][own])
+    lit = [_light(tour, room, hits.point[:, a:b], hits.normal[:, a:b]) for room, a, b in rooms]
+    light = torch.maximum(torch.cat(lit, dim=1), s.look[:, 7][own])
     radiance = torch.empty_like(light)
     return radiance.index_copy_(1, order, _albedo(tour, hits, spans) * light)
 
@@ -70,17 +71,13 @@ def _hits(
     point = origin[:, None] + depth * direction
     d = point - g[9:12]
     q = R[0] * d[0] + R[1] * d[1] + R[2] * d[2]
-    normals, uvs = [], []
-    for value, start, end in kinds:
-        normal, uv = _LOCAL[value % 4](q[:, start:end], g[:, start:end])
-        normals.append(normal)
-        uvs.append(uv)
-    local = torch.cat(normals, dim=1)
+    local_uv = [_LOCAL[value % 4](q[:, start:end], g[:, start:end]) for value, start, end in kinds]
+    local, uv = (torch.cat(parts, dim=1) for parts in zip(*local_uv, strict=True))
     n = R[:, 0] * local[0] + R[:, 1] * local[1] + R[:, 2] * local[2]
     n = n * _dot(n, n).clamp_min(1e-12).rsqrt()
     cosine = _dot(n, direction) * _dot(direction, direction).rsqrt()
     footprint = pixel_angle * depth / cosine.abs().clamp_min(0.25)
-    return Hits(surface, point, n * -torch.copysign(torch.ones_like(cosine), cosine), torch.cat(uvs, dim=1), footprint)
+    return Hits(surface, point, n * -torch.copysign(torch.ones_like(cosine), cosine), uv, footprint)
 
 
 def _quad(q: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
@@ -128,21 +125,15 @@ def _albedo(tour: Tour, hits: Hits, spans: list[Span]) -> Tensor:
     colours = []
     for value, start, end in spans:
         part = slice(start, end)
-        first, second = look[:3, part], look[3:6, part]
         u, v = shifted[:, part]
         own_u, own_v = own[:, part]
-        patch = Patch(u, v, own_u, own_v, pixel[part], first, second, tour.noise)
+        patch = Patch(u, v, own_u, own_v, pixel[part], look[:3, part], look[3:6, part], tour.noise)
         colours.append(albedo(value % _TEXTURES, patch))
     return torch.cat(colours, dim=1)
 
 
-def _light(tour: Tour, hits: Hits, rooms: list[Span]) -> Tensor:
-    """[3, P] what the room's lamps and the light from everywhere bring to a surface."""
-    parts = [_light_of(tour, r, hits.point[:, a:b], hits.normal[:, a:b]) for r, a, b in rooms]
-    return torch.cat(parts, dim=1)
-
-
-def _light_of(tour: Tour, room: int, point: Tensor, normal: Tensor) -> Tensor:
+def _light(tour: Tour, room: int, point: Tensor, normal: Tensor) -> Tensor:
+    """[3, P] what a room's lamps and the light from everywhere bring to its surfaces."""
     lower, upper = tour.rooms[room].float()
     before = ((point + _BEFORE * normal - lower[:, None]) / (upper - lower)[:, None] * 2 - 1).T
     reached = grid_sample(

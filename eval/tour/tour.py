@@ -15,7 +15,7 @@ from ufmstar_torch.eval.tour.palette import Palette
 from ufmstar_torch.eval.tour.rooms import Door, Room, frame, lay_out, shell
 from ufmstar_torch.eval.tour.route import ways
 from ufmstar_torch.eval.tour.shapes import NOBODY, QUAD, Part, Surfaces, surfaces
-from ufmstar_torch.eval.tour.style import TourStyle, style_of
+from ufmstar_torch.eval.tour.style import style_of
 from ufmstar_torch.eval.tour.texture import noise_table
 from ufmstar_torch.eval.tour.volume import light_volumes
 
@@ -33,48 +33,21 @@ class Tour:
     """Furnished rooms, and the ways through them. World axes: x right, y down, z forward [m], the floor at y = 0."""
 
     seed: int
-    style: TourStyle
     rooms: Tensor  # [R, 2, 3] float64 lower and upper corners (y from the ceiling to 0) [m]
     room_styles: tuple[str, ...]  # the name of each room's style
     doors: Tensor  # [D, 2, 3] float64 boxes around the openings [m]
-    door_rooms: Tensor  # [D, 2] the rooms that each one joins
     surfaces: Surfaces  # the primitives
-    labels: tuple[str, ...]  # what each primitive is part of
     lights: Tensor  # [R, L, 7] float32: position [m], linear RGB, reach [m]; unused ones are dark
     volumes: Tensor  # [R, L, Y, Z, X] float32 share of each light that reaches a grid of points in the room
     noise: Tensor  # behind the textures, see ``texture.noise_table``
     ways: tuple[Tensor, ...]  # [M, 2] float64 closed ways of x and z [m], see ``route.ways``
     camera_height: float  # above the floor [m]
 
-    def room_at(self, position: Tensor) -> Tensor:
-        """The room at a position, or the nearest one (in a doorway, say).
-
-        Args:
-            position: [..., 3] [m].
-
-        Returns:
-            [...] int64 index of a room.
-        """
-        p = position.to(self.rooms)[..., None, :]
-        beyond = torch.maximum(self.rooms[:, 0] - p, p - self.rooms[:, 1]).clamp_min(0)
-        return beyond.pow(2).sum(-1).argmin(-1)
-
-    def style_at(self, position: Tensor) -> str:
-        """The name of the style of the room at one position [3] [m]."""
-        return self.room_styles[int(self.room_at(position))]
-
 
 @lru_cache(maxsize=8, typed=True)  # True is no seed
 def make_tour(seed: int, style: str = "home") -> Tour:
-    """Makes the rooms of a seed; the same ones everywhere.
-
-    Args:
-        seed: at least 0.
-        style: ``home``, ``hall``, ``mixed``, ``blank`` or ``scales``.
-
-    Raises:
-        ValueError: a negative seed, or no such style.
-    """
+    """Makes the rooms of a seed, the same ones everywhere, in one of ``STYLES``. Raises ValueError: a negative seed, or
+    no such style."""
     if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
         raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
     chosen = style_of(style)
@@ -88,18 +61,18 @@ def make_tour(seed: int, style: str = "home") -> Tour:
     table = surfaces(parts, stream(_SHIFTS))
     corners = torch.tensor(np.array([room.box for room in rooms]))
     openings = [door.box(_FRAME, door.thickness / 2 + _FRAME, _FRAME, _FRAME) for door in doors]
-    light_table = _light_table(lights)
+    dark = Light(np.zeros(3), np.zeros(3), 1.0, 0.0)
+    lights = [[*of_room, *[dark] * (LIGHTS - len(of_room))] for of_room in lights]
+    rows = [[[*light.position, *light.color, light.reach] for light in of_room] for of_room in lights]
+    light_table = torch.tensor(rows, dtype=torch.float32)
+    sizes = torch.tensor([[light.size for light in of_room] for of_room in lights])
     casts = torch.tensor([p.kind != QUAD and p.finish.glow == 0 and p.label not in _SHADOWLESS for p in parts])
-    sizes = torch.tensor([[light.size for light in of_room] + [0.0] * (LIGHTS - len(of_room)) for of_room in lights])
     return Tour(
         seed=seed,
-        style=chosen,
         rooms=corners,
         room_styles=tuple(room.style.name for room in rooms),
         doors=torch.tensor(np.array(openings).reshape(-1, 2, 3)),
-        door_rooms=torch.tensor([door.rooms for door in doors]).reshape(-1, 2),
         surfaces=table,
-        labels=tuple(p.label for p in parts),
         lights=light_table,
         volumes=light_volumes(corners, table, light_table, sizes, casts),
         noise=noise_table(),
@@ -124,10 +97,3 @@ def _fill(
     for door in doors:
         parts += [replace(p, rooms=door.rooms) for p in frame(door, palettes[door.rooms[0]].finish("wood"))]
     return parts, lights
-
-
-def _light_table(lights: list[list[Light]]) -> Tensor:
-    """[R, LIGHTS, 7], see ``Tour.lights``."""
-    rows = [[[*light.position, *light.color, light.reach] for light in of_room] for of_room in lights]
-    dark = [0.0] * 6 + [1.0]
-    return torch.tensor([row + [dark] * (LIGHTS - len(row)) for row in rows], dtype=torch.float32)

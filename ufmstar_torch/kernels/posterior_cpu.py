@@ -25,7 +25,7 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
     away_from,
     fitted,
     scene_of,
-    second_moment,
+    second_moments,
     spread_around,
     wrong,
 )
@@ -44,11 +44,11 @@ def update(
     maps = [x.detach().contiguous().numpy() for x in (packed.double(), frame.depth, frame.valid, claimed)]
     streams = zip(*maps, _anchors(anchors, len(packed)), strict=True)
     results = each(functools.partial(_of_stream, config), list(streams))
-    kept, depth, variance, outlier = (np.stack([result[i] for result in results]) for i in range(4))
+    kept, depth, variance, outlier, inlier = (np.stack([result[i] for result in results]) for i in range(5))
     sums = [Running.of(row, config) for row in kept]
     calibration = [r.ratios["calibration"] if r.below[-1] > 0 else np.nan for r in sums]
     unseen = [r.ratios["unseen"] for r in sums]
-    outputs = [torch.from_numpy(x) for x in (depth, variance, np.array(calibration), np.array(unseen), outlier)]
+    outputs = [torch.from_numpy(x) for x in (depth, variance, np.array(calibration), np.array(unseen), outlier, inlier)]
     return torch.from_numpy(kept).to(packed.dtype), Posterior(*outputs)
 
 
@@ -63,12 +63,12 @@ def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | Non
 def _of_stream(
     config: PosteriorConfig, packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any],
     given_: AnchorRows | None,
-) -> tuple[Floats, NDArray[Any], NDArray[Any], NDArray[Any]]:  # fmt: skip
-    """The memory after the frame; depth, variance and the probability of another surface."""
+) -> tuple[Floats, NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:  # fmt: skip
+    """The memory after the frame; depth, variance, the probability of another surface, and the variance on its own."""
     running, anchors = Running.of(packed, config), _NONE if given_ is None else given_
     some = len(anchors.depth) > 0
     if given_ is None and not running.frames:
-        return packed, np.where(valid, depth, np.nan).astype(depth.dtype), claimed, np.full_like(depth, np.nan)
+        return packed, np.where(valid, depth, np.nan).astype(depth.dtype), claimed, np.full_like(depth, np.nan), claimed
     with np.errstate(all="ignore"):  # what is not valid is not read
         logs = np.log(depth)
     rows, cols = (min(SIDE, n) for n in depth.shape)
@@ -87,12 +87,12 @@ def _of_stream(
     share, offset = away / config.reach, mean - (x * b).sum(1)
     variance = variance + running.ratios["roughness"] + away * running.ratios["unseen"]
     p = wrong(running, share)
-    variance = second_moment(
+    variance, inlier = second_moments(
         scene, variance, p, offset, spread_around(scene, np.ones(len(scene.noise), np.bool_), b[0])
     )
-    nodes = np.stack([grid.log_depth, offset, variance, share], 1)
-    depth, spread, unseen = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
-    return kept, depth, spread, wrong(running, unseen).astype(unseen.dtype)
+    nodes = np.stack([grid.log_depth, offset, variance, inlier, share], 1)
+    depth, spread, inlier, unseen = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
+    return kept, depth, spread, wrong(running, unseen).astype(unseen.dtype), inlier
 
 
 def _relative(claimed: NDArray[Any], anchors: AnchorRows) -> Floats:

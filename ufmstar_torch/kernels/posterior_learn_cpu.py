@@ -11,11 +11,11 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
     Running,
     Scene,
     away_from,
-    second_moment,
+    second_moments,
     spread_around,
     wrong,
 )
-from ufmstar_torch.posterior.learn import LEAST_REST, STEPS
+from ufmstar_torch.posterior.learn import APART, LEAST_REST, STEPS
 
 
 def learnt(
@@ -55,7 +55,7 @@ def _of_discs(scene: Scene, weight: Floats, claimed: Floats, running: Running) -
     wide = noise + np.minimum(config.spread * spread, config.widest)
     with np.errstate(over="ignore"):  # certainly another surface
         odds = p / (1 - p) * np.sqrt(own / wide) * np.exp((error**2 / own - (error + offset) ** 2 / wide) / 2)
-    stated = second_moment(scene, own, p, offset, spread) + share * claimed[held]
+    stated = second_moments(scene, own, p, offset, spread)[0] + share * claimed[held]
     sums = {
         "wrong": (area * (1 - 1 / (1 + odds)), area * (1 + config.other * share)),
         "calibration": (area * error**2 / stated, area),
@@ -77,7 +77,7 @@ def _of_pairs(
         alone[one] = alone[other] = False
         pairs += len(one)
         _, variance, away, noise = (means[:, one] + means[:, other]) / 2
-        covariance = np.maximum(variance - amplitude * link[one] / 2, 0)
+        covariance = np.maximum(variance - APART * amplitude * link[one] / 2, 0)
         sums += _products(means[0, one] * means[0, other], covariance, variance, noise, away)
     error, variance, away, noise = means[:, alone]
     share = len(error) / max(len(error) + pairs, 1)

@@ -185,11 +185,12 @@ def wrong(running: Running, share: NDArray[Any]) -> NDArray[Any]:
     return np.minimum(running.ratios["wrong"] * (1 + running.config.other * share), MOST_WRONG)
 
 
-def second_moment(scene: Scene, variance: Floats, p: Floats, offset: Floats, spread: Floats) -> Floats:
+def second_moments(scene: Scene, variance: Floats, p: Floats, offset: Floats, spread: Floats) -> tuple[Floats, Floats]:
     config, q = scene.config, np.exp(np.minimum(-offset, LARGEST))
     own, wide = (np.minimum(v, config.widest) for v in (variance, config.spread * spread))
     tail = q * q * np.exp(2 * wide) - 2 * q * np.exp(wide / 2) + 1
-    return (1 - p) * (np.exp(2 * own) - 2 * np.exp(own / 2) + 1) + p * tail
+    inlier: Floats = np.exp(2 * own) - 2 * np.exp(own / 2) + 1
+    return (1 - p) * inlier + p * tail, inlier
 
 
 def away_from(scene: Scene, evidence: NDArray[np.bool_]) -> Floats:

@@ -38,22 +38,27 @@ class PosteriorFrame(FrameExtension):
         claimed = total(out.disagreement).detach()
         frame, anchors, packed = self._anchors.frame, self._anchors.anchors, state.by_stream["posterior"]
         learnt, posterior = self._update(packed, frame, anchors, claimed, self._config.posterior)
-        variance = posterior.variance.clamp_min(self._config.variance_floor)
+        more = torch.zeros_like(posterior.variance)
         if anchors is not None and anchors.contradiction is not None:  # most are off by more than a factor of 100
-            variance = variance + posterior.depth.square() * anchors.contradiction[:, None, None].to(variance.dtype)
+            more = posterior.depth.square() * anchors.contradiction[:, None, None].to(more.dtype)
         if anchors is not None and anchors.shared is not None:  # an error of the poses, which no anchor beside can show
-            shared = anchors.shared[:, None, None].to(variance.dtype)
+            shared = anchors.shared[:, None, None].to(more.dtype)
             most = self._config.posterior.prior_sigma**2 * posterior.depth.square()
-            variance = variance + torch.minimum(posterior.depth**4 * shared, most)
-        self._posterior = replace(posterior, variance=variance)
+            more = more + torch.minimum(posterior.depth**4 * shared, most)
+        floor = self._config.variance_floor
+        variance, inlier = (v.clamp_min(floor) + more for v in (posterior.variance, posterior.inlier))
+        self._posterior = replace(posterior, variance=variance, inlier=inlier)
         statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
         return state.with_tensors({"posterior": learnt}), replace(out, statistics=statistics)
 
     def outputs(self) -> dict[str, Tensor]:
-        """The corrected depth, its variance, and the probability of another surface."""
+        """The corrected depth, its variance, the probability of another surface, and the variance on its own."""
         assert self._posterior is not None
-        names = ("depth", "variance", "outlier")
-        return {f"posterior_{name}": getattr(self._posterior, name) for name in names}
+        p = self._posterior
+        return {
+            "posterior_depth": p.depth, "posterior_variance": p.variance,
+            "posterior_outlier": p.outlier, "posterior_inlier_variance": p.inlier,
+        }  # fmt: skip
 
 
 class PosteriorExtension(Extension):

@@ -14,8 +14,11 @@ from torch.nn.functional import pad
 from ufmstar_torch.fixed_order import total
 from ufmstar_torch.posterior.field import Field
 from ufmstar_torch.posterior.running import Running, ratios
-from ufmstar_torch.posterior.scene import LeftOut, Scene, away_from, second_moment, spread_around, wrong
+from ufmstar_torch.posterior.scene import LeftOut, Scene, away_from, second_moments, spread_around, wrong
 
+# Variance of the difference between neighbouring nodes, over that of the link between them: on a square lattice the
+# other ways from one to the other are worth as much as the link.
+APART = 0.5
 # With fewer anchors beside the discs, nothing is held out: the field would be the prior.
 LEAST_REST = 5
 # The frame's number moves the discs along this sequence of low discrepancy (R2, Roberts).
@@ -63,7 +66,7 @@ def _of_discs(scene: Scene, weight: Tensor, claimed: Tensor, running: Running) -
     own = variance + scene.noise + away * running.ratio("unseen")[:, None]
     wide = scene.noise + (scene.config.spread * spread).clamp_max(scene.config.widest)
     odds = p / (1 - p) * (own / wide).sqrt() * ((error.square() / own - (error + offset).square() / wide) / 2).exp()
-    stated = second_moment(scene, own, p, offset, spread) + share * claimed
+    stated = second_moments(scene, own, p, offset, spread)[0] + share * claimed
     return _of_pairs(scene, held, torch.stack([error, variance, away, scene.noise]), running) | {
         "wrong": (total(area * (1 - 1 / (1 + odds)), 1), total(area * (1 + scene.config.other * share), 1)),
         "calibration": (total(area * error.square() / stated, 1), total(area, 1)),
@@ -99,7 +102,9 @@ def _of_pairs(scene: Scene, held: Tensor, values: Tensor, running: Running) -> d
         paired, pairs = paired | pad(pair, before) | pad(pair, after), pairs + pair.sum((1, 2))
         _, variance, away, noise = (one + other) / 2
         between = amplitude[:, None, None] * link.view_as(count).narrow(axis, 0, n)
-        sums = sums + _products(pair, one[0] * other[0], (variance - between / 2).clamp_min(0), variance, noise, away)
+        sums = sums + _products(
+            pair, one[0] * other[0], (variance - APART * between / 2).clamp_min(0), variance, noise, away
+        )
     error, variance, away, noise = means
     alone, product = (count > 0) & ~paired, error.square() - noise / count.clamp_min(1)
     share = alone.sum((1, 2)) / (alone.sum((1, 2)) + pairs).clamp_min(1)

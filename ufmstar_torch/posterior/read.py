@@ -17,8 +17,8 @@ LARGEST = math.log(FARTHEST_OFF)
 def read(
     depth: Tensor, valid: Tensor, claimed: Tensor, nodes: Tensor, coefficients: Tensor, mean: Tensor,
     size: tuple[int, int], config: PosteriorConfig,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Depth, variance and the share without evidence at every pixel.
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Depth, variances and the share without evidence at every pixel.
 
     The four nodes around it count by their bilinear weights and by 1/(1 + (D/edge_contrast)^2); D is the difference
     between the pixel's log d and the node's.
@@ -26,16 +26,16 @@ def read(
     Args:
         depth, valid: [B, H, W].
         claimed: [B, H, W] UfM*'s variance [m^2]; counts where a pixel has no evidence.
-        nodes: [B, n, 4] log d, y less the coefficients' part, variance over the squared depth, and share without
-            evidence.
+        nodes: [B, n, 5] log d, y less the coefficients' part, variance over the squared depth, the same on the surface
+            of the evidence, and share without evidence.
         coefficients: [B, 4] of 1, log d - m_0, u, v.
         mean: [B] m_0.
         size: R and C of the nodes.
         config: of the posterior.
 
     Returns:
-        Depth d e^y [m], variance (d e^y)^2 (v + share claimed/d^2) [m^2] and the share, [B, H, W] in depth's dtype, NaN
-        where not valid.
+        Depth d e^y [m], variance (d e^y)^2 (v + share claimed/d^2) [m^2], that on the surface of the evidence, which
+        claimed is no part of, and the share, [B, H, W] in depth's dtype, NaN where not valid.
     """
     rows, cols = size
     b, height, width = depth.shape
@@ -44,21 +44,22 @@ def read(
     v, u = ((torch.arange(n, dtype=d.dtype, device=d.device) + 0.5) / n for n in (height, width))
     (top, below), (left, beside) = _between(v, rows), _between(u, cols)
     total = torch.zeros_like(d)
-    sums = torch.zeros(3, *d.shape, dtype=d.dtype, device=d.device)
+    sums = torch.zeros(4, *d.shape, dtype=d.dtype, device=d.device)
     for row, by_row in ((top, 1 - below), ((top + 1).clamp_max(rows - 1), below)):
         for column, by_column in ((left, 1 - beside), ((left + 1).clamp_max(cols - 1), beside)):
-            at = nodes[:, (row[:, None] * cols + column).flatten()].view(b, height, width, 4)
+            at = nodes[:, (row[:, None] * cols + column).flatten()].view(b, height, width, 5)
             alike = 1 / (1 + ((logs - at[..., 0]) / config.edge_contrast).square())
             weight = by_row[:, None] * by_column * alike
             total = total + weight
             sums = sums + weight * at[..., 1:].permute(3, 0, 1, 2)
-    offset, variance, unseen = sums / total
+    offset, variance, inlier, unseen = sums / total
     c = coefficients[:, None, None].expand(b, height, width, 4).unbind(-1)
     y = c[0] + c[1] * (logs - mean[:, None, None]) + c[2] * (2 * u - 1) + c[3] * (2 * v - 1)[:, None] + offset
     corrected = d * y.clamp(-LARGEST, LARGEST).exp()
-    spread = corrected.square() * (variance + unseen * claimed.double() / d.square())
-    corrected, spread, unseen = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in (corrected, spread, unseen))
-    return corrected, spread, unseen
+    variance = variance + unseen * claimed.double() / d.square()
+    maps = corrected, corrected.square() * variance, corrected.square() * inlier, unseen
+    corrected, variance, inlier, unseen = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in maps)
+    return corrected, variance, inlier, unseen
 
 
 def _between(x: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -157,13 +157,14 @@ def wrong(running: Running, share: Tensor) -> Tensor:
     return (running.ratio("wrong")[:, None] * (1 + running.config.other * share)).clamp_max(MOST_WRONG)
 
 
-def second_moment(scene: Scene, variance: Tensor, p: Tensor, offset: Tensor, spread: Tensor) -> Tensor:
-    """Variance over the squared depth: of y's ``variance``, and with the probability p that the local correction
-    ``offset`` does not hold, of ``spread``."""
+def second_moments(scene: Scene, variance: Tensor, p: Tensor, offset: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
+    """Variances over the squared depth: all in all, and of y's ``variance`` alone; with the probability p, which the
+    former contains, the local correction ``offset`` does not hold and y has the variance of ``spread``."""
     config, q = scene.config, (-offset).clamp_max(LARGEST).exp()
     own, wide = (v.clamp_max(config.widest) for v in (variance, config.spread * spread))
     tail = q.square() * (2 * wide).exp() - 2 * q * (wide / 2).exp() + 1
-    return (1 - p) * ((2 * own).exp() - 2 * (own / 2).exp() + 1) + p * tail
+    inlier = (2 * own).exp() - 2 * (own / 2).exp() + 1
+    return (1 - p) * inlier + p * tail, inlier
 
 
 def away_from(scene: Scene, evidence: Tensor) -> Tensor:

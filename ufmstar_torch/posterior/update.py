@@ -21,7 +21,7 @@ share = min(1, distance/reach):
     (1 - p) m(v) + p tail + share V/d^2,      p = wrong (1 + other share),      m(v) = E[(e^n - 1)^2],      n ~ N(0, v).
 
 The error of the depth is log-normal, so m exceeds v where v is large. p is the probability that the depth is of another
-surface than its evidence: ``outlier``.
+surface than its evidence: ``outlier``. ``inlier`` is m(v) alone.
 
 The distance from evidence is geodesic, in widths of the image, and differences of log d lengthen it: on tours the
 variance of the error grows in proportion to it. V = M + A + E counts where evidence is far. ``learn`` says how
@@ -55,7 +55,7 @@ from ufmstar_torch.posterior.grid import Grid
 from ufmstar_torch.posterior.learn import learnt
 from ufmstar_torch.posterior.read import read
 from ufmstar_torch.posterior.running import Running
-from ufmstar_torch.posterior.scene import Scene, away_from, fitted, second_moment, spread_around, wrong
+from ufmstar_torch.posterior.scene import Scene, away_from, fitted, second_moments, spread_around, wrong
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,7 @@ class Posterior:
         unseen: [B] variance of y a width of the image from evidence.
         outlier: [B, H, W] probability in [0, 1] that a pixel lies on another surface than its evidence; NaN where not
             valid or no anchors were ever given.
+        inlier: [B, H, W] the variance if it does not [m^2]; UfM*'s where no anchors were ever given.
     """
 
     depth: Tensor
@@ -76,6 +77,7 @@ class Posterior:
     calibration: Tensor
     unseen: Tensor
     outlier: Tensor
+    inlier: Tensor
 
 
 # As :func:`update`; ``kernels/posterior_cpu`` has the compiled one.
@@ -114,10 +116,10 @@ def update(
     offset, share = mean - (features * b[:, None]).sum(-1), away / config.reach
     variance = variance + running.ratio("roughness")[:, None] + away * running.ratio("unseen")[:, None]
     p = wrong(running, share)
-    variance = second_moment(scene, variance, p, offset, spread_around(scene, anchors.valid, b[:, 0]))
-    nodes = torch.stack([grid.log_depth, offset, variance, share], -1)
+    variance, inlier = second_moments(scene, variance, p, offset, spread_around(scene, anchors.valid, b[:, 0]))
+    nodes = torch.stack([grid.log_depth, offset, variance, inlier, share], -1)
     maps = frame.depth, frame.valid, known_claim
-    depth, spread, unseen = read(*maps, nodes, b, grid.mean, grid.size, config)
+    depth, spread, inlier, unseen = read(*maps, nodes, b, grid.mean, grid.size, config)
     outlier = wrong(running, unseen.flatten(1)).view_as(unseen).to(unseen.dtype)
     some = anchors.valid.any(1)
     known = (some | (running.frames > 0) | given)[:, None, None]
@@ -128,7 +130,7 @@ def update(
     calibration = torch.where(now.below["calibration"] > 0, now.ratio("calibration"), torch.nan)
     return kept, Posterior(
         torch.where(known, depth, plain), torch.where(known, spread, claimed), calibration, now.ratio("unseen"),
-        torch.where(known, outlier, torch.nan),
+        torch.where(known, outlier, torch.nan), torch.where(known, inlier, claimed),
     )  # fmt: skip
 
 

@@ -1,0 +1,68 @@
+"""The posterior as the mixture that it states: with probability 1 - p on its evidence's surface, else on another."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.eval.metrics.base import SumMetric, share
+from ufmstar_torch.eval.metrics.calibration import quantile_levels
+
+_BINS, _DELTA = 10, 0.25
+# Mass of a normal distribution within three standard deviations.
+_THREE_SIGMA = 0.9973002039367398
+
+
+class Mixture(SumMetric):
+    """NLL, calibration and coverage of (1 - p) N(d, v_1) + p N(d, v_2), which has the variance v in all.
+
+    v_2 = (v - (1 - p) v_1)/p, at least v_1. Pixels count that have ground truth, a finite depth, v_1 > 0 and p.
+    ``compute()``: ``mixture_nll`` [nats], ``mixture_ece_delta`` and ``mixture_ece_q`` with the bins of ``ECEDelta`` and
+    ``ECEQuantile``, ``mixture_coverage``: share of ground truths in the central interval of three sigma's mass, .9973.
+    Nothing without a pixel: only a posterior states a mixture.
+    """
+
+    OF_VARIANCE = "the mixture"
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_sums("total")
+        self.add_sums("confidence", shape=(_BINS,))
+        self.add_counts("accurate", "pixels", "at_or_below", shape=(_BINS,))
+        self.add_counts("covered")
+
+    def add_mixture(self, depth: Tensor, variance: Tensor, target: Tensor, inlier: Tensor, outlier: Tensor) -> None:
+        """Add maps of one shape: d [m], v [m^2], ground truth [m], v_1 [m^2] and p."""
+        d, v, g, v1, p = (
+            x.detach().to("cpu", torch.float64).flatten() for x in (depth, variance, target, inlier, outlier)
+        )
+        used = (g > 0) & g.isfinite() & d.isfinite() & v.isfinite() & (v1 > 0) & v1.isfinite() & (p >= 0) & (p <= 1)
+        d, v, g, v1, p = (x[used] for x in (d, v, g, v1, p))
+        parts = torch.stack([v1, torch.maximum((v - (1 - p) * v1) / p.clamp_min(1e-12), v1)])
+        weight, sigma, error = torch.stack([1 - p, p]), parts.sqrt(), g - d
+        log_density = -(error.square() / parts + (2 * torch.pi * parts).log()) / 2
+        confidence = (weight * torch.erf(_DELTA * d.abs() / (2**0.5 * sigma))).sum(0)
+        below = (weight * torch.special.ndtr(error / sigma)).sum(0)
+        bins = (confidence * _BINS).long().clamp_max(_BINS - 1)
+        accurate = error.abs() <= _DELTA * d.abs()
+        self.total = self.total - torch.logsumexp(weight.log() + log_density, 0).sum()
+        self.confidence = self.confidence + torch.bincount(bins, confidence, _BINS)
+        self.pixels = self.pixels + torch.bincount(bins, minlength=_BINS)
+        self.accurate = self.accurate + torch.bincount(bins[accurate], minlength=_BINS)
+        self.at_or_below = self.at_or_below + (below[:, None] <= quantile_levels(_BINS)).sum(0)
+        self.covered = self.covered + ((below - 0.5).abs() <= _THREE_SIGMA / 2).sum()
+
+    def compute(self) -> dict[str, Tensor]:
+        count = self.pixels.sum()
+        if not int(count):
+            return {}
+        gap = (self.confidence - self.accurate.double()).abs().sum()
+        observed = share(self.at_or_below, count)
+        return {
+            "mixture_nll": share(self.total, count),
+            "mixture_ece_delta": share(gap, count),
+            "mixture_ece_q": (observed - quantile_levels(_BINS)).abs().mean(),
+            "mixture_coverage": share(self.covered, count),
+        }

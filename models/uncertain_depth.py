@@ -1,0 +1,40 @@
+"""``UncertainDepth`` of any network: the class that ``ufmstar_torch`` exports under this name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+from torch import Tensor, nn
+
+from ufmstar_torch import networks_in_turn, pipeline
+from ufmstar_torch.models.any_network import wrap_network
+from ufmstar_torch.models.hugging_face import of_transformers
+from ufmstar_torch.models.outputs import METRIC, OutputSpec
+from ufmstar_torch.prediction import DepthPrediction
+
+
+class UncertainDepth(pipeline.UncertainDepth):
+    __doc__ = pipeline.UncertainDepth.__doc__
+
+    def accepted(
+        self, networks: object, preprocess: networks_in_turn.Preprocess | Literal["own"] | None
+    ) -> tuple[list[nn.Module], networks_in_turn.Preprocess | None]:
+        """See the base class. Functions, and models and pipelines of ``transformers``, are wrapped; they take a
+        ``preprocess`` that is a ``Preprocess`` or an image processor."""
+        members: list[Any] = [networks]
+        if isinstance(networks, Iterable) and not isinstance(networks, nn.Module | str | Mapping):
+            members = list(networks)
+        foreign = [not isinstance(member, nn.Module) or of_transformers(member) for member in members]
+        declared = preprocess if hasattr(preprocess, "to_dict") else None
+        modules = [
+            wrap_network(member, preprocess=declared) if wrapped else member
+            for member, wrapped in zip(members, foreign, strict=True)
+        ]
+        return super().accepted(modules, "own" if any(foreign) and declared is not None else preprocess)
+
+    def as_prediction(self, result: Any, x: Tensor) -> DepthPrediction:
+        """See the base class. Maps that a network returns are taken as metric depth."""
+        if isinstance(result, DepthPrediction):
+            return result
+        return OutputSpec(METRIC).prediction(result, x)
