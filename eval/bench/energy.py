@@ -31,15 +31,9 @@ Energy = NDArray[np.float64] | str
 
 
 class EnergyMeter:
-    """The energy of the GPU (its index as torch counts; None = none is used) and of the processor.
-
-    Args:
-        gpu: see above.
-        monitor: of zeus; None = one for this machine, where zeus is installed.
-
-    Attributes:
-        missing: by unit, "gpu" or "cpu", why it has no meter.
-    """
+    """The energy of the GPU (its index as torch counts; None = none is used) and of the processor, by zeus's
+    ``monitor`` (None = one for this machine, where zeus is installed). ``missing`` has by unit, "gpu" or "cpu", why it
+    has none."""
 
     def __init__(self, gpu: int | None = None, monitor: Any = None) -> None:
         self._monitor = _open(gpu) if monitor is None else monitor

@@ -56,13 +56,11 @@ def measure(
     plan: Plan | None = None,
     meter: EnergyMeter | None = None,
 ) -> dict[str, Any]:
-    """Measure every row on the first frames of a sequence with images; plain values for JSON.
+    """Measure every row on the first frames of a sequence with images; plain values for JSON. A row whose base has no
+    network, or has one member where it needs several, is left out and named in the result.
 
     Args:
-        rows: different ones.
-        networks: by base. A row whose base is missing, or has one member where it needs several, is left out and
-            named in the result.
-        sequence: see above.
+        rows, networks, sequence: different ones; by base.
         device: of the networks, on which they lie.
         multiview_device: of UfM and UfM*; the paper runs them on the CPU.
         plan: how much; None = the defaults.

@@ -70,16 +70,9 @@ class Contrast:
 
 def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: Report) -> dict[str, Any]:
     """Run live for some seconds of 30 images each in the rooms of a seed, then judge the frames, and draw the picture.
-
-    Args:
-        out: folder, for the quantised graph and the picture.
-        weights: networks of ``ufmstar train``, of which the first is quantised; or a FastDepth (.onnx, .tflite) as it
-            is.
-        seconds, seed, progress: see above; called after every step.
-
-    Raises:
-        FileNotFoundError, ValueError, ModuleNotFoundError: the network cannot be loaded or quantised.
-    """
+    ``out`` gets the quantised graph and the picture; ``weights`` are networks of ``ufmstar train``, of which the first
+    is quantised, or a FastDepth (.onnx, .tflite) as it is. Raises FileNotFoundError, ValueError, ModuleNotFoundError:
+    the network cannot be loaded or quantised."""
     network, about = _network(weights, out, seed)
     h, w = network.preprocess.size or _HALF_VGA
     way = tour_sequence(seed, frames=_PATH, size=_SIZES.get((h, w), _HALF_VGA), style="scales")

@@ -58,15 +58,12 @@ def evaluate_sequence(
     progress: Callable[[Progress], object] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> list[RowFigures]:
-    """Judge every row on the frames of a sequence; a result for each row, in their order.
+    """Judge every row on the frames of a posed sequence with ground truth; a result for each row, in their order.
 
     Args:
-        sequence: posed frames with ground truth.
-        rows: different ones.
-        judge: networks, device and metrics.
+        sequence, rows, judge: see above.
         sinks: receive the frames after the metrics; a row's key is its slug.
-        progress: called at the start and after every frame.
-        stop: called before every frame.
+        progress, stop: called at the start and after every frame; called before every frame.
 
     Raises:
         SequenceError: the sequence cannot be judged.

@@ -123,17 +123,10 @@ def network_source(
     inference: Inference = _AS_USERS,
     device: str = "cpu",
 ) -> NetworkSource:
-    """One network, or the members of an ensemble, from files (:func:`load_members`), as ``ufmstar run`` runs them.
-
-    Args:
-        mode: "alternate" (one member per image in turn) or "full" (all of them on every image, or ``samples``
-            passes of a network that samples).
-        samples: None: as many as the paper's baseline.
-
-    Raises:
-        FileNotFoundError, ValueError: as :func:`load_members`; mode "full" of one network that does not sample, or
-            ``samples`` for any other.
-    """
+    """One network, or the members of an ensemble, from files (:func:`load_members`), as ``ufmstar run`` runs them. Mode
+    is "alternate" (one member per image in turn) or "full" (all of them on every image, or ``samples`` passes of a
+    network that samples; None: as many as the paper's baseline). Raises FileNotFoundError, ValueError, also for mode
+    "full" of one network that does not sample, and ``samples`` for any other."""
     files, where = tuple(str(file) for file in weights), torch.device(device)
     members = load_members(model, files, spec=spec, offload=offload, inference=inference, device=where)
     alone = len(members) == 1 and mode == "full"

@@ -105,9 +105,6 @@ class PredictionCache:
     """Predictions by a ``path`` of networks, sequence, frame and member, and a digest of the frame's ``content``.
     Several processes may use one folder: a file is whole or absent, and all write the same into it.
 
-    Args:
-        folder: made if it does not exist.
-
     Raises:
         CacheError: the folder cannot be made or written.
     """

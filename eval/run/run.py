@@ -38,14 +38,11 @@ def run(
     KeyboardInterrupt and OSError (a full disk) end the run in order: finished frames stay, and the summary
     states the reason. A frame that cannot be read, or whose pose or intrinsics are unusable, is skipped and counted.
 
-    Args:
-        job: what to run.
-        out, resume, overwrite: the folder; see ``OutputFolder.open``.
-        progress: called at the start of each stage and after every frame.
-        stop: called before every frame; True ends the run as KeyboardInterrupt does.
+    ``progress`` is called at the start of each stage and after every frame, ``stop`` before every frame: True ends the
+    run as KeyboardInterrupt does.
 
     Raises:
-        FolderError: the folder cannot be used.
+        FolderError: the folder cannot be used (``OutputFolder.open``).
         OSError: the summary cannot be written.
         Exception: whatever else the network or UfM* raise, after the summary was written.
     """
