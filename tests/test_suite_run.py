@@ -131,7 +131,7 @@ def test_images_without_poses_are_for_networks_alone(tmp_path):
     folder, (item,) = folder_of(job), job.items
     done = sorted(path.stem for path in folder.sequence_folder(item).glob("*.json") if path.stem != "failed")
     assert done == ["DepthOnly"]
-    failure = folder.failure(item)
+    failure = json.loads((folder.sequence_folder(item) / "failed.json").read_text())
     assert "no poses" in failure["reason"]
     assert failure["rows"] == ["UfM-DepthOnly", "UfM-DepthOnly-100K", "UfMstar-DepthOnly"]
     assert sum("failed" in line for line in message) == 1

@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import torch
@@ -111,13 +111,8 @@ class PredictionCache:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            # Tried by writing: permissions say nothing about file systems that are mounted read-only.
-            probe = folder / ".writable"
-            write_atomic(probe, lambda opened: opened.write(b""))
-        except OSError as error:
-            raise CacheError(_cannot(folder, error)) from error
+        # Tried by writing: permissions say nothing about file systems that are mounted read-only.
+        self._write(Path(".writable"), lambda opened: opened.write(b""))
 
     def load(self, path: Path, content: str, device: torch.device) -> Predicted | None:
         """The prediction bit for bit as it was stored, or None where it has to be made: there is no file, it belongs to
@@ -138,16 +133,18 @@ class PredictionCache:
         arrays = {name: value[0].cpu().numpy() for name, value in named.items() if value is not None}
         arrays["intrinsics"] = predicted.intrinsics[0].numpy()
         arrays["content"] = np.frombuffer(content.encode(), np.uint8)
+        self._write(path, lambda opened: np.savez(opened, allow_pickle=False, **arrays))
+
+    def _write(self, path: Path, write: Callable[[BinaryIO], object]) -> None:
         file = self.folder / path
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            write_atomic(file, lambda opened: np.savez(opened, allow_pickle=False, **arrays))
+            write_atomic(file, write)
         except OSError as error:
-            raise CacheError(_cannot(self.folder, error)) from error
-
-
-def _cannot(folder: Path, error: OSError) -> str:
-    return f"the cache of predictions cannot be written to {folder} ({error}): choose another folder, or none"
+            text = (
+                f"the cache of predictions cannot be written to {self.folder} ({error}): choose another folder, or none"
+            )
+            raise CacheError(text) from error
 
 
 class FramePredictions:

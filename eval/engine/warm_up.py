@@ -20,17 +20,9 @@ _STEP, _FRAMES = 4, 8  # the wall moves by so many pixels a frame
 def warm_up_command(
     config: UfMStarConfig, device: torch.device, show: Callable[[Progress], object], *, dense: bool = False
 ) -> None:
-    """Compile UfM*, the metrics and, if ``dense``, the search of :class:`DenseEvidence`, or load them from disk."""
-    also, ufm = [metrics, *([dense_anchors] if dense else [])], UfMStar(config, device=device)
+    """Compile UfM* and, if ``dense``, the search of :class:`DenseEvidence`, or load them from disk."""
+    also, ufm = [dense_anchors] if dense else [], UfMStar(config, device=device)
     warm_up(ufm, (32, 32), 1, lambda done, total: show(Progress("kernels", done, total)), also)
-
-
-def metrics() -> None:
-    """The metrics of single-precision maps."""
-    from ufmstar_torch.eval.metrics import SequenceMetrics  # torchmetrics takes seconds to import
-
-    maps = torch.ones(1, 8, 8)
-    SequenceMetrics().update(maps, maps, maps)
 
 
 def dense_anchors() -> None:
