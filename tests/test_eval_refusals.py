@@ -44,7 +44,7 @@ def mcd(**overrides: object) -> object:
 
 
 def tracked(**values: object) -> object:
-    return setting_from({"anchors": "tracked", **values})
+    return setting_from({"anchors": "corners", **values})
 
 
 def poses(*words: str) -> object:
@@ -69,12 +69,12 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: tracked(anchor_count=-1), "anchor_count must lie in"),
     (lambda: tracked(anchor_count=True), "anchor_count must be a number"),
     (lambda: tracked(anchor_count=2.5), "anchor_count must be a whole number"),
-    (lambda: tracked(corrected=1), "corrected must be True or False"),
+    (lambda: tracked(posterior=1), "posterior must be True or False"),
     (lambda: tracked(track_noise=-1.0), "track_noise must lie in"),
-    (lambda: setting_from({"anchors": "truth", "track_noise": 1.0}), 'goes with anchors = "tracked"'),
+    (lambda: setting_from({"anchors": "truth", "track_noise": 1.0}), 'goes with anchors = "corners"'),
     *[
         (partial(setting_from, values), "go with anchors")
-        for values in ({"anchor_count": 5}, {"corrected": True}, {"anchors.half_life": 10.0})
+        for values in ({"anchor_count": 5}, {"posterior": True}, {"anchors.half_life": 10.0})
     ],
     *[
         (partial(setting_from, {name: value}), f"{name} must ")

@@ -116,7 +116,7 @@ def test_words_and_files_become_sources(file, tmp_path):
     assert isinstance(landmark_source("dense"), DenseEvidence)
     with pytest.raises(ValueError, match=r"'lidar' is neither 'corners', 'dense' nor a file \.csv"):
         landmark_source("lidar")
-    for value in (True, "corners", "tracked"):
+    for value in (True, "corners"):
         assert isinstance(landmarks_of(value, None), LandmarkTracker)
     assert landmarks_of(file.name, file.parent).identity == own.identity
     with pytest.raises(FileNotFoundError, match=r"none.csv \(neither in .* nor in the working folder\)"):

@@ -16,7 +16,7 @@ from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting, setting_from
 from ufmstar_torch.eval.methods.suite import suite_named
-from ufmstar_torch.eval.report.data import Merged, Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.figures_cost import STAGES, draw_stages
 from ufmstar_torch.eval.report.figures_curves import (
     draw_calibration,
@@ -49,7 +49,7 @@ def results() -> Results:
         for row in ROWS:
             judged, _ = judge(draw_maps(row, sequence), references)
             records.append(record_of("own", "rooms", sequence, row, judged))
-            merged.setdefault(("rooms", row), Merged(judged.figures, judged.curves))
+            merged.setdefault(("rooms", row), judged.curves)
     empty = in_memory({(row, ("rooms", "a")): {} for row in ROWS})
     return replace(empty, records=tuple(records), merged=merged)
 
@@ -75,7 +75,7 @@ class TestCalibration:
         delta, quantile = drawn(shown[0]), drawn(shown[2])
         assert list(delta) == list(quantile) == ["exactly right", "alone", "UfM-100K", "UfM*"]
         for row in (ALONE, UFM, UFM_STAR):
-            curves = results.merged["rooms", row].curves
+            curves = results.merged["rooms", row]
             np.testing.assert_array_equal(quantile[look_of(row.method).name].get_ydata(), curves["ece_q_observed"])
             pixels = np.array(curves["ece_delta_pixels"])
             kept = pixels > 0.001 * pixels.sum()
@@ -97,7 +97,7 @@ class TestError:
         for axes, reference in zip(shown, ("Ensemble", "UfM-Ensemble-100K"), strict=True):
             for row in (ALONE, UFM, UFM_STAR):
                 line = drawn(axes)[look_of(row.method).name]
-                expected = results.merged["rooms", row].curves[f"nll_by_error:{reference}"]
+                expected = results.merged["rooms", row][f"nll_by_error:{reference}"]
                 np.testing.assert_array_equal(line.get_ydata(), expected)
                 np.testing.assert_array_equal(line.get_xdata(), np.arange(5, 100, 10))
         assert named(shown[0]) == {"alone", "UfM-100K", "UfM*"}
@@ -227,10 +227,10 @@ def row(**values: Any) -> Row:
 )
 def test_anchored_rows_are_a_line_that_goes_through_the_row_without_noise(anchored, name, values):
     lines = sweep_lines(anchored, "depth_only", name)
-    tracked = [line for line in lines if dict(line.rest) == {"anchors": "tracked"}]
+    tracked = [line for line in lines if dict(line.rest) == {"anchors": "corners"}]
     assert [point.value for point in tracked[0].points] == pytest.approx(values)
     (at_default,) = (point for point in tracked[0].points if point.value == default_value(name))
-    assert at_default.rows == (row(anchors="tracked"),)
+    assert at_default.rows == (row(anchors="corners"),)
     assert tracked[0].words == "anchored"
     # And no row of another line is among those of plain UfM*.
     (alone,) = (line for line in lines if line.method == STAR and not line.rest)
@@ -244,7 +244,7 @@ def test_numbers_of_anchors_begin_with_none(anchored):
     assert [point.value for point in lines["anchored"].points] == [0, 5, 20, MOST]
     # Plain UfM* where no row says 0; and a row that says nothing has as many as the tracker follows.
     assert lines["anchored"].points[0].rows == (Row(STAR),)
-    assert lines["anchored"].points[-1].rows == (row(anchors="tracked"),)
+    assert lines["anchored"].points[-1].rows == (row(anchors="corners"),)
     assert lines["truth anchors"].points[0].rows == (row(anchors="truth", anchor_count=0),)
     both = results_of([row(anchors="truth"), *(row(anchors="truth", anchor_count=n) for n in (0, 20))])
     assert [point.value for point in sweep_lines(both, "depth_only", "anchor_count")[0].points] == [0, 20, TRUTH_COUNT]

@@ -18,7 +18,7 @@ def write_pngs(folder, names, units=1000, scale_text=None):
 
 
 def values(maps):
-    return [float(maps[i][0][0, 0]) for i in range(len(maps))]
+    return [float(depth[0, 0]) for depth, _ in maps]
 
 
 def test_png_scale_is_given_or_in_the_file(tmp_path):

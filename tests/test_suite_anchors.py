@@ -18,7 +18,6 @@ from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.data import setting_of
 from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.sequence import open_tour
@@ -41,15 +40,14 @@ def networks(tmp_path_factory):
     return {"depth_only": base_network(f"depth_only=trained:{file}")}
 
 
-def by_hand(sequence, network, anchors_of, *, config=ON, setting=DEFAULT, corrected=False):
+def by_hand(sequence, network, anchors_of, *, config=ON, setting=DEFAULT):
     """Metrics and the mean number of anchors used: ``anchors_of(frame, T, predicted, truth)``."""
     ufm, metrics, used = UfMStar(config), SequenceMetrics(), []
     for frame in list(sequence)[:: setting.skip + 1]:
         T, p = perturbed(frame.T_world_cam, setting, frame.index), unbatched(network, frame)
         truth = truth_at(frame, p.intrinsics.numpy(), p.size)
         out = ufm(p.depth[None], torch.from_numpy(T)[None], p.intrinsics[None], anchors=anchors_of(frame, T, p, truth))
-        depth, variance = out.corrected() if corrected else (out.depth, out.variance)
-        metrics.update(depth[0], variance[0], torch.from_numpy(truth), out.valid[0])
+        metrics.update(out.depth[0], out.variance[0], torch.from_numpy(truth), out.valid[0])
         used.append(int(out.statistics.anchors_used[0]))
     return metrics.compute(), float(np.mean(used))
 
@@ -71,37 +69,36 @@ def assert_agrees(result, expected, used):
 @pytest.mark.parametrize(
     "values",
     [
-        {"anchors": "tracked"},
-        {"anchors": "tracked", "corrected": True},
-        {"anchors": "tracked", "anchor_count": 0, "seed": 0},
+        {"anchors": "corners"},
+        {"anchors": "corners", "posterior": True},
+        {"anchors": "corners", "anchor_count": 0, "seed": 0},
         {"anchors": "truth", "seed": 3},
-        {"anchors": "tracked", "track_noise": 2.0, "rotation_noise": 1.0, "seed": 1},
-        {"disagreement": "overlap", "anchors": "tracked", "anchors.half_life": 10.0},
+        {"anchors": "corners", "track_noise": 2.0, "rotation_noise": 1.0, "seed": 1},
+        {"disagreement": "overlap", "anchors": "corners", "anchors.half_life": 10.0},
     ],
 )
 def test_a_setting_survives_its_flat_form_and_json(values):
     setting = setting_from(values)
     assert setting.to_dict() == values
-    assert setting_of(json.loads(json.dumps(setting.to_dict()))) == setting
+    assert setting_from(json.loads(json.dumps(setting.to_dict()))) == setting
     assert configured(setting).anchors is not None
-    assert ufm_star_config(row(NAME, anchors="tracked")) == ON
+    assert ufm_star_config(row(NAME, anchors="corners")) == ON
 
 
 def test_the_seed_matters_only_where_something_is_drawn():
-    assert Setting(anchors="tracked", seed=4).slug == Setting(anchors="tracked").slug != ""
+    assert Setting(anchors="corners", seed=4).slug == Setting(anchors="corners").slug != ""
     assert Setting(anchors="truth", seed=4).slug != Setting(anchors="truth").slug
-    assert Setting(anchors="tracked", anchor_count=0).slug != Setting(anchors="tracked").slug
-    assert [default_of(n) for n in ("anchors", "anchor_count", "track_noise", "corrected")] == ["", None, 0.0, False]
+    assert Setting(anchors="corners", anchor_count=0).slug != Setting(anchors="corners").slug
+    assert [default_of(n) for n in ("anchors", "anchor_count", "track_noise", "posterior")] == ["", None, 0.0, False]
 
 
 # ---- against a loop by hand ----
 
 
-@pytest.mark.parametrize("corrected", [False, True])
-def test_tracked_rows_equal_the_tracker_and_ufm_star_by_hand(tour, networks, corrected):
-    target = row(NAME, anchors="tracked", corrected=corrected)
+def test_tracked_rows_equal_the_tracker_and_ufm_star_by_hand(tour, networks):
+    target = row(NAME, anchors="corners")
     actual = evaluate(tour, [row(NAME), target], networks)[target.slug]
-    expected, used = by_hand(tour, networks["depth_only"], tracked_by(LandmarkTracker()), corrected=corrected)
+    expected, used = by_hand(tour, networks["depth_only"], tracked_by(LandmarkTracker()))
     assert used > 3
     assert_agrees(actual, expected, used)
     assert actual.ms["anchors"] > 0
@@ -111,8 +108,8 @@ def test_tracked_rows_equal_the_tracker_and_ufm_star_by_hand(tour, networks, cor
 
 def test_the_tracker_sees_the_noisy_poses_and_the_chosen_images(tour, networks):
     noise = {"rotation_noise": 0.3, "translation_noise": 0.01, "seed": 5}
-    noisy, sparse = row(NAME, anchors="tracked", **noise), row(NAME, anchors="tracked", skip=1)
-    result = evaluate(tour, [row(NAME, anchors="tracked"), noisy, sparse], networks)
+    noisy, sparse = row(NAME, anchors="corners", **noise), row(NAME, anchors="corners", skip=1)
+    result = evaluate(tour, [row(NAME, anchors="corners"), noisy, sparse], networks)
     for one in (noisy, sparse):
         by = tracked_by(LandmarkTracker())
         assert_agrees(result[one.slug], *by_hand(tour, networks["depth_only"], by, setting=one.setting))
@@ -128,7 +125,7 @@ def test_the_tracker_sees_the_noisy_poses_and_the_chosen_images(tour, networks):
 
 
 def test_no_anchors_at_most_is_plain_ufm_star(tour, networks):
-    rows = [row(NAME), *(row(NAME, anchors=kind, anchor_count=0) for kind in ("tracked", "truth"))]
+    rows = [row(NAME), *(row(NAME, anchors=kind, anchor_count=0) for kind in ("corners", "truth"))]
     plain, *none = evaluate(tour, rows, networks).values()
     for result in none:
         assert result.figures == pytest.approx(plain.figures, rel=0, abs=0, nan_ok=True)
@@ -167,7 +164,7 @@ def test_track_noise_has_the_size_that_the_tracker_states_for_it(tour):
         p = Biased().one(frame, 0)
         pair = []
         for size, own in zip((0.0, 0.5), tracks, strict=True):
-            source = AnchorSource(Setting(anchors="tracked", track_noise=size), own)
+            source = AnchorSource(Setting(anchors="corners", track_noise=size), own)
             _, anchors, ms = source.of(frame, frame.T_world_cam, p, None)
             assert isinstance(anchors, Anchors)
             assert ms > 0
@@ -188,4 +185,4 @@ def test_tracking_needs_images(tour):
     outcome = evaluate(blind, [row(NAME), row(NAME, anchors="truth")], networks)
     assert all(result.frames["judged"] == 10 for result in outcome.values())
     with pytest.raises(Exception, match="no image"):
-        evaluate(blind, [row(NAME, anchors="tracked")], networks)
+        evaluate(blind, [row(NAME, anchors="corners")], networks)

@@ -19,7 +19,6 @@ from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting, default_of, setting_from
-from ufmstar_torch.eval.report.data import setting_of
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -127,7 +126,7 @@ def test_frames_must_come_in_order():
 def test_a_setting_of_drift(name):
     setting = setting_from({name: 0.1, "seed": 2})
     assert setting.to_dict() == {name: 0.1, "seed": 2}
-    assert setting_of(json.loads(json.dumps(setting.to_dict()))) == setting
+    assert setting_from(json.loads(json.dumps(setting.to_dict()))) == setting
     assert len({setting.slug, Setting(**{name: 0.2, "seed": 2}).slug, Setting(**{name: 0.1}).slug, ""}) == 4
     assert default_of(name) == 0
     assert setting.pose_noise != Setting(**{name: 0.1}).pose_noise
@@ -161,15 +160,15 @@ def test_a_row_sees_drift_and_noise_on_top_of_it():
 
 def test_rows_of_one_drift_share_a_tracker_and_a_reference():
     alike = [
-        row(NAME, anchors="tracked", rotation_drift=0.1),
-        row(NAME, anchors="tracked", rotation_drift=0.1, corrected=True),
+        row(NAME, anchors="corners", rotation_drift=0.1),
+        row(NAME, anchors="corners", rotation_drift=0.1, posterior=True),
     ]
     others = [
-        row(NAME, anchors="tracked", **{name: 0.1, "seed": seed})
+        row(NAME, anchors="corners", **{name: 0.1, "seed": seed})
         for name in ("translation_drift", "rotation_noise")
         for seed in (0, 1)
     ]
-    alone = [row(NAME), row(NAME, anchors="tracked"), row(NAME, anchors="tracked", skip=1)]
+    alone = [row(NAME), row(NAME, anchors="corners"), row(NAME, anchors="corners", skip=1)]
     sources = anchor_sources([*alike, *others, *alone])
     assert alone[0] not in sources
     assert sources[alike[0]].tracks is sources[alike[1]].tracks

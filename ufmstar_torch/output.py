@@ -182,19 +182,6 @@ class UfMStarOutput:
             raise ValueError("posterior needs UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())")
         return self.posterior_depth, self.posterior_variance
 
-    def corrected(self) -> tuple[Tensor, Tensor]:
-        """Depth without the bias that anchors found, d (1 + r) [m], and the variance that remains [m^2].
-
-        From E[(x - r)^2] = E[x^2] - r^2: the bias's square leaves B, of which no less than 0 remains.
-
-        Raises:
-            ValueError: without ``config.anchors`` nothing is known of a bias.
-        """
-        if self.anchored is None or self.bias is None:
-            raise ValueError("corrected needs anchors: UfMStarConfig(anchors=AnchorConfig())")
-        remaining = (self.anchored - (self.depth * self.bias).square()).clamp_min(0)
-        return self.depth * (1 + self.bias), self.variance - self.anchored + remaining
-
 
 @dataclass(frozen=True)
 class SampleStatistics:

@@ -10,6 +10,7 @@ intrinsics of another size, a late trajectory) and names what fits.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -56,8 +57,7 @@ class SequenceCheck:
         return not self.problems
 
 
-@dataclass(frozen=True, eq=False)
-class _Pair:
+class _Pair(NamedTuple):
     """Points of one frame [3, N] and the frame in which they are looked up."""
 
     points: np.ndarray

@@ -8,7 +8,7 @@ poses or intrinsics; where it lies on the line is its depth in the unit of the p
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -164,14 +164,11 @@ def image_fit(sequence: FrameSequence, corners: Sequence[FollowedCorners]) -> Im
     width = 2 * sequence.intrinsics[0, 2] if sequence.image_size is None else sequence.image_size[1]
     fit = ImageFit(len(near), motion, error, reading, best, "")
     if reading != GIVEN:
-        return _with_problem(fit, f"{reading}: corners fit to {best:.1f} px then")
+        return replace(fit, problem=f"{fit.words}: {reading}: corners fit to {best:.1f} px then")
     if error > max(_FINE, _LARGEST * width):
-        return _with_problem(fit, "poses, intrinsics and images belong together under no reading tried")
+        text = "poses, intrinsics and images belong together under no reading tried"
+        return replace(fit, problem=f"{fit.words}: {text}")
     return fit
-
-
-def _with_problem(fit: ImageFit, text: str) -> ImageFit:
-    return ImageFit(fit.pairs, fit.motion, fit.error, fit.reading, fit.best_error, f"{fit.words}: {text}")
 
 
 def _error(sequence: FrameSequence, corners: Iterable[FollowedCorners], reading: Reading) -> float:
@@ -213,15 +210,8 @@ def depth_fit(
     corners: Iterable[FollowedCorners],
     depth_at: Callable[[int, np.ndarray], np.ndarray | None],
 ) -> DepthFit | None:
-    """Compare depth with that of corners by parallax, in the unit of the poses.
-
-    Args:
-        sequence, corners: as :func:`image_fit`, whose outcome is without a problem.
-        depth_at: of a frame's index and pixels [N, 2] of its image: depth [N], not positive = none; or None.
-
-    Returns:
-        The comparison, None with too little parallax or depth.
-    """
+    """Compares depth with that of corners by parallax, in the unit of the poses; None with too little of either.
+    ``depth_at`` has the depth [N] at pixels [N, 2] of the image of a frame's index, not positive = none."""
     ratios, orders = [], []
     for one in corners:
         distance, along, rho = _beside(sequence, one)

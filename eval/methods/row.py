@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.methods.method import UFM_STAR, Method
-from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, Setting, configured
+from ufmstar_torch.eval.methods.setting import CORNERS, DEFAULT, Setting, configured, setting_from
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Row:
     @property
     def name(self) -> str:
         """The method's name, and what tracked corners serve: "UfM*-Anchored-Ensemble", "UfM*-Posterior-Ensemble"."""
-        if self.setting.anchors != TRACKED:
+        if self.setting.anchors != CORNERS:
             return self.method.name
         kind = "Posterior" if self.setting.posterior else "Anchored"
         return self.method.name.replace("UfM*-", f"UfM*-{kind}-", 1)
@@ -51,7 +51,7 @@ class Row:
         values = self.setting.to_dict()
         if self.setting.recalibration:  # without the folder
             values["recalibration"] = Path(self.setting.recalibration).name
-        named = {"anchors", "posterior"} if self.setting.anchors == TRACKED else set()
+        named = {"anchors", "posterior"} if self.setting.anchors == CORNERS else set()
         return {name: value for name, value in values.items() if name not in named}
 
     @property
@@ -64,6 +64,12 @@ class Row:
         """The row as plain values, as eval.json has it."""
         named = {"label": self.title} if self.title else {}
         return {"method": self.method.name, "setting": self.setting.to_dict(), **named}
+
+
+def row_from(values: Mapping[str, Any]) -> Row:
+    """The inverse of :meth:`Row.to_dict`. Raises KeyError, TypeError, ValueError: there is no such row."""
+    setting = setting_from(values.get("setting", {}))
+    return Row(Method.parse(values["method"]), setting, str(values.get("label", "")))
 
 
 def plain_rows(rows: Iterable[Row]) -> list[Row]:

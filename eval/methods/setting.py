@@ -13,12 +13,12 @@ from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any
 
-from ufmstar_torch.anchors.landmarks import DENSE, FILE_TYPES
+from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES
 from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.config import AnchorConfig, ConfidenceConfig, MergeConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.stateful import flat
 
-TRACKED, TRUTH = "tracked", "truth"
+TRUTH = "truth"
 DEFAULTS, PAPER = "default", "paper"
 # How an image comes to the network's input.
 OF_NETWORK, RESIZE, CROP = "network", "resize", "crop"
@@ -41,13 +41,12 @@ class Setting(Checked):
         translation_drift: the same of the position [m per square root of frames].
         skip: images left out between two that are used; the paper's skip interval, 0 = consecutive ones.
         seed: of everything that is drawn: noise, and which anchors are taken.
-        anchors: what UfM* is anchored by (``UfMStarConfig.anchors`` follows): "" nothing; "tracked": corners of the
-            images, triangulated with the row's poses; "dense": dense evidence, likewise; "truth": ground truth at
-            pixels drawn at random, the upper bound; or a file of landmarks in the folder of each sequence, see
+        anchors: what UfM* is anchored by (``UfMStarConfig.anchors`` follows): "" nothing; "corners": those of the
+            images, tracked and triangulated with the row's poses; "dense": dense evidence, likewise; "truth": ground
+            truth at pixels drawn at random, the upper bound; or a file of landmarks in the folder of each sequence, see
             ``ufmstar_torch.anchors.LandmarkMap.read``.
         anchor_count: anchors of a frame at most, drawn at random; None = all that are tracked, 100 of ground truth.
         track_noise: standard deviation of noise on tracked positions [px of the image]; see ``engine.anchors``.
-        corrected: judge the depth corrected by the anchors' bias, and the variance that remains.
         posterior: judge the posterior's depth and variance (``UfMStarConfig.posterior`` follows).
         recalibration: file of a map of the variance (``ufmstar recalibrate``); "" = none.
 
@@ -67,24 +66,21 @@ class Setting(Checked):
     anchors: str = ""
     anchor_count: int | None = number(None, "", "1", 0)
     track_noise: float = number(0.0, "", "px", 0.0, open_high=True)
-    corrected: bool = False
     posterior: bool = False
     recalibration: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.anchors not in ("", TRACKED, DENSE, TRUTH) and not str(self.anchors).lower().endswith(FILE_TYPES):
-            allowed = f"{TRACKED!r}, {DENSE!r}, {TRUTH!r} or a file {', '.join(FILE_TYPES)}"
+        if self.anchors not in ("", CORNERS, DENSE, TRUTH) and not str(self.anchors).lower().endswith(FILE_TYPES):
+            allowed = f"{CORNERS!r}, {DENSE!r}, {TRUTH!r} or a file {', '.join(FILE_TYPES)}"
             raise ValueError(f"Setting.anchors must be {allowed}, got {self.anchors!r}")
         count = self.anchor_count
         if count is not None and not isinstance(count, int):
             raise ValueError(f"Setting.anchor_count must be a whole number, got {count!r}")
-        if not self.anchors and (count is not None or self.corrected or self.posterior):
-            raise ValueError("anchor_count, corrected and posterior go with anchors")
-        if self.corrected and self.posterior:
-            raise ValueError("corrected and posterior contradict each other")
-        if self.track_noise and self.anchors != TRACKED:
-            raise ValueError('track_noise goes with anchors = "tracked"')
+        if not self.anchors and (count is not None or self.posterior):
+            raise ValueError("anchor_count and posterior go with anchors")
+        if self.track_noise and self.anchors != CORNERS:
+            raise ValueError('track_noise goes with anchors = "corners"')
         for group in ("anchors", "posterior"):
             if not getattr(self, group) and any(name.startswith(f"{group}.") for name in self.overrides):
                 raise ValueError(f"{group}. settings go with {group}: set {group} as well")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, SumMetric, share
 from ufmstar_torch.eval.metrics.calibration import quantile_levels
 
 _BINS, _DELTA = 10, 0.25
@@ -25,13 +23,10 @@ class Mixture(SumMetric):
     """
 
     OF_VARIANCE = "the mixture"
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_sums("total")
-        self.add_sums("confidence", shape=(_BINS,))
-        self.add_counts("accurate", "pixels", "at_or_below", shape=(_BINS,))
-        self.add_counts("covered")
+    STATES = (
+        *(("total", SUM), ("confidence", SUM, _BINS), ("covered", COUNT)),
+        *((name, COUNT, _BINS) for name in ("accurate", "pixels", "at_or_below")),
+    )
 
     def add_mixture(self, depth: Tensor, variance: Tensor, target: Tensor, inlier: Tensor, outlier: Tensor) -> None:
         """Add maps of one shape: d [m], v [m^2], ground truth [m], v_1 [m^2] and p."""

@@ -90,7 +90,6 @@ SETTINGS = {
     "anchors.half_life": ("half-life of evidence", "frames"),
     "anchors.shrinkage": ("shrinkage κ", "anchors"),
     "track_noise": ("track noise", "px"),
-    "corrected": ("depth corrected", ""),
     "posterior": ("posterior", ""),
     "overlap_weighted": ("fusion weighted by overlap", ""),
     "disagreement": ("disagreement", ""),
@@ -118,7 +117,7 @@ _WORDS = {
     ("posterior", True): "posterior",
 }
 # Values in words.
-_VALUES = {"tracked": "tracked corners", "dense": "dense evidence", "truth": "ground truth"}
+_VALUES = {"corners": "tracked corners", "dense": "dense evidence", "truth": "ground truth"}
 
 
 def own_quantities(figures: Iterable[str]) -> list[Quantity]:

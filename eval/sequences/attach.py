@@ -87,9 +87,9 @@ def frame_of_files(
     the image or the pose is missing (None). Raises ValueError: a malformed pose file."""
     if options.trajectory is not None:
         return frame_of_image(name, image, load_depth)
-    return (
-        Skipped(name, "missing pose file") if pose is None else frame_of_image(name, image, load_depth, read_pose(pose))
-    )
+    if pose is None:
+        return Skipped(name, "missing pose file")
+    return frame_of_image(name, image, load_depth, read_pose(pose))
 
 
 def frame_of_image(

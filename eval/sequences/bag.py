@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -68,26 +69,22 @@ class Bag:
     @property
     def topics(self) -> dict[str, str]:
         """The types of the topics that have a message, by name."""
-        try:
-            return {c.topic: _OLD_NAMES.get(c.msgtype, c.msgtype) for c in self._open().connections if c.msgcount}
-        except self._errors() as error:
-            raise self._broken(error) from error
+        with self._opened() as reader:
+            return {c.topic: _OLD_NAMES.get(c.msgtype, c.msgtype) for c in reader.connections if c.msgcount}
 
     def messages(self, topics: Iterable[str], *when: int) -> Iterator[tuple[Place, Any]]:
         """The messages of topics in the order in which they were received, those of [start, stop) [ns] where that is
         given."""
         types, wanted = self.topics, set(topics)
-        decode = self._store.deserialize_ros1 if self.path.suffix == ".bag" else self._store.deserialize_cdr
         last: dict[str, tuple[int, int]] = {}
-        try:
-            chosen = [c for c in self._open().connections if c.topic in wanted]
-            for connection, received, raw in self._open().messages(chosen, *when) if chosen else ():
+        with self._opened() as reader:
+            decode = self._store.deserialize_ros1 if self.path.suffix == ".bag" else self._store.deserialize_cdr
+            chosen = [c for c in reader.connections if c.topic in wanted]
+            for connection, received, raw in reader.messages(chosen, *when) if chosen else ():
                 before, number = last.get(connection.topic, (-1, 0))
                 number = number + 1 if before == received else 0
                 last[connection.topic] = (received, number)
                 yield Place(connection.topic, received, number), decode(raw, types[connection.topic])
-        except self._errors() as error:
-            raise self._broken(error) from error
 
     def read(self, place: Place) -> Any:
         """One message."""
@@ -96,26 +93,27 @@ class Bag:
                 return message
         raise FrameError(self.path, f"the message of {place.topic} at {place.received} ns is missing")
 
-    def _open(self) -> Any:
-        if self._reader is None:
-            stores, ros1 = _module("rosbags.typesys"), self.path.suffix == ".bag"
-            reader = _module("rosbags.rosbag1" if ros1 else "rosbags.rosbag2").Reader(self.path)
-            reader.open()
-            self._store = stores.get_typestore(stores.Stores.ROS1_NOETIC if ros1 else stores.Stores.ROS2_HUMBLE)
-            if ros1:  # ROS 1's types in rosbags have no tf
-                self._store.register(stores.get_types_from_msg(_TF_FIELDS, _TF))
-            self._reader = reader
-            finalize(self, reader.close)
-        return self._reader
-
-    def _errors(self) -> tuple[type[Exception], ...]:
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
         own = [_module(f"rosbags.{name}").ReaderError for name in ("rosbag1", "rosbag2")]
         zstd = _module("rosbags.rosbag2.storage_mcap").zstd
-        return (*own, _module("rosbags.serde").SerdeError, zstd.ZstdError, _module("apsw").Error, *_BROKEN)
+        try:
+            if self._reader is None:
+                self._open()
+            yield self._reader
+        except (*own, _module("rosbags.serde").SerdeError, zstd.ZstdError, _module("apsw").Error, *_BROKEN) as error:
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            raise FrameError(self.path, f"the bag cannot be read: {reason}") from error
 
-    def _broken(self, error: Exception) -> FrameError:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        return FrameError(self.path, f"the bag cannot be read: {reason}")
+    def _open(self) -> None:
+        stores, ros1 = _module("rosbags.typesys"), self.path.suffix == ".bag"
+        reader = _module("rosbags.rosbag1" if ros1 else "rosbags.rosbag2").Reader(self.path)
+        reader.open()
+        self._store = stores.get_typestore(stores.Stores.ROS1_NOETIC if ros1 else stores.Stores.ROS2_HUMBLE)
+        if ros1:  # ROS 1's types in rosbags have no tf
+            self._store.register(stores.get_types_from_msg(_TF_FIELDS, _TF))
+        self._reader = reader
+        finalize(self, reader.close)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"path": self.path, "_reader": None, "_store": None}
@@ -197,16 +195,13 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         first = next((message for _, message in bag.messages([name])), None)
         if first is None:
             raise FrameError(bag.path, f"{name} should have messages, but has none: the bag is damaged")
-        is_depth = getattr(first, "encoding", "") in ros.DEPTH_ENCODINGS or ros.COMPRESSED_DEPTH in getattr(
-            first, "format", ""
-        )
-        (depths if is_depth else images)[name] = ros.frame_name(first.header.frame_id)
-    image = _one("the image", bag, images, named, types)
+        (depths if ros.is_depth(first) else images)[name] = ros.frame_name(first.header.frame_id)
+    image = _one("the image", bag, named, images)
     if not image:
         raise ValueError(f"{bag.path} has no topic of colour images, but {_listing(types)}")
     infos = [name for name, kind in types.items() if kind == _INFO]
     beside = [name for name in infos if name.rsplit("/", 1)[0] in (image.rsplit("/", 1)[0], image.rsplit("/", 2)[0])]
-    info = "" if options.intrinsics is not None else _one("the camera info", bag, beside or infos, named, types)
+    info = "" if options.intrinsics is not None else _one("the camera info", bag, named, beside or infos)
     if not info and options.intrinsics is None:
         raise ValueError(f"{bag.path} has no camera info: pass intrinsics")
     same_view = [name for name, frame in depths.items() if frame == images[image]]
@@ -217,7 +212,7 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         same_view = [name for name in same_view if name in named]
         depths = {name: depths[name] for name in same_view}
         so_called = [name for name in so_called if name not in predicted]
-    depth = _one("the depth", bag, so_called or same_view, named, types)
+    depth = _one("the depth", bag, named, so_called or same_view)
     other = [name for name in named if name in depths and name not in same_view]
     if other:
         raise ValueError(
@@ -230,16 +225,15 @@ def _choose(bag: Bag, options: Options) -> _Topics:
     if options.trajectory is None:
         by_tf = [name for name in named if types[name] == _TF]
         poses = [name for name, kind in types.items() if kind in _POSES]
-        pose = by_tf[0] if by_tf else _one("the pose", bag, poses, named, types)
+        pose = by_tf[0] if by_tf else _one("the pose", bag, named, poses)
         pose = pose or next((name for name, kind in types.items() if kind == _TF and "static" not in name), "")
         if not pose:
             raise ValueError(f"{bag.path} has no poses: pass trajectory")
     return _Topics(image, info, depth, pose, ros.frame_name(named.get(pose, "")))
 
 
-def _one(kind: str, bag: Bag, candidates: Iterable[str], named: dict[str, str], types: dict[str, str]) -> str:
-    candidates = list(candidates)
-    candidates = [name for name in candidates if name in named] or candidates
+def _one(kind: str, bag: Bag, named: dict[str, str], topics: Iterable[str]) -> str:
+    candidates = [name for name in topics if name in named] or list(topics)
     if len(candidates) > 1:
         raise ValueError(f"{bag.path}: {kind} may be {', '.join(sorted(candidates))}: name one with --topics")
     return candidates[0] if candidates else ""

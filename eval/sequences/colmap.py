@@ -118,9 +118,7 @@ def _metric(root: Path) -> bool:
 def _pose(view: _View, model: Path) -> np.ndarray:
     """[4, 4] camera-to-world, NaN where it is not finite."""
     quaternion, position = np.array(view.pose[:4]), np.array(view.pose[4:])
-    if not np.isfinite(view.pose).all():
-        return np.full((4, 4), np.nan)
-    if abs(np.linalg.norm(quaternion) - 1) > _NORM_TOLERANCE:
+    if np.isfinite(view.pose).all() and abs(np.linalg.norm(quaternion) - 1) > _NORM_TOLERANCE:
         raise ValueError(f"{model}: the quaternion of image {view.name!r} is {quaternion}, expected a norm of 1")
     return np.asarray(np.linalg.inv(poses_from_quaternions(position[None], np.roll(quaternion, -1)[None])[0]))
 

@@ -24,17 +24,10 @@ class DepthMaps:
     variance_files: tuple[Path, ...] = ()
     scale: float | None = None
 
-    def __len__(self) -> int:
-        return len(self.depth_files)
-
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Depth [H, W] float32 [m] (0 = invalid) and variance [H, W] float32 [m^2], or None without one.
-
-        Where the variance is negative or not finite, both are 0: such a pixel has no prediction.
-
-        Raises:
-            FrameError: a file cannot be decoded, or the two differ in size.
-        """
+        """Depth [H, W] float32 [m] (0 = invalid) and variance [H, W] float32 [m^2], or None without one. Where the
+        variance is negative or not finite, both are 0. Raises FrameError: a file cannot be decoded, or the two differ
+        in size."""
         depth = read_depth(self.depth_files[index], self.scale)
         if not self.variance_files:
             return depth, None
@@ -43,24 +36,21 @@ class DepthMaps:
         if variance.shape != depth.shape:
             raise FrameError(path, f"the variance is {list(variance.shape)}, its depth {list(depth.shape)}")
         usable = np.isfinite(variance) & (variance >= 0)
-        zero = np.float32(0)
-        return np.where(usable, depth, zero), np.where(usable, variance, zero)
+        return np.where(usable, depth, np.float32(0)), np.where(usable, variance, np.float32(0))
 
 
 class DepthFolder:
-    """A folder of predicted depth maps: 16-bit PNG or TIFF, float TIFF, EXR, npy or npz.
+    """A folder of predicted depth maps of one format: 16-bit PNG or TIFF, float TIFF, EXR, npy or npz.
 
     Args:
-        path: the folder; all its maps must have the same suffix.
-        scale: metres per unit, for any of the formats. None: a PNG names it in its text ``depth_scale``
-            (each map for itself), the others are in metres.
+        path: the folder.
+        scale: metres per unit. None: a PNG names it in its text ``depth_scale``, the others are in metres.
         variance: folder of variance maps [m^2] as npy, npz, EXR or float TIFF. It may be ``path`` itself,
             where npz files hold the keys ``depth`` and ``variance``.
 
     Raises:
         NotADirectoryError: a folder does not exist.
-        ValueError: no map, maps of several formats, integers whose scale is not known, ``scale`` out of
-            range.
+        ValueError: no map, maps of several formats, integers whose scale is not known.
     """
 
     def __init__(self, path: str | Path, scale: float | None = None, variance: str | Path | None = None) -> None:
@@ -68,7 +58,6 @@ class DepthFolder:
         self.path = Path(path)
         self.scale = scale
         self.files = _maps(self.path, DEPTH_SUFFIXES, "depth")
-        self.variance_path = None if variance is None else Path(variance)
         self.variance_files = [] if variance is None else _maps(Path(variance), _VARIANCE_SUFFIXES, "variance")
         for file in self.files if scale is None else ():
             try:
@@ -79,9 +68,6 @@ class DepthFolder:
                 raise ValueError(f"scale: {file} holds integers and no text {SCALE_KEY!r}: pass metres per unit")
             break
 
-    def __len__(self) -> int:
-        return len(self.files)
-
     def for_frames(
         self, names: Sequence[str], names_on_disk: Sequence[str] = (), selected: Sequence[str] | None = None
     ) -> DepthMaps:
@@ -90,11 +76,8 @@ class DepthFolder:
         that the sequence skips) or ``selected`` has. Raises ValueError: some frames have no map (they are listed)."""
         expected = names if selected is None else selected
         orders = (names_on_disk or names, names, expected)
-        depth = _paired(self.path, self.files, expected, orders)
-        variance: tuple[Path, ...] = ()
-        if self.variance_path is not None:
-            variance = _paired(self.variance_path, self.variance_files, expected, orders)
-        return DepthMaps(depth, variance, self.scale)
+        depth = _paired(self.files, expected, orders)
+        return DepthMaps(depth, _paired(self.variance_files, expected, orders), self.scale)
 
 
 def _maps(folder: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
@@ -108,16 +91,19 @@ def _maps(folder: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
     return files
 
 
-def _paired(folder: Path, files: list[Path], names: Sequence[str], orders: Sequence[Sequence[str]]) -> tuple[Path, ...]:
+def _paired(files: list[Path], names: Sequence[str], orders: Sequence[Sequence[str]]) -> tuple[Path, ...]:
+    if not files:
+        return ()
     pairs = pair_by_name(names, files)
     missing = [name for name in names if name not in pairs]
     if missing:
         order = next((order for order in orders if len(order) == len(files)), None)
         if order is None:
             shown = ", ".join(missing[:10]) + (", ..." if len(missing) > 10 else "")
+            folder, first = files[0].parent, files[0].name
             raise ValueError(
                 f"{folder}: no map for {len(missing)} of {len(names)} frames ({shown}); its {len(files)} files are "
-                f"named {files[0].name}, ..., and there are not as many as frames, so that order does not pair them"
+                f"named {first}, ..., and there are not as many as frames, so that order does not pair them"
             )
         pairs = dict(zip(order, files, strict=True))
     return tuple(pairs[name] for name in names)

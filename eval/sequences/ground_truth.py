@@ -23,39 +23,26 @@ _BORDER = 1e-6
 
 
 def resample_nearest(values: NDArray, K_from: NDArray, K_to: NDArray, size: Size) -> NDArray:
-    """Every pixel of the second camera takes the value of the first one's pixel that its ray falls into.
-
-    Values are copied, never mixed: a mean over a depth edge lies on no surface. For an image that
-    was resized and cropped this equals ``Preprocess.apply_depth``.
-
-    Args:
-        values: [H, W, ...] of the first camera.
-        K_from, K_to: [3, 3] intrinsics of the two cameras [px].
-        size: (h, w) of the second one.
-
-    Returns:
-        [h, w, ...] of the same type; 0 (False) where the first camera does not look.
-    """
+    """Every pixel [h, w, ...] of a camera ``K_to`` with ``size`` (h, w) takes the value of the pixel of the camera
+    ``K_from`` that its ray falls into, of ``values`` [H, W, ...]; 0 (False) where that does not look. Values are
+    copied, never mixed: a mean over a depth edge lies on no surface."""
     mapping = np.asarray(K_from @ np.linalg.inv(K_to), np.float64)
     source, inside = _source(mapping.tobytes(), values.shape[:2], size)
     result = values.reshape(-1, *values.shape[2:])[source]
-    if inside is None:
-        return result
     return np.where(inside.reshape(*size, *[1] * (values.ndim - 2)), result, np.zeros((), values.dtype))
 
 
 @lru_cache(maxsize=16)
-def _source(mapping: bytes, size_from: Size, size: Size) -> tuple[NDArray[np.intp], NDArray[np.bool_] | None]:
+def _source(mapping: bytes, size_from: Size, size: Size) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """For every pixel [h, w] of the second camera, the pixel of the first one (H, W), counted along its rows, and
-    whether there is one; None = everywhere. ``mapping`` [3, 3] float64 takes pixels of the second camera to the first
-    one. The same for all frames of a sequence."""
+    whether there is one. ``mapping`` [3, 3] float64 takes pixels of the second camera to the first one."""
     M = np.frombuffer(mapping).reshape(3, 3)
     v, u = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float64)
     column = np.floor(M[0, 0] * u + M[0, 1] * v + M[0, 2] + 0.5 + _BORDER).astype(np.intp)
     row = np.floor(M[1, 1] * v + M[1, 2] + 0.5 + _BORDER).astype(np.intp)
     height, width = size_from
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    return row.clip(0, height - 1) * width + column.clip(0, width - 1), None if inside.all() else inside
+    return row.clip(0, height - 1) * width + column.clip(0, width - 1), inside
 
 
 def depth_camera(frame: Frame) -> NDArray:
@@ -78,21 +65,9 @@ def truth_at(frame: Frame, K: NDArray, size: Size) -> NDArray | None:
 def register_depth(
     depth: np.ndarray, K_depth: np.ndarray, K_color: np.ndarray, T_color_depth: np.ndarray, size: Size
 ) -> np.ndarray:
-    """Depth as the colour camera sees it: points are forward-warped, the nearest one wins (z-buffer).
-
-    Each point fills the one pixel it falls on, so where the colour image is finer than the depth map, and
-    at the edges that only the colour camera sees, pixels stay 0.
-
-    Args:
-        depth: [H, W] of the depth camera [m], 0 = invalid.
-        K_depth: [3, 3] [px].
-        K_color: [3, 3] [px].
-        T_color_depth: [4, 4] takes points of the depth camera into the colour camera [m].
-        size: (H, W) of the result.
-
-    Returns:
-        ``size`` float32 depth along the colour camera's z [m], 0 = invalid.
-    """
+    """Depth [H, W] [m] (0 = invalid) as the colour camera with ``size`` (h, w) sees it, float32: points are moved by
+    ``T_color_depth`` [4, 4] [m] into the colour camera, the nearest one wins (z-buffer). Each point fills the one pixel
+    it falls on, so where the colour image is finer than the depth map, pixels stay 0."""
     v, u = np.nonzero(depth > 0)
     z = depth[v, u].astype(np.float64)
     points = np.linalg.inv(K_depth) @ np.stack([u * z, v * z, z])

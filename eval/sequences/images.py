@@ -8,10 +8,9 @@ not applied: intrinsics hold for the stored pixels).
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Iterable
 from contextlib import redirect_stdout, suppress
-from functools import lru_cache, partial
+from functools import partial
 from io import BytesIO, StringIO
 from pathlib import Path
 
@@ -29,8 +28,8 @@ DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
 _BROKEN_IMAGE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 # Key of a PNG's text chunk: metres per unit of its 16-bit values.
 SCALE_KEY = "depth_scale"
-# A PNG's signature, two numbers, width and height; then bit depth, colour type, compression, filter and interlacing.
-_HEADER, _SIGNATURE, _RGB = struct.Struct(">8s8x2I5s"), b"\x89PNG\r\n\x1a\n", bytes((8, 2, 0, 0, 0))
+# Bit depth, colour type, compression, filter and interlacing, from a PNG's header.
+_SIGNATURE, _RGB = b"\x89PNG\r\n\x1a\n", bytes((8, 2, 0, 0, 0))
 _MILLIMETRE = 1e-3
 # Names of a depth channel of an EXR file, best first; Blender prefixes its layer ("ViewLayer.Depth.Z").
 _DEPTH_NAMES = ("Z", "depth", "V", "Y", "R")
@@ -66,8 +65,6 @@ def read_depth(path: str | Path, scale: float | None = None, *, default_scale: f
     values, named_scale = read_map(path, key="depth")
     if scale is None and np.issubdtype(values.dtype, np.integer):
         scale = named_scale or default_scale
-    if values.dtype == np.uint16 and scale is not None:
-        return _lengths(scale)[values]
     return positive(values.astype(np.float32) if scale is None else (values * np.float64(scale)).astype(np.float32))
 
 
@@ -155,12 +152,8 @@ def depth_loader(path: Path | None, scale: float | None, default_scale: float = 
     return None if path is None else partial(read_depth, path, scale, default_scale=default_scale)
 
 
-def within(load: Loader | None, most: float) -> Loader | None:
-    """The loader of a depth map without the depths beyond ``most`` [m] (None stays None)."""
-    return None if load is None else partial(_within, load, most)
-
-
-def _within(load: Loader, most: float) -> np.ndarray:
+def within(load: Loader, most: float) -> np.ndarray:
+    """A depth map without the depths beyond ``most`` [m]."""
     depth = load()
     return np.where(depth <= most, depth, np.float32(0))
 
@@ -173,12 +166,6 @@ def check_scale(depth_scale: float | None) -> None:
         )
 
 
-@lru_cache(maxsize=4)
-def _lengths(scale: float) -> np.ndarray:
-    """[65536] float32, the length of each 16-bit count [m]."""
-    return positive((np.arange(2**16) * np.float64(scale)).astype(np.float32))
-
-
 def positive(depth: np.ndarray) -> np.ndarray:
     """A depth map of float32 with 0 for what is not finite or not positive."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
@@ -189,11 +176,9 @@ def _plain_png(path: Path) -> np.ndarray | None:
     if path.suffix.lower() != ".png" or not path.is_file():
         return None
     with path.open("rb") as file:
-        content = file.read(_HEADER.size)
-    if len(content) < _HEADER.size:
-        return None
-    signature, width, height, found = _HEADER.unpack(content)
-    if (signature, found) != (_SIGNATURE, _RGB) or width * height > (Image.MAX_IMAGE_PIXELS or 0):
+        header = file.read(29)
+    width, height = int.from_bytes(header[16:20]), int.from_bytes(header[20:24])
+    if header[:8] != _SIGNATURE or header[24:] != _RGB or width * height > (Image.MAX_IMAGE_PIXELS or 0):
         return None
     from kornia_rs import io
 

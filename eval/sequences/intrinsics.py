@@ -43,12 +43,10 @@ def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | N
     if len(words) <= 1:
         return words[0] if words else None
     try:
-        numbers = [float(word) for word in words]
+        fx, fy, cx, cy = map(float, words)
     except ValueError:
-        numbers = []
-    if len(numbers) != 4:
-        raise ValueError(f"{option} must be a file, or the four numbers fx fy cx cy, got {' '.join(words)!r}")
-    return numbers
+        raise ValueError(f"{option} must be a file, or the four numbers fx fy cx cy, got {' '.join(words)!r}") from None
+    return [fx, fy, cx, cy]
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:

@@ -63,12 +63,9 @@ def parts(root: Path) -> list[Path]:
 def read(path: Path, options: Options) -> FrameSequence:
     """Opens a drive: ``path`` is the root (with the option ``drive``, unless there is only one), or the drive's folder
     (its first rectified camera), or the camera's. Depth comes from the folder ``depth`` (16 bits, 1/256 m), or else
-    from the laser: the frame's own scan, unrolled, and those of ``scans`` frames before and after it.
-
-    Raises:
-        FileNotFoundError: no poses, or a calibration file that is needed is missing.
-        ValueError: no or several drives fit; a fisheye camera; no usable frame; malformed files.
-    """
+    from the laser: the frame's own scan, unrolled, and those of ``scans`` frames before and after it. Raises
+    FileNotFoundError: no poses or calibration; ValueError: no or several drives fit, a fisheye camera, malformed
+    files."""
     folder = _camera(_drive(path, options.drive))
     if folder is None or folder.name not in _CAMERAS:
         raise ValueError(f"{path}: of KITTI-360, {' and '.join(_CAMERAS)} can be read; the others are fisheye cameras")

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.eval.sequences.attach import stem_times
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, read_color
-from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS, in_metres, parse_pose
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS, in_metres, parse_pose, poses_from_columns
 
 _FPS = 30.0  # of a recording without timestamps
 _POLL = 0.01  # [s] between two looks at a folder
@@ -157,8 +157,7 @@ def json_lines(
                 raise ValueError("a stamp and a pose or an image are needed")
             if not isinstance(stamp := about["stamp"], int | float):
                 raise ValueError(f"a stamp is a number [s], got {stamp!r:.40}")
-            stamp = float(stamp)
-            if not math.isfinite(stamp):
+            if not math.isfinite(stamp := float(stamp)):
                 raise ValueError(f"stamp must be finite [s], got {stamp}")
             pose = _pose(about["pose"], convert, scale) if "pose" in about else None
             image = _image(about["image"], Path(folder)) if "image" in about else None
@@ -173,9 +172,7 @@ def _pose(values: Any, convert: Callable[[np.ndarray], np.ndarray], scale: float
     if len(numbers) not in _NUMBERS:
         forms = " or ".join(f"{count} ({form})" for count, form in _NUMBERS.items())
         raise ValueError(f"a pose has {forms} numbers, got {values}")
-    found = parse_pose(" ".join(["0", *map(repr, numbers.tolist())]), "pose")
-    assert found is not None
-    return in_metres(convert(found[1]), scale)
+    return in_metres(convert(poses_from_columns(numbers[None], ["pose"])[0]), scale)
 
 
 def _image(text: Any, folder: Path) -> NDArray[np.uint8]:

@@ -1,16 +1,13 @@
 """NYU Depth V2 in FastDepth's layout as an evaluation set: ``train|val/<scene>/*.h5`` with ``rgb`` and ``depth``.
 
 ``rgb`` is uint8 [3, H, W], ``depth`` floating-point [H, W] in metres along the optical axis, registered to ``rgb``;
-0 or not finite = none. The images are single ones: the sequence has ``posed`` False, and its poses, the identity, mean
-nothing. A network's own variance can be judged on it; rows that compare views (UfM, UfM*) must be refused, by looking
-at ``FrameSequence.posed`` and not at the poses. What networks see of an image is ``Preprocess.nyu()``.
+0 or not finite = none. The images are single ones: the sequence has ``posed`` False.
 """
 
 from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,9 +15,6 @@ from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence,
 from ufmstar_torch.eval.sequences.images import depth_size, natural_key, positive
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
 from ufmstar_torch.eval.sequences.options import Options
-
-if TYPE_CHECKING:
-    import h5py
 
 LOOKED_FOR = "val/SCENE/*.h5 or train/SCENE/*.h5 (the root, meaning val, the part's folder or the scene's)"
 PARTS = ("train", "val")
@@ -47,13 +41,8 @@ def part_files(folder: Path) -> list[Path]:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a part, or a scene of it, as a sequence without poses; names are ``SCENE__NUMBER``.
-
-    Raises:
-        ImportError: h5py is not installed.
-        ValueError: the images were cropped and ``intrinsics`` are not given; an option that files without poses have no
-            use for; no file can be read.
-    """
+    """Opens a part, or a scene of it, as a sequence without poses; names are ``SCENE__NUMBER``. Raises ValueError: the
+    images were cropped and ``intrinsics`` are not given, or no file can be read."""
     folder = parts(path)[0]
     files = _files(folder)
     scale = 1.0 if options.depth_scale is None else options.depth_scale
@@ -74,7 +63,9 @@ def read_h5(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     try:
         with h5py.File(path, "r") as file:
-            rgb, depth = _array(file, "rgb"), _array(file, "depth")
+            if missing := {"rgb", "depth"} - set(file):
+                raise KeyError(f"no dataset {min(missing)!r}, only {sorted(file)}")
+            rgb, depth = np.asarray(file["rgb"]), np.asarray(file["depth"])
     except _BROKEN as error:
         raise FrameError(path, f"cannot be read: {error}") from error
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[0] != 3 or 0 in rgb.shape:
@@ -83,12 +74,6 @@ def read_h5(path: Path) -> tuple[np.ndarray, np.ndarray]:
         expected = f"floating-point {list(rgb.shape[1:])}"
         raise FrameError(path, f"depth must be {expected} as rgb is, got {depth.dtype} {list(depth.shape)}")
     return rgb, depth
-
-
-def _array(file: h5py.File, key: str) -> np.ndarray:
-    if key not in file:
-        raise KeyError(f"no dataset {key!r}, only {sorted(file)}")
-    return np.asarray(file[key])
 
 
 def _files(path: Path) -> list[Path]:

@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.images import within
-from ufmstar_torch.eval.sequences.layout import layout_of, readers
+from ufmstar_torch.eval.sequences.layout import READERS, layout_of, readers
 from ufmstar_torch.eval.sequences.lens import parse_distortion, undistort
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS, in_metres
 
-# Options that a layout has no use for, beside those of KITTI-360 alone.
-_REFUSED = {
-    "tum": "images depth depth_intrinsics fps T_color_depth",
-    "7scenes": "images depth",
-    "scannet": "images depth T_color_depth",
-    "sens": "images depth T_color_depth",
-    "tartanair": "images depth depth_intrinsics T_color_depth",
-    "kitti360": "images T_color_depth",
-    "nyu": "trajectory images depth depth_intrinsics fps T_color_depth distortion",
-    "colmap": "depth_intrinsics T_color_depth distortion",
-    "transforms": "images depth depth_intrinsics T_color_depth distortion",
-    "euroc": "images depth depth_intrinsics T_color_depth distortion",
-    "bag": "images depth depth_intrinsics T_color_depth distortion",
-    "stray": "images depth depth_intrinsics T_color_depth distortion",
-    "arkitscenes": "images depth depth_intrinsics T_color_depth distortion",
-    "generic": "T_color_depth",
+# The layouts that have a use for an option which not all have.
+_TAKEN_BY = {
+    "images": ("colmap", "generic"),
+    "depth": ("kitti360", "colmap", "generic"),
+    "depth_intrinsics": ("7scenes", "scannet", "sens", "kitti360", "generic"),
+    "T_color_depth": ("7scenes",),
+    "distortion": ("tum", "7scenes", "scannet", "sens", "tartanair", "kitti360", "generic"),
+    "topics": ("bag",),
+    "drive": ("kitti360",),
+    "scans": ("kitti360",),
 }
 
 
@@ -70,10 +65,9 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
     chosen = Options(**options)
     explicit = chosen.images is not None or chosen.trajectory is not None
     layout = layout_of(layout, path, explicit, chosen.plugin)
-    refused = _REFUSED.get(layout, "").split()
-    refused += [] if layout == "kitti360" else ["drive", "scans"]
-    refused += [] if layout == "bag" else ["topics"]
-    refused += [] if layout == "generic" or chosen.trajectory is not None else ["fps"]
+    refused = [name for name, layouts in _TAKEN_BY.items() if layout in READERS and layout not in layouts]
+    refused += ["trajectory", "fps"] if layout == "nyu" else []
+    refused += ["fps"] if layout == "tum" or (layout != "generic" and chosen.trajectory is None) else []
     chosen.reject(layout, *refused)
     sequence = readers(chosen.plugin)[layout].read(path, chosen)
     if chosen.distortion is not None:
@@ -81,7 +75,10 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
         sequence = undistort(sequence, *coefficients, depth_too=chosen.depth_intrinsics is None)
     sequence = convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), poses)
     if chosen.max_truth is not None:
-        entries = [replace(entry, load_depth=within(entry.load_depth, chosen.max_truth)) for entry in sequence.entries]
+        entries = []
+        for entry in sequence.entries:
+            load_depth = entry.load_depth and partial(within, entry.load_depth, chosen.max_truth)
+            entries.append(replace(entry, load_depth=load_depth))
         sequence = replace(sequence, entries=tuple(entries))
     return sequence if chosen.pose_scale is None else scale_poses(sequence, chosen.pose_scale)
 

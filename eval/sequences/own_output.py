@@ -44,19 +44,19 @@ def read_records(content: bytes, file: Path) -> list[dict]:
     records = []
     for number, line in enumerate(content.splitlines(), start=1):
         try:
-            records.append(json.loads(line))
+            record = json.loads(line)
         except (ValueError, RecursionError):
-            records.append(None)
-        if not _is_record(records[-1]):
-            shown = line[:60].decode(errors="replace")
-            raise ValueError(f"{file}, line {number} is not the record of a frame: {shown}")
+            record = None
+        match record:
+            case {"name": str(), "state": "skipped", "reason": str()}:
+                records.append(record)
+            case {"name": str(), "state": "done", "intrinsics": [_, _, _, _] as K} if all(map(_is_number, K)):
+                records.append(record)
+            case _:
+                shown = line[:60].decode(errors="replace")
+                raise ValueError(f"{file}, line {number} is not the record of a frame: {shown}")
     return records
 
 
-def _is_record(record: Any) -> bool:
-    match record:
-        case {"name": str(), "state": "skipped", "reason": str()}:
-            return True
-        case {"name": str(), "state": "done", "intrinsics": [*K]}:
-            return len(K) == 4 and all(isinstance(value, int | float) for value in K)
-    return False
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float)

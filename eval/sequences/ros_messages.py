@@ -21,8 +21,7 @@ from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.poses import trajectory_of
 from ufmstar_torch.trajectory import Trajectory, interpolate_pose
 
-DEPTH_ENCODINGS = {"16UC1": "u2", "32FC1": "f4"}
-COMPRESSED_DEPTH = "compressedDepth"
+_DEPTHS = {"16UC1": "u2", "32FC1": "f4"}
 # Encoding: bytes of a pixel, and OpenCV's conversion to RGB (None: it is RGB).
 _COLOURS: dict[str, tuple[int, str | None]] = {
     "rgb8": (3, None),
@@ -62,14 +61,19 @@ def colour(message: Any, path: Path) -> np.ndarray:
     return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}")))
 
 
+def is_depth(message: Any) -> bool:
+    """Whether an Image or CompressedImage is a depth map."""
+    return getattr(message, "encoding", "") in _DEPTHS or "compressedDepth" in getattr(message, "format", "")
+
+
 def depth(message: Any, scale: float | None, path: Path) -> np.ndarray:
     """[H, W] float32 [m], 0 = invalid, of an Image or a CompressedImage of ``compressed_depth_image_transport``;
     ``scale`` in metres per unit instead of REP 118's."""
     if hasattr(message, "encoding"):
-        if message.encoding not in DEPTH_ENCODINGS:
+        if message.encoding not in _DEPTHS:
             raise FrameError(path, f"depth must be 16UC1 or 32FC1, got {message.encoding!r}")
         order = ">" if message.is_bigendian else "<"
-        values = _rows(message, np.dtype(order + DEPTH_ENCODINGS[message.encoding]), 1, path)
+        values = _rows(message, np.dtype(order + _DEPTHS[message.encoding]), 1, path)
     else:
         values = _compressed_depth(bytes(message.data), str(message.format), path)
     scale = scale or (1e-3 if values.dtype.kind == "u" else 1.0)

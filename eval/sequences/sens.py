@@ -18,7 +18,7 @@ from typing import BinaryIO
 import numpy as np
 
 from ufmstar_torch.eval.sequences import scannet
-from ufmstar_torch.eval.sequences.attach import attach_given
+from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import read_color
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix
@@ -144,14 +144,11 @@ def _frames(file: BinaryIO, path: Path, count: int, depth_size: Size, scale: flo
         time = float(frame["times"][0]) * _MICROSECOND or None
         load_depth = partial(_read_depth, path, depth_at, depth_bytes, depth_size, scale) if depth_bytes else None
         load_color = partial(_read_color, path, color_at, color_bytes)
-        frames.append(Entry(name, _rigid(frame["T_world_cam"].astype(np.float64)), load_color, load_depth, time))
+        T = frame["T_world_cam"].astype(np.float64)
+        if not np.abs(T[3] - [0, 0, 0, 1]).max() < 1e-6:  # -inf or 0: it was not tracked
+            T = UNKNOWN
+        frames.append(Entry(name, T, load_color, load_depth, time))
     return frames
-
-
-def _rigid(T: np.ndarray) -> np.ndarray:
-    """The pose, all NaN if an entry is not finite or it is all 0, as frames that were not tracked are written."""
-    usable = np.isfinite(T).all() and np.abs(T[3] - [0, 0, 0, 1]).max() < 1e-6
-    return T if usable else np.full((4, 4), np.nan)
 
 
 def _read_color(path: Path, offset: int, size: int) -> np.ndarray:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, depth_loader, image_size, read_color
 from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
@@ -90,7 +91,7 @@ def _pose(frame: Mapping[str, Any], file: Path) -> np.ndarray:
         raise ValueError(f"{file}: {frame['file_path']}: transform_matrix must be 4x4 numbers: {error}") from error
     T = np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
     if not np.isfinite(T).all():
-        return np.full((4, 4), np.nan)
+        return UNKNOWN
     if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
         raise ValueError(f"{file}: {frame['file_path']}: transform_matrix must be a rotation and a position, got {T}")
     return CONVENTIONS["opengl"].convert(T)
@@ -113,11 +114,8 @@ def _lens(values: Mapping[str, Any], size: Size, file: Path) -> Lens:
     sx, sy = size[1] / width, size[0] / height
     fisheye = model in _FISHEYES or values.get("is_fisheye") is True
     k1, k2, p1, p2, k3, k4 = (_number(values, key, file, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4"))
-    if fisheye:
-        coefficients: tuple[float, ...] = (k1, k2, k3, k4)
-    else:
-        coefficients = (k1, k2, p1, p2, k3, k4, 0.0, 0.0) if k4 else (k1, k2, p1, p2, k3)
-    return Lens((fx * sx, fy * sy, cx * sx - 0.5, cy * sy - 0.5), size, coefficients, fisheye)
+    coefficients = [k1, k2, k3, k4] if fisheye else [k1, k2, p1, p2, k3] + [k4, 0.0, 0.0] * bool(k4)
+    return Lens((fx * sx, fy * sy, cx * sx - 0.5, cy * sy - 0.5), size, tuple(coefficients), fisheye)
 
 
 def _number(values: Mapping[str, Any], key: str, file: Path, default: float) -> float:

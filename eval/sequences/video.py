@@ -16,19 +16,9 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 
 
 class Video:
-    """A video file; frames are exact by index, and cheap when read in increasing order.
-
-    Seeking in compressed video is inexact in most containers, so that an earlier frame is reached by
-    decoding again from the start.
-
-    Attributes:
-        path: the file.
-        size: (H, W).
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: the file is no video, or one without a frame.
-    """
+    """A video file with images of ``size`` (H, W); frames are exact by index, and cheap when read in increasing order:
+    seeking is inexact in most containers, so that an earlier frame is reached by decoding again from the start. Raises
+    FileNotFoundError: no such file; ValueError: it is no video, or one without a frame."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -54,9 +44,8 @@ class Video:
         return self._length
 
     def times(self) -> np.ndarray:
-        """[N] when each frame is shown [s], from 0 on, by the timestamps in the container: a phone's frames are not
-        equally far apart. Where those are not as many as the frames (an edited video), the file is decoded once. Raises
-        FrameError: the file ends before its last frame."""
+        """[N] when each frame is shown [s], from 0 on, by the timestamps in the container, or where those are not as
+        many as the frames (an edited video), by decoding. Raises FrameError: the file ends before its last frame."""
         stamps = _container_times(self.path)
         if len(stamps) != self._length:
             stamps = self._decoded_times()
@@ -68,18 +57,13 @@ class Video:
         """Frame ``index`` as [H, W, 3] uint8 RGB. Raises FrameError: the file ends, or cannot be decoded, before that
         frame."""
         if self._capture is None or index < self._next:
-            self._capture = self._open()
-            self._next = 0
-        while self._next < index:
-            self._advance(self._capture.grab(), index)
-        ok, image = self._capture.read()
-        self._advance(ok, index)
+            self._capture, self._next = self._open(), 0
+        while self._next <= index:
+            if not self._capture.grab():
+                raise FrameError(self.path, f"frame {index} cannot be read, decoding stops at frame {self._next}")
+            self._next += 1
+        _, image = self._capture.retrieve()
         return np.ascontiguousarray(image[..., ::-1])
-
-    def _advance(self, found: bool, index: int) -> None:
-        if not found:
-            raise FrameError(self.path, f"frame {index} cannot be read, decoding stops at frame {self._next}")
-        self._next += 1
 
     def _decoded_times(self) -> np.ndarray:
         """[N] timestamps [s] of all frames, by decoding the file: of one that does not say how many it has (a browser's

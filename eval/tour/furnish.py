@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.eval.tour.furniture import AT_WALLS, FREE_STANDING, IN_HALLS, Piece, chair
 from ufmstar_torch.eval.tour.palette import Palette
 from ufmstar_torch.eval.tour.rooms import Door, Room, on_plan
-from ufmstar_torch.eval.tour.shapes import Part, ball, box, tube, turn
+from ufmstar_torch.eval.tour.shapes import Part, ball, box, rotation, tube
 
 Array = NDArray[np.float64]
 
@@ -164,7 +164,7 @@ class Furnished:
         rng, palette = self.rng, self.palette
         if rng.random() < 0.15:
             round_ = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-            face = tube((0, -0.16, 0.02), 0.16, 0.02, palette.finish("ceiling"), rotation=round_)
+            face = tube((0, -0.16, 0.02), 0.16, 0.02, palette.finish("ceiling"), axes=round_)
             piece = Piece("clock", [face], 0.34, 0.045, 0.33)
         else:
             w, h = rng.uniform(0.15, 0.5), rng.uniform(0.15, 0.35)
@@ -199,7 +199,7 @@ class Furnished:
         bottom: float = 0.0,
     ) -> bool:
         """Adds a piece if there is room for it, whatever stands in the space ``ignore``."""
-        room, R = self.room, turn(yaw)
+        room, R = self.room, rotation(1, yaw)
         corners = np.array([[x, z] for x in (-piece.width / 2, piece.width / 2) for z in (0, piece.depth)]) * scale
         ground = corners @ R[np.ix_([0, 2], [0, 2])].T + spot
         low, high = ground.min(0), ground.max(0)
@@ -214,12 +214,11 @@ class Furnished:
         self.taken.append(space)
         base = np.array([spot[0], -bottom, spot[1]])
         for p in piece.parts:
-            centre, rotation = base + R @ (p.centre * scale), R @ p.rotation
-            self.parts.append(replace(p, centre=centre, half=p.half * scale, rotation=rotation, label=piece.name))
+            centre, axes = base + R @ (p.centre * scale), R @ p.rotation
+            self.parts.append(replace(p, centre=centre, half=p.half * scale, rotation=axes, label=piece.name))
         return True
 
     def _to_way(self, low: Array, high: Array) -> float:
         """Distance from a rectangle to the nearest point of the ways [m]."""
-        if not len(self.way):
-            return float("inf")
-        return float(np.linalg.norm(np.maximum(np.maximum(low - self.way, self.way - high), 0), axis=1).min())
+        outside = np.maximum(np.maximum(low - self.way, self.way - high), 0)
+        return float(np.linalg.norm(outside, axis=1).min(initial=np.inf))

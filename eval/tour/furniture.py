@@ -21,8 +21,7 @@ class Piece:
 
     name: str  # what it is
     parts: list[Part]  # its primitives
-    # width, depth, height: the space it takes [m].
-    width: float
+    width: float  # of the space it takes [m]
     depth: float
     height: float
 
@@ -71,8 +70,7 @@ def chair(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("chair", parts, w, d, h + 2 * back)
 
 
-def table(rng: np.random.Generator, palette: Palette) -> Piece:
-    """A table, square or round, with things on it."""
+def _table(rng: np.random.Generator, palette: Palette) -> Piece:
     wood, h = palette.finish("wood"), rng.uniform(0.7, 0.78)
     if rng.random() < 0.4:
         r = rng.uniform(0.4, 0.6)
@@ -88,8 +86,7 @@ def table(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("table", [*parts, *_on_top(rng, palette, w, d / 2, -h - 0.02)], w, d, h)
 
 
-def desk(rng: np.random.Generator, palette: Palette) -> Piece:
-    """A desk with a screen, and a drawer unit beneath."""
+def _desk(rng: np.random.Generator, palette: Palette) -> Piece:
     wood, dark = palette.finish("wood"), palette.solid((0.02, 0.02, 0.025))
     w, d, h = rng.uniform(1.1, 1.5), rng.uniform(0.6, 0.75), 0.74
     screen = rng.uniform(0.22, 0.34)
@@ -104,8 +101,7 @@ def desk(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("desk", parts, w, d, h + 0.5)
 
 
-def sofa(rng: np.random.Generator, palette: Palette) -> Piece:
-    """A sofa or an armchair with cushions."""
+def _sofa(rng: np.random.Generator, palette: Palette) -> Piece:
     cloth, w = palette.finish("cloth"), rng.uniform(1.5, 2.0) if rng.random() < 0.65 else rng.uniform(0.8, 0.95)
     d, seat = rng.uniform(0.75, 0.9), rng.uniform(0.36, 0.44)
     parts = [
@@ -120,8 +116,7 @@ def sofa(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("sofa", parts, w, d, seat + 0.45)
 
 
-def bed(rng: np.random.Generator, palette: Palette) -> Piece:
-    """A bed, its head at the wall."""
+def _bed(rng: np.random.Generator, palette: Palette) -> Piece:
     wood, w, d = palette.finish("wood"), rng.uniform(0.95, 1.5), rng.uniform(1.9, 2.05)
     parts = [
         box((0, -0.14, d / 2), (w / 2, 0.11, d / 2), wood),
@@ -134,8 +129,7 @@ def bed(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("bed", parts, w, d, 0.95)
 
 
-def bookshelf(rng: np.random.Generator, palette: Palette) -> Piece:
-    """Boards with rows of books between them."""
+def _bookshelf(rng: np.random.Generator, palette: Palette) -> Piece:
     wood, w, d = palette.finish("wood"), rng.uniform(0.7, 1.3), rng.uniform(0.26, 0.34)
     rows = int(rng.integers(3, 6))
     h = rows * 0.36 + 0.06
@@ -155,8 +149,7 @@ def bookshelf(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("bookshelf", parts, w, d, h)
 
 
-def cabinet(rng: np.random.Generator, palette: Palette) -> Piece:
-    """A chest or wardrobe with doors and knobs; low ones carry things."""
+def _cabinet(rng: np.random.Generator, palette: Palette) -> Piece:
     body, front, knob = palette.finish("wood"), palette.finish("wood"), palette.finish("metal")
     high = rng.random() < 0.4
     h = rng.uniform(1.7, 2.0) if high else rng.uniform(0.7, 1.0)
@@ -170,8 +163,7 @@ def cabinet(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("cabinet", parts, w, d + 0.03, h)
 
 
-def television(rng: np.random.Generator, palette: Palette) -> Piece:
-    """A low board with a television."""
+def _television(rng: np.random.Generator, palette: Palette) -> Piece:
     dark, w, d, h = palette.solid((0.015, 0.015, 0.02)), rng.uniform(1.2, 1.7), 0.42, 0.45
     half = rng.uniform(0.4, 0.6)
     parts = [
@@ -183,8 +175,7 @@ def television(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("television", parts, w, d, h + 1.2 * half)
 
 
-def lamp(rng: np.random.Generator, palette: Palette) -> Piece:
-    """A floor lamp with a shade that glows."""
+def _lamp(rng: np.random.Generator, palette: Palette) -> Piece:
     metal, h = palette.finish("metal"), rng.uniform(1.35, 1.65)
     shade = palette.solid((0.9, 0.8, 0.6), 0.9)
     parts = [
@@ -195,8 +186,7 @@ def lamp(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("lamp", parts, 0.44, 0.44, h + 0.2)
 
 
-def plant(rng: np.random.Generator, palette: Palette) -> Piece:
-    """A plant in a pot: a bush, or a stem with leaves."""
+def _plant(rng: np.random.Generator, palette: Palette) -> Piece:
     h, leaf = rng.uniform(0.22, 0.34), palette.finish("leaf")
     parts = [tube((0, -h / 2, 0.25), rng.uniform(0.12, 0.16), h / 2, palette.finish("paint"), 1.3)]
     top = h + rng.uniform(0.1, 0.5)
@@ -208,8 +198,7 @@ def plant(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("plant", parts, 0.5, 0.5, top + 0.5)
 
 
-def stool(rng: np.random.Generator, palette: Palette) -> Piece:
-    """A stool, a pouf, or a bin."""
+def _stool(rng: np.random.Generator, palette: Palette) -> Piece:
     what, r = int(rng.integers(3)), rng.uniform(0.18, 0.26)
     if what == 0:
         parts = [tube((0, -0.45, r), r, 0.025, palette.finish("wood"))]
@@ -221,8 +210,7 @@ def stool(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("stool", parts, 2 * r, 2 * r, 0.48)
 
 
-def crates(rng: np.random.Generator, palette: Palette) -> Piece:
-    """Boxes on each other, each turned its own way, and sometimes a ball."""
+def _crates(rng: np.random.Generator, palette: Palette) -> Piece:
     parts, y = [], 0.0
     for _ in range(int(rng.integers(1, 4))):
         half = rng.uniform((0.14, 0.1, 0.12), (0.24, 0.18, 0.22))
@@ -233,8 +221,7 @@ def crates(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("crates", parts, 0.68, 0.68, 0.2 - y)
 
 
-def statue(rng: np.random.Generator, palette: Palette) -> Piece:
-    """A pedestal with an egg, a cone or a tilted cube on it."""
+def _statue(rng: np.random.Generator, palette: Palette) -> Piece:
     parts = [box((0, -0.4, 0.3), (0.2, 0.4, 0.2), palette.finish("paint"))]
     what = int(rng.integers(3))
     if what == 0:
@@ -246,8 +233,7 @@ def statue(rng: np.random.Generator, palette: Palette) -> Piece:
     return Piece("statue", parts, 0.5, 0.6, 1.35)
 
 
-def column(rng: np.random.Generator, palette: Palette) -> Piece:
-    """A round column on a plinth."""
+def _column(rng: np.random.Generator, palette: Palette) -> Piece:
     finish, r, h = palette.finish("wall"), rng.uniform(0.14, 0.2), 2.05
     parts = [
         box((0, -0.06, 0.3), (r + 0.06, 0.06, r + 0.06), finish),
@@ -258,7 +244,8 @@ def column(rng: np.random.Generator, palette: Palette) -> Piece:
 
 
 AT_WALLS: tuple[Maker, ...] = (
-    sofa, bookshelf, cabinet, cabinet, desk, bed, television, lamp, plant, table, chair, stool, crates, statue
+    _sofa, _bookshelf, _cabinet, _cabinet, _desk, _bed, _television, _lamp, _plant, _table, chair, _stool, _crates,
+    _statue,
 )  # fmt: skip
-FREE_STANDING: tuple[Maker, ...] = (table, stool, chair, plant, crates, statue)
-IN_HALLS: tuple[Maker, ...] = (column, column, statue, sofa, table, plant, crates, bookshelf, lamp)
+FREE_STANDING: tuple[Maker, ...] = (_table, _stool, chair, _plant, _crates, _statue)
+IN_HALLS: tuple[Maker, ...] = (_column, _column, _statue, _sofa, _table, _plant, _crates, _bookshelf, _lamp)

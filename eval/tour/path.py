@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.tour.route import SPACING
-from ufmstar_torch.eval.tour.shapes import lean, tilt, turn
+from ufmstar_torch.eval.tour.shapes import rotation
 from ufmstar_torch.eval.tour.tour import Tour
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ def tour_path(tour: Tour, frames: int, seed: int | None = None, *, pan: bool = F
     if pan:
         sway = np.stack([_waves(_STEP * np.arange(frames, dtype=np.float64), rng, 0.35, 1.1) for _ in range(3)], 1)
         poses[:, :3, 3] = poses[0, :3, 3] + 0.7 * SWAY * sway
-        poses[:, :3, :3] = np.stack([turn(i * _TURN / 2) @ poses[0, :3, :3] for i in range(frames)])
+        poses[:, :3, :3] = np.stack([rotation(1, i * _TURN / 2) @ poses[0, :3, :3] for i in range(frames)])
     return torch.from_numpy(poses)
 
 
@@ -110,7 +110,7 @@ def _poses(tour: Tour, way: Array, s: Array, rng: np.random.Generator) -> Array:
     for i in range(len(s)):
         direction = heading[i] + _GLANCE * glance[i] + 0.015 * hand[3][i]
         pitch = np.radians(6.0) + _PITCH * hand[4][i] * 0.7
-        poses[i, :3, :3] = turn(direction) @ tilt(pitch) @ lean(_ROLL * hand[3][i])
+        poses[i, :3, :3] = rotation(1, direction) @ rotation(0, -pitch) @ rotation(2, _ROLL * hand[3][i])
         poses[i, :3, 3] = x[i] + SWAY * 0.7 * hand[0][i], -height[i], z[i] + SWAY * 0.7 * hand[1][i]
     return poses
 

@@ -25,8 +25,7 @@ _TRIES = 400
 class Room:
     """A rectangle of floor with walls up to a ceiling."""
 
-    # lower, upper: [2] x and z of its corners [m].
-    lower: Array
+    lower: Array  # [2] x and z of its corners [m]
     upper: Array
     height: float  # of the ceiling [m]
     style: TourStyle  # how it is furnished
@@ -49,8 +48,7 @@ class Door:
     rooms: tuple[int, int]  # the earlier and the later room
     middle: Array  # [2] x and z of its middle, halfway through the wall [m]
     normal: Array  # [2] unit vector from the earlier into the later room
-    # width, height: of the opening [m].
-    width: float
+    width: float  # of the opening [m]
     height: float
     thickness: float  # of the wall [m]
 
@@ -74,30 +72,20 @@ def on_plan(axis: int, across: float, along: float) -> Array:
 
 def lay_out(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room], list[Door]]:
     """Draws the rooms; door i joins room i + 1 to an earlier one."""
-    while True:
-        layout = _try_layout(style, rng)
-        if layout is not None:
-            return layout
-
-
-def _try_layout(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room], list[Door]] | None:
     count = int(rng.integers(style.rooms[0], style.rooms[1] + 1))
-    styles = [style] * count
-    if style.last is not None:
-        styles[-1] = style.last
+    styles = [style] * (count - 1) + [style.last or style]
     rooms = [_room(styles[0], rng)]
     doors: list[Door] = []
     for own in styles[1:]:
         new = _room(own, rng)
         for _ in range(_TRIES):
             parent = len(rooms) - 1 if rng.random() < 0.75 or own is not style else int(rng.integers(len(rooms)))
-            attached = _attach(rooms, doors, parent, new, rng)
-            if attached is not None:
+            if (attached := _attach(rooms, doors, parent, new, rng)) is not None:
                 rooms.append(attached[0])
                 doors.append(attached[1])
                 break
         else:
-            return None
+            return lay_out(style, rng)
     return rooms, doors
 
 
@@ -141,25 +129,17 @@ def shell(room: Room, doors: list[Door], palette: Palette) -> Iterator[Part]:
     accent = int(room.lower.sum() * 1000) % 4
     for number, (axis, sign) in enumerate(((0, -1), (0, 1), (1, -1), (1, 1))):
         finish = special if number == accent else usual
-        yield from _wall(room, axis, sign, _openings(room, axis, sign, doors), finish, board)
+        yield from _wall(room, axis, sign, doors, finish, board)
 
 
-def _openings(room: Room, axis: int, sign: int, doors: list[Door]) -> list[tuple[float, float, float]]:
-    """(start, end, height) of the doorways in one wall, in order along it [m]."""
-    wall = room.upper[axis] if sign > 0 else room.lower[axis]
-    gaps = []
-    for door in doors:
-        if abs(door.normal[axis]) > 0.5 and abs(door.middle[axis] - wall) < door.thickness:
-            s = float(door.middle[1 - axis])
-            gaps.append((s - door.width / 2, s + door.width / 2, door.height))
-    return sorted(gaps)
-
-
-def _wall(
-    room: Room, axis: int, sign: int, openings: list[tuple[float, float, float]], finish: Finish, board: Finish
-) -> Iterator[Part]:
+def _wall(room: Room, axis: int, sign: int, doors: list[Door], finish: Finish, board: Finish) -> Iterator[Part]:
     along = 1 - axis
     wall = float(room.upper[axis] if sign > 0 else room.lower[axis])
+    openings = []  # of the doorways in this wall: start, end and height [m]
+    for door in doors:
+        if abs(door.normal[axis]) > 0.5 and abs(door.middle[axis] - wall) < door.thickness:
+            s = float(door.middle[along])
+            openings.append((s - door.width / 2, s + door.width / 2, door.height))
 
     def spot(across: float, y: float, on: float) -> Array:
         return np.insert(on_plan(axis, across, on), 1, y)
@@ -177,7 +157,7 @@ def _wall(
         return part(BOX, centre, half, board, label="skirting")
 
     top, at = -room.height - _OVERLAP, float(room.lower[along]) - _OVERLAP
-    for start, end, height in openings:
+    for start, end, height in sorted(openings):
         yield rectangle(at, start, top, _OVERLAP)
         yield skirting(at, start)
         yield rectangle(start, end, top, -height)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from ufmstar_torch.eval.tour.view import TourView, intrinsics, render
 PREFIX = "tour:"
 _FORM = "tour:SEED or tour:SEED?option=value&..., with the options style, frames, size, fov, path, pan and sensor"
 FPS = 15.0  # of the timestamps
-_KEPT = 4  # rendered frames kept, so that a frame's image and depth come from one rendering
 
 
 def open_tour(name: str) -> FrameSequence:
@@ -71,7 +71,7 @@ def tour_sequence(
     tour = make_tour(seed, style)
     poses = tour_path(tour, frames, path_seed, pan=pan)
     K = intrinsics(size[0], size[1], fov)
-    renderer = _Renderer(tour, poses, K, size, sensor)
+    renderer = _Renderer(tour, poses, torch.from_numpy(K), size, sensor)
     entries = [
         Entry(f"{i:06d}", poses[i].numpy(), partial(renderer.image, i), partial(renderer.depth, i), timestamp=i / FPS)
         for i in range(frames)
@@ -79,28 +79,29 @@ def tour_sequence(
     return make_sequence(f"tour-{seed}-{style}", "tour", entries, K, image_size=size, depth_size=size)
 
 
+@dataclass(frozen=True, eq=False)
 class _Renderer:
-    """Renders the frames of one path and keeps the last few."""
+    """Renders the frames of one path."""
 
-    def __init__(self, tour: Tour, poses: torch.Tensor, K: np.ndarray, size: Size, sensor: bool) -> None:
-        self._tour, self._poses, self._K, self._size, self._sensor = tour, poses, torch.from_numpy(K), size, sensor
-        self._kept: dict[int, TourView] = {}
+    tour: Tour
+    poses: torch.Tensor
+    K: torch.Tensor
+    size: Size
+    sensor: bool
 
     def image(self, index: int) -> np.ndarray:
         """[H, W, 3] uint8 RGB."""
-        return self._view(index).image.numpy()
+        return _view(self, index).image.numpy()
 
     def depth(self, index: int) -> np.ndarray:
         """[H, W] float32 [m]."""
-        return self._view(index).depth.float().numpy()
+        return _view(self, index).depth.float().numpy()
 
-    def _view(self, index: int) -> TourView:
-        if index not in self._kept:
-            seed = self._tour.seed * 1_000_003 + index if self._sensor else None
-            self._kept[index] = render(self._tour, self._poses[index], self._K, *self._size, frame_seed=seed)
-            if len(self._kept) > _KEPT:
-                del self._kept[next(iter(self._kept))]
-        return self._kept[index]
+
+@lru_cache(maxsize=4)  # a frame's image and depth come from one rendering
+def _view(walk: _Renderer, index: int) -> TourView:
+    seed = walk.tour.seed * 1_000_003 + index if walk.sensor else None
+    return render(walk.tour, walk.poses[index], walk.K, *walk.size, frame_seed=seed)
 
 
 def export_tour(sequence: FrameSequence, folder: str | Path) -> Path:

@@ -71,17 +71,13 @@ def _hits(
     point = origin[:, None] + depth * direction
     d = point - g[9:12]
     q = R[0] * d[0] + R[1] * d[1] + R[2] * d[2]
-    normals, uvs = [], []
-    for value, start, end in kinds:
-        normal, uv = _LOCAL[value % 4](q[:, start:end], g[:, start:end])
-        normals.append(normal)
-        uvs.append(uv)
-    local = torch.cat(normals, dim=1)
+    local_uv = [_LOCAL[value % 4](q[:, start:end], g[:, start:end]) for value, start, end in kinds]
+    local, uv = (torch.cat(parts, dim=1) for parts in zip(*local_uv, strict=True))
     n = R[:, 0] * local[0] + R[:, 1] * local[1] + R[:, 2] * local[2]
     n = n * _dot(n, n).clamp_min(1e-12).rsqrt()
     cosine = _dot(n, direction) * _dot(direction, direction).rsqrt()
     footprint = pixel_angle * depth / cosine.abs().clamp_min(0.25)
-    return Hits(surface, point, n * -torch.copysign(torch.ones_like(cosine), cosine), torch.cat(uvs, dim=1), footprint)
+    return Hits(surface, point, n * -torch.copysign(torch.ones_like(cosine), cosine), uv, footprint)
 
 
 def _quad(q: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:

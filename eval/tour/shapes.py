@@ -29,8 +29,7 @@ class Finish:
     """The look of a surface: texture and colours."""
 
     texture: str = "plain"  # one of ``TEXTURES``
-    # first, second: its two colours, linear RGB in [0, 1].
-    first: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    first: tuple[float, float, float] = (0.5, 0.5, 0.5)  # its two colours, linear RGB in [0, 1]
     second: tuple[float, float, float] = (0.3, 0.3, 0.3)
     period: float = 0.3  # of the pattern [m]
     glow: float = 0.0  # light of its own, 0 = none
@@ -61,13 +60,8 @@ class Surfaces:
     taper: Tensor  # [N] float64
     rooms: Tensor  # [N, 2] int64
     texture: Tensor  # [N] int64, index into ``TEXTURES``
-    # [N, 8, 3] float64 of the boxes around them, by signs along x, y, z as binary digits [m].
-    corners: Tensor
-    # [N, 10] float32: two colours, period [m], glow, and two random offsets of the pattern [m].
-    look: Tensor
-
-    def __len__(self) -> int:
-        return self.kind.shape[0]
+    corners: Tensor  # [N, 8, 3] float64 of the boxes around them, by signs along x, y, z as binary digits [m]
+    look: Tensor  # [N, 10] float32: two colours, period [m], glow, and two random offsets of the pattern [m]
 
 
 def part(
@@ -75,70 +69,55 @@ def part(
     centre: Vector,
     half: Vector,
     finish: Finish,
-    rotation: Array | None = None,
+    axes: Array | None = None,
     taper: float = 1.0,
     label: str = "",
 ) -> Part:
     """A primitive in the caller's frame."""
-    R = np.eye(3) if rotation is None else rotation
+    R = np.eye(3) if axes is None else axes
     return Part(kind, np.asarray(centre, np.float64), np.asarray(half, np.float64), finish, R, taper, label=label)
 
 
 def box(centre: Vector, half: Vector, finish: Finish, yaw: float = 0.0, pitch: float = 0.0) -> Part:
     """A box, turned about the vertical axis by ``yaw`` and then tilted about its x axis by ``pitch`` [rad]."""
-    return part(BOX, centre, half, finish, turn(yaw) @ tilt(pitch))
+    return part(BOX, centre, half, finish, rotation(1, yaw) @ rotation(0, -pitch))
 
 
 def ball(centre: Vector, half: Vector, finish: Finish, yaw: float = 0.0, roll: float = 0.0) -> Part:
     """An ellipsoid."""
-    return part(ELLIPSOID, centre, half, finish, turn(yaw) @ lean(roll))
+    return part(ELLIPSOID, centre, half, finish, rotation(1, yaw) @ rotation(2, roll))
 
 
 def tube(
-    centre: Vector, radius: float, half_height: float, finish: Finish, taper: float = 1.0, rotation: Array | None = None
+    centre: Vector, radius: float, half_height: float, finish: Finish, taper: float = 1.0, axes: Array | None = None
 ) -> Part:
     """A frustum on its foot."""
-    return part(FRUSTUM, centre, (radius, half_height, radius), finish, rotation, taper)
+    return part(FRUSTUM, centre, (radius, half_height, radius), finish, axes, taper)
 
 
-def turn(yaw: float) -> Array:
-    """[3, 3] rotation about the vertical axis; a positive yaw turns z towards x, which is to the right [rad]."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-
-
-def tilt(pitch: float) -> Array:
-    """[3, 3] rotation about the x axis; a positive pitch looks down [rad]."""
-    c, s = np.cos(pitch), np.sin(pitch)
-    return np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
-
-
-def lean(roll: float) -> Array:
-    """[3, 3] rotation about the z axis [rad]."""
-    c, s = np.cos(roll), np.sin(roll)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def rotation(axis: int, angle: float) -> Array:
+    """[3, 3] rotation about an axis, 0 to 2 for x, y, z, by the right-hand rule [rad]."""
+    R, i, j = np.eye(3), (axis + 1) % 3, (axis + 2) % 3
+    R[i, i] = R[j, j] = np.cos(angle)
+    R[j, i] = np.sin(angle)
+    R[i, j] = -R[j, i]
+    return R
 
 
 def surfaces(parts: Sequence[Part], rng: np.random.Generator) -> Surfaces:
     """The tensors of a list of primitives; ``rng`` shifts every pattern by its own offset."""
     offsets = rng.uniform(0.0, 7.0, (len(parts), 2))
-    looks = [
-        [*p.finish.first, *p.finish.second, p.finish.period, p.finish.glow, *offset]
-        for p, offset in zip(parts, offsets, strict=True)
-    ]
-
-    def stack(values: list[Array]) -> Tensor:
-        return torch.from_numpy(np.stack(values))
-
+    finishes = [p.finish for p in parts]
+    looks = [[*f.first, *f.second, f.period, f.glow, *at] for f, at in zip(finishes, offsets, strict=True)]
     return Surfaces(
         kind=torch.tensor([p.kind for p in parts]),
-        centre=stack([p.centre for p in parts]),
-        half=stack([p.half for p in parts]),
-        rotation=stack([p.rotation for p in parts]),
+        centre=torch.tensor(np.array([p.centre for p in parts])),
+        half=torch.tensor(np.array([p.half for p in parts])),
+        rotation=torch.tensor(np.array([p.rotation for p in parts])),
         taper=torch.tensor([p.taper for p in parts], dtype=torch.float64),
         rooms=torch.tensor([p.rooms for p in parts]),
-        texture=torch.tensor([TEXTURES.index(p.finish.texture) for p in parts]),
-        corners=stack([_around(p) for p in parts]),
+        texture=torch.tensor([TEXTURES.index(finish.texture) for finish in finishes]),
+        corners=torch.tensor(np.array([_around(p) for p in parts])),
         look=torch.tensor(looks, dtype=torch.float32),
     )
 

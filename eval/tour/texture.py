@@ -23,15 +23,12 @@ _POSITIVE = 4096.0  # cells added so that truncation rounds down; a multiple of 
 class Patch:
     """Pixels that see one kind of texture; P of them."""
 
-    # u, v: [P] coordinates on the surface [periods], shifted at random.
-    u: Tensor
+    u: Tensor  # [P] coordinates on the surface [periods], shifted at random
     v: Tensor
-    # own_u, own_v: [P] the same from the surface's middle.
-    own_u: Tensor
+    own_u: Tensor  # [P] the same from the surface's middle
     own_v: Tensor
     pixel: Tensor  # [P] size of a pixel there [periods]
-    # first, second: [3, P] the texture's colours.
-    first: Tensor
+    first: Tensor  # [3, P] the texture's colours
     second: Tensor
     table: Tensor  # see :func:`noise_table`
 

@@ -43,12 +43,6 @@ class Tour:
     ways: tuple[Tensor, ...]  # [M, 2] float64 closed ways of x and z [m], see ``route.ways``
     camera_height: float  # above the floor [m]
 
-    def room_at(self, position: Tensor) -> Tensor:
-        """[...] int64 index of the room at a position [..., 3] [m], or the nearest one (in a doorway, say)."""
-        p = position.to(self.rooms)[..., None, :]
-        beyond = torch.maximum(self.rooms[:, 0] - p, p - self.rooms[:, 1]).clamp_min(0)
-        return beyond.pow(2).sum(-1).argmin(-1)
-
 
 @lru_cache(maxsize=8, typed=True)  # True is no seed
 def make_tour(seed: int, style: str = "home") -> Tour:

@@ -42,7 +42,9 @@ def render(
     depth, surface = cast(tour, pose, intrinsics, height, width)
     valid = surface >= 0
     fx, fy = float(intrinsics[0, 0]), float(intrinsics[1, 1])
-    direction = _directions(pose, intrinsics, height, width)
+    u, v = _pixels(height, width)
+    M = (pose[:3, :3, None] * torch.linalg.inv(intrinsics)).sum(1)
+    direction = torch.stack([(u * row[0] + (v * row[1] + row[2])).flatten().float() for row in M])
     flat = surface.flatten().clamp_min(0)
     near = torch.where(valid, depth, 0.0).flatten().float()
     color = shade(tour, flat, near, direction, pose[:3, 3].float(), (fx * fy) ** -0.5)
@@ -54,8 +56,7 @@ def cast(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) ->
     """Depth [H, W] float64 [m], infinite where nothing is, and the primitives seen [H, W] int64, -1 for none; arguments
     as of :func:`render`."""
     seen = surface_windows(tour.surfaces.corners, T_world_cam, K, height, width)
-    u = torch.arange(width, dtype=torch.float64)
-    v = torch.arange(height, dtype=torch.float64)[:, None]
+    u, v = _pixels(height, width)
     depth = torch.full((height, width), float("inf"), dtype=torch.float64)
     surface = torch.full((height, width), -1, dtype=torch.int64)
     for (i, (top, bottom, left, right)), (kind, taper, o, M) in zip(
@@ -69,6 +70,11 @@ def cast(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) ->
     return depth, surface
 
 
+def _pixels(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Columns [W] and rows [H, 1] float64."""
+    return torch.arange(width, dtype=torch.float64), torch.arange(height, dtype=torch.float64)[:, None]
+
+
 def _rays(
     tour: Tour, T_world_cam: Tensor, K: Tensor, seen: list[tuple[int, Window]]
 ) -> Iterator[tuple[int, float, list[float], list[list[float]]]]:
@@ -79,14 +85,6 @@ def _rays(
     camera = (R[:, :, :, None] * T_world_cam[:3, None, :3]).sum(1) / half[:, :, None]
     M = (camera[..., None] * torch.linalg.inv(K)).sum(2)
     return zip(s.kind[chosen].tolist(), s.taper[chosen].tolist(), o.tolist(), M.tolist(), strict=True)
-
-
-def _directions(T_world_cam: Tensor, K: Tensor, height: int, width: int) -> Tensor:
-    """[3, H W] float32 world directions of the pixels' rays, with depth 1."""
-    M = (T_world_cam[:3, :3, None] * torch.linalg.inv(K)).sum(1)
-    u = torch.arange(width, dtype=torch.float64)
-    v = torch.arange(height, dtype=torch.float64)[:, None]
-    return torch.stack([(u * row[0] + (v * row[1] + row[2])).flatten().float() for row in M])
 
 
 def _checked(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:

@@ -195,7 +195,7 @@ class LandmarkTracker(SavedState):
     @property
     def identity(self) -> dict[str, Any]:
         """Plain values on which the landmarks depend."""
-        return {"anchors": "tracked", "tracker": self.config.to_dict()}
+        return {"anchors": "corners", "tracker": self.config.to_dict()}
 
     def reset(self) -> None:
         """Forget everything."""
