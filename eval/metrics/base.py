@@ -100,7 +100,11 @@ class SumMetric(Metric):
         if self.OF_VARIANCE and len(pixels.variance) != len(pixels.depth):
             judged = f"{self.OF_VARIANCE} judges the predicted distribution N(depth, variance)"
             raise ValueError(f"variance must be given: {judged}")
-        for name, added in self.sums(pixels).items():
+        self.add_sums(self.sums(pixels))
+
+    def add_sums(self, sums: Mapping[str, Any]) -> None:
+        """Add to states by their names."""
+        for name, added in sums.items():
             state = getattr(self, name)
             setattr(self, name, state + torch.as_tensor(added, dtype=state.dtype, device=state.device))
 

@@ -67,6 +67,11 @@ class ECEDelta(SumMetric):
         }
 
 
+def quantile_levels(bins: int) -> Tensor:
+    """[B] q_b = (b - 1/2) / B, b = 1..B: the levels 0 and 1, which are always right, stay out."""
+    return (torch.arange(bins, dtype=torch.float64) + 0.5) / bins
+
+
 class ECEQuantile(SumMetric):
     """ECE_q = 1/B sum_b |obs(q_b) - q_b| and the quantile calibration curve.
 
@@ -82,12 +87,11 @@ class ECEQuantile(SumMetric):
     OF_VARIANCE = "ECE_q"
 
     def __init__(self, levels: Sequence[float] | None = None, **kwargs: Any) -> None:
-        levels = [(b + 0.5) / 10 for b in range(10)] if levels is None else list(levels)
-        q = self.levels = torch.tensor(levels, dtype=torch.float64)
+        q = quantile_levels(10) if levels is None else torch.tensor(list(levels), dtype=torch.float64)
         if q.numel() == 0 or not bool(((q >= 0) & (q <= 1)).all() and (q.diff() > 0).all()):
             raise ValueError(f"levels must rise within [0, 1], got {levels}")
-        self.settings = {"levels": levels}
-        self.STATES = (("at_or_below", COUNT, len(levels)), ("pixels", COUNT))
+        self.levels, self.settings = q, {"levels": q.tolist()}
+        self.STATES = (("at_or_below", COUNT, len(q)), ("pixels", COUNT))
         super().__init__(**kwargs)
 
     def sums(self, pixels: Pixels) -> Mapping[str, Any]:
