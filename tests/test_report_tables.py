@@ -53,6 +53,7 @@ from ufmstar_torch.eval.report.table import (
 )
 from ufmstar_torch.eval.report.tables import (
     difference_table,
+    extra_table,
     main_table,
     write_tables,
 )
@@ -67,6 +68,15 @@ T_4 = 2.7764451051977934  # 97.5 % quantile of Student's t with 4 degrees of fre
 def less(results: Results, row: Row, reference: Row) -> Mean:
     """The paired difference in NLL."""
     return difference(results.of(row), results.of(reference), NLL)
+
+
+def test_a_mixture_has_columns_where_a_row_states_one():
+    plain = {(row, ("d", "s")): {"rmse": 0.5} for row in (ALONE, UFM_STAR)}
+    stated = plain | {(UFM_STAR, ("d", "s")): {"rmse": 0.5, "mixture_nll": 0.25, "mixture_coverage": 0.99}}
+    without, extended = extra_table(in_memory(plain)), extra_table(in_memory(stated))
+    new = [column.name for column in extended.columns if column not in without.columns]
+    assert new == ["mixture: NLL ↓", "mixture: ECE_δ ↓", "mixture: ECE_q ↓", "mixture: within 3 σ [%]"]
+    assert [cell.value for cell in extended.lines[1].cells[-4:]] == ["0.25", "", "", "99.0"]
 
 
 class TestMainTable:

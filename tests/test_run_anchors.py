@@ -208,7 +208,7 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
     assert "posterior  " in run_table(summary)
     for name in tour.names:
         one, other = (read_frame(out / "frames" / f"{name}.npz") for out in (whole, parts))
-        for key in ("posterior_depth", "posterior_variance"):
+        for key in ("posterior_depth", "posterior_variance", "posterior_inlier_variance", "posterior_outlier"):
             np.testing.assert_array_equal(one[key], other[key])
     for kind, values, unit in (
         ("depth", one["posterior_depth"], 1e-3),

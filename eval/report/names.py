@@ -69,6 +69,13 @@ EXTRA = (
     NETWORK_MS,
     UNCERTAINTY_MS,
 )
+# Of rows with a posterior, judged as the mixture that it states; in the table where a row has them.
+MIXTURE = (
+    Quantity("mixture_nll", "mixture: NLL", 2, LOWER),
+    Quantity("mixture_ece_delta", "mixture: ECE_δ", 3, LOWER),
+    Quantity("mixture_ece_q", "mixture: ECE_q", 3, LOWER),
+    Quantity("mixture_coverage", "mixture: within 3 σ", 1, None, "%", 100.0),
+)
 OWN = "own"  # the group of figures of a user's metrics
 # Figures of which differences between rows are shown.
 DIFFERENCES = (NLL, ECE_DELTA, ECE_Q, AUSE, SPEARMAN)

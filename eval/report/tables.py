@@ -28,6 +28,7 @@ from ufmstar_torch.eval.report.names import (
     EXTRA,
     MAIN,
     MEMORY,
+    MIXTURE,
     Quantity,
     own_quantities,
     row_labels,
@@ -51,7 +52,8 @@ def main_table(results: Results, dataset: str | None = None) -> Table:
 
 def extra_table(results: Results, dataset: str | None = None) -> Table:
     """Figures beyond the paper's tables: errors in metres, ranking, pixels without a figure, times."""
-    return _means(results, dataset, EXTRA, "extra")
+    mixture = MIXTURE if any(MIXTURE[0].key in record.figures for record in results.records) else ()
+    return _means(results, dataset, (*EXTRA, *mixture), "extra")
 
 
 def sequence_tables(results: Results, dataset: str) -> list[Table]:

@@ -108,7 +108,14 @@ class _Messages:
     def info(self, stamp: int, K: NDArray[np.float64], size: tuple[int, ...]) -> Any:
         zero = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
         P = np.hstack([K, np.zeros((3, 1))]).ravel()
-        how = {"d": np.zeros(5), "k": K.ravel().copy(), "r": np.eye(3).ravel(), "p": P, "binning_x": 0, "binning_y": 0}
+        how: dict[str, Any] = {
+            "d": np.zeros(5),
+            "k": K.ravel().copy(),
+            "r": np.eye(3).ravel(),
+            "p": P,
+            "binning_x": 0,
+            "binning_y": 0,
+        }
         how |= {"height": size[0], "width": size[1], "distortion_model": "plumb_bob"}
         roi = self._make("sensor_msgs/msg/RegionOfInterest", **zero)
         return self._make("sensor_msgs/msg/CameraInfo", header=self._header(stamp), roi=roi, **how)
@@ -118,9 +125,11 @@ class _Messages:
         field, width = "sensor_msgs/msg/PointField", data.itemsize * len(_FIELDS)
         how = {"datatype": _FLOAT32, "count": 1}
         fields = [self._make(field, name=n, offset=data.itemsize * i, **how) for i, n in enumerate(_FIELDS)]
-        how = {"height": 1, "width": len(data), "fields": fields, "is_bigendian": False, "is_dense": True}
-        how |= {"point_step": width, "row_step": width * len(data), "data": data.view(np.uint8).ravel()}
-        return self._make("sensor_msgs/msg/PointCloud2", header=self._header(stamp), **how)
+        size = {"height": 1, "width": len(data), "point_step": width, "row_step": width * len(data)}
+        return self._make(
+            "sensor_msgs/msg/PointCloud2", header=self._header(stamp), fields=fields, is_bigendian=False, is_dense=True,
+            data=data.view(np.uint8).ravel(), **size,
+        )  # fmt: skip
 
     def tf(self, stamp: int, T_world_cam: NDArray[np.float64]) -> Any:
         quaternion = Rotation.from_matrix(T_world_cam[:3, :3]).as_quat()

@@ -20,7 +20,10 @@ from ufmstar_torch.eval.run.summary import GOING_ON, NEAR_ZERO, write_summary
 from ufmstar_torch.eval.run.writers import frame_file, write_frame, write_pngs
 from ufmstar_torch.eval.sequences.frame import Frame
 
-_MAPS = ("depth", "variance", "disagreement", "measured", "anchored", "bias", "posterior_depth", "posterior_variance")
+_MAPS = (
+    "depth", "variance", "disagreement", "measured", "anchored", "bias",
+    "posterior_depth", "posterior_variance", "posterior_inlier_variance", "posterior_outlier",
+)  # fmt: skip
 _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured", "single_view")
 _SUMMARY_EVERY = 30.0  # [s] between two summaries of an unfinished run
 

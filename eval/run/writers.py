@@ -2,10 +2,11 @@
 
 The npz has depth [m], variance [m^2], disagreement [m^2], measured (the share of the disagreement that rests on two
 views or more) float32 and valid bool, each [H, W]; with anchors also anchored [m^2] (B) and bias (r: depth (1 + r) is
-the depth corrected), with a posterior also posterior_depth [m] and posterior_variance [m^2]; T_world_cam [4, 4]
-camera-to-world [m] and intrinsics [3, 3] of the maps [px]; with anchors also anchors [N, 4]: u, v in the maps [px],
-depth and its standard deviation [m]. depth/NAME.png and sigma/NAME.png are the posterior's where there is one; the
-network's own are in network_depth/ and network_sigma/ then.
+the depth corrected), with a posterior also posterior_depth [m], posterior_variance [m^2], posterior_outlier (a
+probability) and posterior_inlier_variance [m^2]; T_world_cam [4, 4] camera-to-world [m] and intrinsics [3, 3] of the
+maps [px]; with anchors also anchors [N, 4]: u, v in the maps [px], depth and its standard deviation [m]. depth/NAME.png
+and sigma/NAME.png are the posterior's where there is one; the network's own are in network_depth/ and network_sigma/
+then.
 """
 
 from __future__ import annotations
