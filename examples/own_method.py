@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from ufmstar_torch.eval.engine.estimators import Alone
-from ufmstar_torch.eval.metrics.base import SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SumMetric, share
 from ufmstar_torch.eval.sequences.frame import Entry, make_sequence
 
 
@@ -30,10 +30,7 @@ class Coverage(SumMetric):
     """The share of pixels whose truth lies within two standard deviations."""
 
     OF_VARIANCE = "Coverage"
-
-    def __init__(self, **how):
-        super().__init__(**how)
-        self.add_counts("inside", "pixels")
+    STATES = (("inside", COUNT), ("pixels", COUNT))
 
     def add(self, pixels):
         judged = pixels.use & (pixels.target > 0) & (pixels.variance >= 0)

@@ -12,7 +12,7 @@ counts as disagreement, and removes the frame-to-frame error of scale that is th
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, TypedDict, Unpack
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -177,33 +177,13 @@ class AlignedNetwork(DepthNetwork):
         return DepthPrediction(self.alignment.depth(relative))
 
 
-class FitOptions(TypedDict, total=False):
-    """Options of :func:`fit_inverse_depth` and :func:`fit_affine_depth`.
-
-    Keys:
-        weights: [B, H, W] inverse variances of 1/depth (or depth) up to a factor, 0 = do not use; None (default) =
-            equal, which in inverse depth fits stereo and structured light. There, for an error of constant size in
-            depth: depth**4.
-        pooled: one alignment for all images, as UfM* needs it, instead of one for each (default).
-        robust: True (default): leave out outliers, up to about a third of the points; False: plain least squares.
-        min_points: fewer usable measurements (of an image, or in all if pooled) are an error; default 10.
-        max_depth: [m] of the resulting alignment; None (default) = no limit.
-    """
-
-    weights: Tensor | None
-    pooled: bool
-    robust: bool
-    min_points: int
-    max_depth: float | None
-
-
 def fit_inverse_depth(
     prediction: Tensor,
     depth: Tensor,
     valid: Tensor | None = None,
     *,
     shift: float | None = None,
-    **options: Unpack[FitOptions],
+    **options: Any,
 ) -> AlignmentFit:
     """Scale and shift with 1/depth = scale prediction + shift, by least squares in inverse depth.
 
@@ -213,7 +193,12 @@ def fit_inverse_depth(
             finite positive value are not used.
         valid: [B, H, W] bool, True = use; None = all measured.
         shift: [1/m] if it is known (0: the prediction is inverse depth up to scale); None = fitted.
-        options: see :class:`FitOptions`.
+        options: weights [B, H, W], inverse variances of 1/depth (or depth) up to a factor, 0 = do not use; equal ones
+            (default) fit stereo and structured light in inverse depth; for a constant error of depth: depth**4.
+            pooled: one alignment for all images, as UfM* needs it, instead of one for each (default).
+            robust: leave out outliers, up to about a third of the points (default); False: plain least squares.
+            min_points: fewer usable measurements (of an image, or in all if pooled) are an error; default 10.
+            max_depth: [m] of the resulting alignment; default: no limit.
 
     Raises:
         ValueError: wrong shapes or types, too few measurements, predictions that hardly differ, or a scale that
@@ -228,7 +213,7 @@ def fit_affine_depth(
     valid: Tensor | None = None,
     *,
     shift: float | None = 0.0,
-    **options: Unpack[FitOptions],
+    **options: Any,
 ) -> AlignmentFit:
     """Scale (and shift) with depth = scale prediction + shift [m], by least squares in depth.
 

@@ -195,10 +195,6 @@ class BatchEnsembleMember(DepthNetwork):
         """Depth [B, H, W] [m] and variances [m^2] of ``image`` [B, 3, H, W]: one inference."""
         return self.distribution(image).prediction()
 
-    def extra_repr(self) -> str:
-        """The member's number."""
-        return f"n={self.n}"
-
 
 def _require_plain(name: str, module: nn.Module) -> None:
     """Raises TypeError where a layer computes something else than its plain class does."""

@@ -57,11 +57,6 @@ class BatchLayer(nn.Module):
         """W, whose type some networks look up."""
         return self.shared.weight
 
-    @property
-    def members(self) -> int:
-        """N."""
-        return len(self.r)
-
     def forward(self, x: Tensor) -> Tensor:
         """y of x ([B, C, H, W], or [B, ..., C] of a linear layer), image b by member ``selection.members[b]``. Raises
         RuntimeError: the layer was called other than through its BatchEnsemble; ValueError: the network changed the
@@ -99,7 +94,3 @@ class BatchLayer(nn.Module):
         if self.bias is not None:
             layer.bias = nn.Parameter(self.bias[member].detach().clone())
         return layer
-
-    def extra_repr(self) -> str:
-        """The number of members."""
-        return f"members={self.members}"

@@ -65,10 +65,12 @@ def load_weights(module: nn.Module, path: str | Path) -> None:
     fill(module, _without_prefixes(_read(Path(path)), keep=set(module.state_dict())), str(path))
 
 
-def channels_of(state: Mapping[str, Tensor], keys: Sequence[str], network: str) -> tuple[int, ...]:
-    """The output channels of some weights, from which a network's shape is read. Raises ValueError: one is missing."""
+def channels_of(state: Mapping[str, Tensor], keys: Sequence[str], network: str, source: object) -> tuple[int, ...]:
+    """The output channels of some weights, from which a network's shape is read. Raises CheckpointError: one is
+    missing; the message names ``source``."""
     if missing := [key for key in keys if key not in state]:
-        raise ValueError(f"not the weights of a {network}: no {missing[0]!r} ({len(missing)} such keys missing)")
+        fault = f"not the weights of a {network}: no {missing[0]!r} ({len(missing)} such keys missing)"
+        raise CheckpointError(f"{source}: {fault}")
     return tuple(len(state[key]) for key in keys)
 
 

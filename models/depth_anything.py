@@ -9,17 +9,17 @@ CC BY-NC 4.0: not for commercial use.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
 import torch
 
-from ufmstar_torch.checked import Checked
-from ufmstar_torch.models.alignment import Alignment
 from ufmstar_torch.models.checkpoints import CheckpointError
-from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
+from ufmstar_torch.models.hugging_face import Checkpoint, HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
 from ufmstar_torch.models.network import DepthNetwork
+
+SIZE = (518, 518)  # [px] of the input
 
 
 class DepthAnything(HuggingFaceDepth):
@@ -29,12 +29,26 @@ class DepthAnything(HuggingFaceDepth):
     its inverse depth up to scale and shift, and ``network.aligned(alignment)`` a depth network.
     """
 
+    def __init__(self, checkpoint: Checkpoint, spec: HuggingFaceSpec, dtype: torch.dtype = torch.float32) -> None:
+        """From a checkpoint that was read; arguments and errors as :meth:`from_pretrained`."""
+        if checkpoint.model_type != "depth_anything":
+            raise CheckpointError(
+                f"{checkpoint.name} is a {checkpoint.config.get('model_type')!r} model, expected 'depth_anything'; "
+                "other depth models: from_hugging_face"
+            )
+        size, multiple = spec.size or SIZE, checkpoint.patch
+        if len(size) != 2 or any(side < 1 or side % multiple for side in size):
+            raise ValueError(f"size must be (height, width) in multiples of the patch, {multiple} px, got {size}")
+        if spec.preprocess is None:
+            spec = replace(spec, size=size, keep_aspect=bool(spec.keep_aspect))
+        super().__init__(checkpoint, spec, dtype)
+
     @classmethod
     def from_pretrained(
         cls,
         name_or_dir: str | Path,
         *,
-        size: tuple[int, int] = (518, 518),
+        size: tuple[int, int] = SIZE,
         keep_aspect: bool = False,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
@@ -51,32 +65,11 @@ class DepthAnything(HuggingFaceDepth):
             ValueError: ``size`` is no multiple of the patch.
         """
         checkpoint = read_checkpoint(name_or_dir, revision, local_files_only)
-        if checkpoint.model_type != "depth_anything":
-            raise CheckpointError(
-                f"{checkpoint.name} is a {checkpoint.config.get('model_type')!r} model, expected 'depth_anything'; "
-                "other depth models: from_hugging_face"
-            )
-        multiple = checkpoint.patch
-        if len(size) != 2 or any(side < 1 or side % multiple for side in size):
-            raise ValueError(f"size must be (height, width) in multiples of the patch, {multiple} px, got {size}")
-        return cls.of_checkpoint(checkpoint, HuggingFaceSpec(size=size, keep_aspect=keep_aspect), dtype).to(device)
-
-
-@dataclass(frozen=True)
-class DepthAnythingSpec(Checked):
-    """Arguments of :meth:`DepthAnything.from_pretrained` for configuration files, and the alignment of a relative
-    checkpoint."""
-
-    size: tuple[int, int] = (518, 518)
-    keep_aspect: bool = False
-    alignment: Alignment | None = None
+        return cls(checkpoint, HuggingFaceSpec(size=size, keep_aspect=keep_aspect), dtype).to(device)
 
 
 def load_depth_anything(weights: Path, spec: Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
-    """The metric network in a directory, or of a hub name; ``spec``: :class:`DepthAnythingSpec`, its plain values or a
-    JSON file. Raises ValueError: an unknown option, or a relative checkpoint without an alignment; others as
-    :meth:`DepthAnything.from_pretrained`."""
-    declared = DepthAnythingSpec.read(spec or {})
-    network = DepthAnything.from_pretrained(weights, size=declared.size, keep_aspect=declared.keep_aspect)
-    metric: DepthNetwork = network.aligned(declared.alignment)
+    """The metric network in a directory, or of a hub name; arguments and errors as ``load_hugging_face``."""
+    declared = HuggingFaceSpec.read(spec or {})
+    metric: DepthNetwork = DepthAnything(read_checkpoint(weights), declared).aligned(declared.alignment)
     return metric

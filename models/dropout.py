@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.models.distribution import DepthDistribution, split_batch
+from ufmstar_torch.models.distribution import DepthDistribution
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.networks_in_turn import combine
@@ -43,9 +43,6 @@ class DecoderDropout(nn.Module):
         draw = torch.rand(*x.shape[:2], *(1,) * (x.dim() - 2), generator=self.generator, device=x.device)
         return x * (draw >= self.p).to(x.dtype) / (1 - self.p)
 
-    def extra_repr(self) -> str:
-        return f"p={self.p}, sampling={self.sampling}"
-
 
 def set_sampling(module: nn.Module, on: bool, generator: torch.Generator | None = None) -> int:
     """Switch sampling in eval mode of every :class:`DecoderDropout` in ``module`` (with p > 0), in place; their number.
@@ -72,7 +69,6 @@ class MonteCarloDropout(DepthNetwork):
         network: used as it is, not copied; from now on its dropout samples also in eval mode, which
             ``set_sampling(network, False)`` takes back. Its weights are trained as without this wrapper.
         samples: passes per call.
-        batched: whether the passes run as one batch, faster on a device with memory for it.
         generator: source of the random numbers, on the network's device; None: torch's global one.
 
     Raises:
@@ -84,7 +80,6 @@ class MonteCarloDropout(DepthNetwork):
         network: DepthNetwork,
         samples: int = 1,
         *,
-        batched: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
@@ -94,7 +89,6 @@ class MonteCarloDropout(DepthNetwork):
         self.network = network
         self.preprocess = network.preprocess
         self.samples = samples
-        self.batched = batched
 
     def distribution(self, image: Tensor) -> DepthDistribution:
         """One pass, for the losses. Raises TypeError: the network predicts depth without declaring a distribution."""
@@ -111,9 +105,5 @@ class MonteCarloDropout(DepthNetwork):
         """Depth [B, H, W] [m] and variances [m^2] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; with
         one sample only what the network itself predicts, otherwise E = the variance between the passes (+ their own
         mean E)."""
-        if self.samples == 1 or not self.batched:
-            passes = [infer(self.network, image, intrinsics) for _ in range(self.samples)]
-            return passes[0] if self.samples == 1 else combine(passes)
-        repeated = None if intrinsics is None else intrinsics.repeat(self.samples, 1, 1)
-        together = infer(self.network, image.repeat(self.samples, 1, 1, 1), repeated)
-        return combine(split_batch(together, self.samples))
+        passes = [infer(self.network, image, intrinsics) for _ in range(self.samples)]
+        return passes[0] if self.samples == 1 else combine(passes)

@@ -149,7 +149,3 @@ class LazyMember(DepthNetwork):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__({**state, "_loading": threading.Lock(), "_calling": threading.Lock()})
-
-    def extra_repr(self) -> str:
-        """Name and state of the network."""
-        return f"{self.name!r}, loaded={self.loaded}, offload={self.offload}"

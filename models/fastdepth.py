@@ -13,6 +13,7 @@ import copy
 import math
 import warnings
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import pairwise
@@ -95,12 +96,11 @@ class FastDepthWidths:
         return cls(tuple(map(scale, full.encoder)), tuple(map(scale, full.decoder)))
 
     @classmethod
-    def of_state_dict(cls, state: Mapping[str, Tensor]) -> FastDepthWidths:
-        """The widths of a :class:`FastDepth`'s own state_dict. Raises ValueError: a weight of whose shape a width is
-        read is missing."""
+    def of_state_dict(cls, state: Mapping[str, Tensor], source: object) -> FastDepthWidths:
+        """The widths of a :class:`FastDepth`'s own state_dict; errors as ``channels_of``."""
         count = len(_STRIDES)
         units = [*(f"encoder.{i}.pointwise" for i in range(1, count)), *(f"decoder.{i}.pointwise" for i in range(5))]
-        widths = channels_of(state, [f"{unit}.conv.weight" for unit in ("encoder.0", *units)], "FastDepth")
+        widths = channels_of(state, [f"{unit}.conv.weight" for unit in ("encoder.0", *units)], "FastDepth", source)
         return cls(widths[:count], widths[count:])
 
 
@@ -314,11 +314,7 @@ def load_fastdepth(
         network = FastDepth.from_onnx(weights, dropout=dropout, size=size)
         return _graph(network, weights, runtime, threads, torch.device(device)) or network
     state = load_state_dict_file(weights)
-    try:
-        widths = FastDepthWidths.of_state_dict(state)
-    except ValueError as error:
-        raise ValueError(f"{weights}: {error}") from error
-    norm = "encoder.0.norm.weight" in state
+    widths, norm = FastDepthWidths.of_state_dict(state, weights), "encoder.0.norm.weight" in state
     network = FastDepth(widths, norm=norm, dropout=dropout, positive=positive, size=size)
     fill(network, state, str(weights))
     return network
@@ -345,17 +341,11 @@ def load_graph(
     instead of an image that is stretched."""
     declared = OnnxSpec.required(spec)
     network = load_onnx(weights, declared, **options)
-    if declared.preprocess is None and find_spec("onnx") is not None and _is_fastdepth(weights):
-        network.preprocess = Preprocess.nyu(network.preprocess.size or (224, 224))
+    if declared.preprocess is None and find_spec("onnx") is not None:
+        with suppress(ValueError):  # another network
+            FastDepth.from_onnx(weights)
+            network.preprocess = Preprocess.nyu(network.preprocess.size or (224, 224))
     return network
-
-
-def _is_fastdepth(weights: Path) -> bool:
-    try:
-        FastDepth.from_onnx(weights)
-    except ValueError:
-        return False
-    return True
 
 
 def _require_same_function(network: FastDepth, path: str | Path) -> None:

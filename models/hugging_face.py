@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, Self
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.checked import Checked
+from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.models.alignment import KINDS, AlignedNetwork, Alignment
 from ufmstar_torch.models.checkpoints import DAMAGE, CheckpointError, some
 from ufmstar_torch.models.network import DepthNetwork, require_image
@@ -67,8 +67,8 @@ class HuggingFaceSpec(Checked):
         alignment: of a relative network; for :func:`load_hugging_face`.
     """
 
-    kind: str | None = None
-    scale: float = 1.0
+    kind: str | None = field(default=None, metadata={"choices": (None, METRIC, *KINDS)})
+    scale: float = number(1.0, "", "m", 0.0, open_low=True, open_high=True)
     size: tuple[int, int] | None = None
     keep_aspect: bool | None = None
     preprocess: Preprocess | None = None
@@ -157,42 +157,26 @@ class HuggingFaceDepth(DepthNetwork):
     takes_intrinsics = False
 
     def __init__(
-        self, raw: RawDepth, preprocess: Preprocess, kind: str, *, scale: float = 1.0, source: str = ""
-    ) -> None:
-        super().__init__()
-        if kind not in (METRIC, *KINDS):
-            raise ValueError(f"kind must be one of {(METRIC, *KINDS)}, got {kind!r}")
-        if not 0 < scale < float("inf"):
-            raise ValueError(f"scale must be positive metres per unit, got {scale}")
-        if kind != METRIC and scale != 1:
-            raise ValueError(f"scale goes with kind {METRIC!r} only; a relative network gets an Alignment")
-        self.raw, self.preprocess = raw, preprocess
-        self.kind, self.scale, self.source = kind, scale, source
-
-    @classmethod
-    def of_checkpoint(
-        cls,
+        self,
         checkpoint: Checkpoint,
         spec: HuggingFaceSpec,
         dtype: torch.dtype = torch.float32,
         model: nn.Module | None = None,
-    ) -> Self:
+    ) -> None:
         """From a checkpoint that was read, or the ``model`` that is in memory already, in eval mode; errors as
         :func:`from_hugging_face`."""
-        kind, preprocess = _kind(checkpoint, spec.kind, spec.takes_intrinsics), spec.preprocess
-        if preprocess is None:
-            preprocess = _preprocess(checkpoint, spec.size, spec.keep_aspect)
-        elif spec.size is not None or spec.keep_aspect is not None:
+        super().__init__()
+        self.kind, self.scale, self.source = _kind(checkpoint, spec), spec.scale, checkpoint.name
+        if spec.preprocess is not None and (spec.size is not None or spec.keep_aspect is not None):
             raise ValueError("preprocess excludes size and keep_aspect, which it contains")
-        padded = checkpoint.model_type == "zoedepth" and checkpoint.processor.get("do_pad", True)
+        self.preprocess = spec.preprocess or _preprocess(checkpoint, spec.size, spec.keep_aspect)
         model = _load_model(checkpoint, dtype, spec.allow_missing) if model is None else model
-        canonical = checkpoint.model_type == "depth_pro"
-        raw = RawDepth(model, checkpoint.patch, canonical=canonical, padded=padded)
-        network = cls(raw, preprocess, kind, scale=spec.scale, source=checkpoint.name)
-        network.takes_intrinsics = spec.takes_intrinsics
+        padded = checkpoint.model_type == "zoedepth" and checkpoint.processor.get("do_pad", True)
+        self.raw = RawDepth(model, checkpoint.patch, canonical=checkpoint.model_type == "depth_pro", padded=padded)
+        self.takes_intrinsics = spec.takes_intrinsics
         if checkpoint.config.get("depth_estimation_type") == METRIC:
-            network.max_depth = spec.scale * float(checkpoint.config["max_depth"])
-        return network.eval()
+            self.max_depth = spec.scale * float(checkpoint.config["max_depth"])
+        self.eval()
 
     @property
     def is_metric(self) -> bool:
@@ -263,11 +247,10 @@ def from_hugging_face(
     spec = HuggingFaceSpec(**declared)
     if of_transformers(name_or_dir):
         model, checkpoint = _in_memory(name_or_dir, processor)
-        return HuggingFaceDepth.of_checkpoint(checkpoint, spec, model=model).to(device)
+        return HuggingFaceDepth(checkpoint, spec, model=model).to(device)
     if processor is not None:
         raise ValueError("processor goes with a model in memory: a checkpoint has its own")
-    checkpoint = read_checkpoint(name_or_dir, revision, local_files_only)
-    return HuggingFaceDepth.of_checkpoint(checkpoint, spec, dtype).to(device)
+    return HuggingFaceDepth(read_checkpoint(name_or_dir, revision, local_files_only), spec, dtype).to(device)
 
 
 def of_transformers(network: object) -> bool:
@@ -294,9 +277,7 @@ def load_hugging_face(weights: Path, spec: Mapping[str, Any] | str | Path | None
     JSON file. Raises ValueError: an unknown option, or a relative network without an alignment; others as
     :func:`from_hugging_face`."""
     declared = HuggingFaceSpec.read(spec or {})
-    network: DepthNetwork = HuggingFaceDepth.of_checkpoint(read_checkpoint(weights), declared).aligned(
-        declared.alignment
-    )
+    network: DepthNetwork = HuggingFaceDepth(read_checkpoint(weights), declared).aligned(declared.alignment)
     return network
 
 
@@ -392,8 +373,6 @@ def _preprocess(checkpoint: Checkpoint, size: tuple[int, int] | None, keep_aspec
         size = (int(own["height"]), int(own["width"]))
     if size is None:
         raise ValueError(f"{name}: preprocessor_config.json states no size with height and width: declare it {declare}")
-    if len(size) != 2:
-        raise ValueError(f"{name}: size must be (height, width) in pixels, got {size}")
     keep = bool(processor.get("keep_aspect_ratio")) if keep_aspect is None else keep_aspect
     divisor = int(processor.get("ensure_multiple_of") or processor.get("size_divisor") or 1)
     mean, std = processor.get("image_mean"), processor.get("image_std")
@@ -403,7 +382,7 @@ def _preprocess(checkpoint: Checkpoint, size: tuple[int, int] | None, keep_aspec
         raise ValueError(f"{name}: its image processor normalises, but names no image_mean and image_std")
     factor = float(processor.get("rescale_factor", 1 / 255)) if processor.get("do_rescale", True) else 1.0
     return Preprocess(
-        size=(size[0], size[1]),
+        size=size,
         aspect_multiple=max(checkpoint.patch, divisor) if keep else None,
         value_range=255 * factor,
         mean=tuple(mean),
@@ -413,9 +392,10 @@ def _preprocess(checkpoint: Checkpoint, size: tuple[int, int] | None, keep_aspec
     )
 
 
-def _kind(checkpoint: Checkpoint, kind: str | None, takes_intrinsics: bool) -> str:
+def _kind(checkpoint: Checkpoint, spec: HuggingFaceSpec) -> str:
     """The kind of depth, from the configuration, the architecture and the declaration."""
     config, name, model_type = checkpoint.config, checkpoint.name, checkpoint.model_type
+    kind, takes_intrinsics = spec.kind, spec.takes_intrinsics
     if model_type not in _ALWAYS_METRIC:
         known = ", ".join(_ALWAYS_METRIC)
         raise CheckpointError(f"{name} ({model_type}) cannot be loaded as a depth model: covered are {known}")
@@ -443,4 +423,6 @@ def _kind(checkpoint: Checkpoint, kind: str | None, takes_intrinsics: bool) -> s
         aligned = "" if own == METRIC else ": from_hugging_face(...).aligned(alignment) makes it metric"
         source = f"depth_estimation_type {stated!r}" if stated else f"the architecture {model_type}"
         raise ValueError(f"kind={kind!r}, but {name} states {source}, which is {own!r}{aligned}")
+    if (own or kind) != METRIC and spec.scale != 1:
+        raise ValueError(f"scale goes with kind {METRIC!r} only; a relative network gets an Alignment")
     return own or str(kind)

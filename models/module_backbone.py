@@ -108,7 +108,7 @@ class ModuleSpec(Checked):
             )
         declared = self.declared or HuggingFaceSpec()
         read = read_checkpoint(self.source) if weights else Checkpoint(self.source, **self.checkpoint, options={})
-        network: nn.Module = HuggingFaceDepth.of_checkpoint(read, declared).aligned(declared.alignment)
+        network: nn.Module = HuggingFaceDepth(read, declared).aligned(declared.alignment)
         return network
 
 

@@ -219,11 +219,11 @@ class MonodepthResNet(Backbone):
         return network
 
 
-def shape_of_state_dict(state: Mapping[str, Tensor]) -> tuple[int, tuple[int, ...]]:
+def shape_of_state_dict(state: Mapping[str, Tensor], source: object) -> tuple[int, tuple[int, ...]]:
     """(layers, decoder) of the :class:`MonodepthResNet` that a state_dict belongs to; the strides do not show in it.
-    Raises ValueError: a tensor from which they are read is missing."""
+    Errors as ``channels_of``."""
     keys = ["encoder.layer1.0.conv2.weight", *(f"levels.{i}.before.weight" for i in range(LEVELS))]
-    _, *decoder = channels_of(state, keys, "MonodepthResNet")
+    _, *decoder = channels_of(state, keys, "MonodepthResNet", source)
     return layers_of(state), tuple(decoder)
 
 

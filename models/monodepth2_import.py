@@ -139,10 +139,8 @@ def load_published(folder: Path, spec: PublishedSpec | Mapping[str, Any] | str |
             f'{folder}: trained on single images, Monodepth2\'s depth has no scale: declare "scale" [m] or "alignment" '
             "(fit_affine_depth, fit_inverse_depth) in a spec"
         )
-    decoder = load_state_dict_file(files[1])
-    widths = channels_of(
-        decoder, [f"decoder.{2 * n + 1}.conv.conv.weight" for n in range(LEVELS)], "Monodepth2 decoder"
-    )
+    keys = [f"decoder.{2 * n + 1}.conv.conv.weight" for n in range(LEVELS)]
+    widths = channels_of(load_state_dict_file(files[1]), keys, "Monodepth2 decoder", files[1])
     scale = (s.scale or STEREO_SCALE) if s.alignment is None else 1.0
     network = MonodepthResNet(layers_of(about), decoder=widths[::-1], disparity=(s.least, s.largest), scale=scale)
     report = load_monodepth2(network, *files)
@@ -163,10 +161,7 @@ def load_monodepth_resnet(
     if weights.is_dir():
         return load_published(weights, spec)
     state = load_state_dict_file(weights)
-    try:
-        layers, decoder = shape_of_state_dict(state)
-    except ValueError as error:
-        raise ValueError(f"{weights}: {error}") from error
+    layers, decoder = shape_of_state_dict(state, weights)
     network = MonodepthResNet(layers, strides=strides, dropout=dropout, decoder=decoder, size=size)
     fill(network, state, str(weights))
     return network

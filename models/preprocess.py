@@ -177,7 +177,8 @@ class Preprocess(Checked):
         if image.dtype == torch.uint8 and image.is_cpu and self.antialias and not self.cubic and single and len(image):
             from ufmstar_torch.models.preprocess_cpu import resample
 
-            steps = (g.resized, g.top, g.left, g.cropped, g.final)
+            once = g.resized == g.cropped == g.image
+            steps = (g.final, 0, 0, g.final, g.final) if once else (g.resized, g.top, g.left, g.cropped, g.final)
             pixels = image.permute(0, 2, 3, 1).contiguous().numpy()
             return torch.stack([torch.from_numpy(resample(one, *steps)) for one in pixels])
         return self.resampled(image)

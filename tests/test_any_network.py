@@ -129,7 +129,7 @@ class Metric(nn.Module):
         return x[:, 0] * K[:, 0, 0, None, None] / 1000
 
 
-@pytest.mark.parametrize("around", ["wrapped", "declared", "ensemble", "lazy", "samples", "batched", "aligned"])
+@pytest.mark.parametrize("around", ["wrapped", "declared", "ensemble", "lazy", "samples", "aligned"])
 def test_the_intrinsics_pass_through_every_wrapper(image: Tensor, around: str) -> None:
     """Every wrapper takes the intrinsics and passes them on, in single precision."""
     inner: DepthNetwork = wrap_network(Metric())
@@ -139,7 +139,6 @@ def test_the_intrinsics_pass_through_every_wrapper(image: Tensor, around: str) -
         "ensemble": lambda: Ensemble([inner, wrap_network(lambda x: x[:, 0])]),
         "lazy": lambda: LazyMember(lambda: inner, inner.preprocess),
         "samples": lambda: MonteCarloDropout(wrap_network(Sampling()), 2),
-        "batched": lambda: MonteCarloDropout(wrap_network(Sampling()), 2, batched=True),
         "aligned": lambda: AlignedNetwork(Metric(), Alignment("affine", 1.0, 0.0)),
     }
     network, factor = networks[around](), torch.tensor([0.5, 2.0])[:, None, None]

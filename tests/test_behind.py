@@ -14,9 +14,8 @@ from runs import Brightness, networks
 
 from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import Gaussians
-from ufmstar_torch.eval.engine.prefetch import prefetch
 from ufmstar_torch.eval.engine.rows import RowRunner
-from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream
+from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream, prefetch
 from ufmstar_torch.eval.engine.writer_thread import WriterThread
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 

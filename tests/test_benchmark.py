@@ -23,15 +23,10 @@ def test_spread_of_known_values():
     message = spread([5.0, 1.0, 2.0, 4.0, 3.0])
     assert message == {"median_ms": 3.0, "iqr_ms": 2.0, "q1_ms": 2.0, "q3_ms": 4.0, "min_ms": 1.0, "count": 5}
     assert spread([1.0, 2.0, 3.0, 4.0])["q1_ms"] == 1.75  # linear between the sorted values
-    with pytest.raises(ValueError, match="at least one"):
-        spread([])
 
 
 def test_paired_ratio_cancels_a_common_slowdown():
     assert paired_ratio([1.0, 40.0, 3.0], [2.0, 80.0, 6.0]) == {"median": 0.5, "q1": 0.5, "q3": 0.5, "count": 3}
-    for a, b in (([], []), ([1.0], [1.0, 2.0])):
-        with pytest.raises(ValueError, match="as many numerators"):
-            paired_ratio(a, b)
 
 
 @pytest.fixture

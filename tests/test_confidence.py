@@ -26,11 +26,11 @@ from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.eval.engine.estimators import make_estimator
 from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
 from ufmstar_torch.eval.engine.networks import NetworkSource
+from ufmstar_torch.eval.engine.predictions import PredictionCache
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.recalibration import figures_of_samples, fit_confidence
-from ufmstar_torch.eval.suite.cache import PredictionCache
 from ufmstar_torch.eval.tour import tour_sequence
 from ufmstar_torch.models import Ensemble, OutputSpec, Preprocess, wrap_network
 from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec

@@ -339,8 +339,8 @@ def test_networks_by_name(metric, relative, other):
         load_network("depth_anything", relative)
     glpn = load_network("huggingface", other, spec={"kind": "metric", "preprocess": {"size": [64, 96]}})
     assert glpn.preprocess == Preprocess(size=(64, 96))
-    with pytest.raises(ValueError, match="Spec has no \\['kind'\\]"):
-        load_network("depth_anything", metric, spec={"kind": "metric"})
+    with pytest.raises(ValueError, match="Spec has no \\['kinds'\\]"):
+        load_network("depth_anything", metric, spec={"kinds": "metric"})
 
 
 def test_the_command_line_runs_a_directory(relative, tmp_path, capsys):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 
-import pytest
 import torch
 from onnx_files import small_network
 from tiny_networks import Linear
@@ -56,14 +55,13 @@ def closed_form(backbone: Linear, image: Tensor) -> tuple[Tensor, Tensor]:
     return backbone.offset + terms.sum(1), terms.square().sum(1) * p / (1 - p)
 
 
-@pytest.mark.parametrize("batched", [False, True])
-def test_moments_of_a_linear_decoder(batched: bool) -> None:
+def test_moments_of_a_linear_decoder() -> None:
     """The multi-inference baseline against its limit. Tolerances are 5 standard errors: of the mean
     sqrt(V / T), of the variance V sqrt(2.25 / T), since a sum of two Bernoullis has a kurtosis below 3.25."""
     backbone, count = Linear(dropout=P), 4000
     image = 1 + torch.rand(2, 3, 4, 6, generator=seeded(1))
     mean, variance = closed_form(backbone, image)
-    network = MonteCarloDropout(DepthOnlyNetwork(backbone), count, batched=batched, generator=seeded(2)).eval()
+    network = MonteCarloDropout(DepthOnlyNetwork(backbone), count, generator=seeded(2)).eval()
     with torch.no_grad():
         prediction = network(image)
     assert prediction.aleatoric_variance is None

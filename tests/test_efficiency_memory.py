@@ -27,12 +27,11 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble, converted_layers
 from ufmstar_torch.models.dropout import MonteCarloDropout
-from ufmstar_torch.models.ensemble import Ensemble, LazyMember
+from ufmstar_torch.models.ensemble import LazyMember
 from ufmstar_torch.models.fastdepth import FastDepth
 from ufmstar_torch.models.heads import with_head
 from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
 from ufmstar_torch.models.outputs import OutputSpec
-from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
 
@@ -116,15 +115,6 @@ def test_depth_alone_is_the_same_depth_from_a_copy():
 
 def test_a_depth_only_row_is_not_charged_for_a_head_that_it_ignores():
     assert TimedNetwork("depth_only", [network()], "Linear").memory()["uncertainty"] == 0
-
-
-def test_networks_are_checked():
-    with pytest.raises(ValueError, match="one by one"):
-        TimedNetwork("ensemble", [Ensemble([network(), network()])], "x")
-    other = network()
-    other.preprocess = Preprocess(size=(8, 8))
-    with pytest.raises(ValueError, match="same input"):
-        TimedNetwork("ensemble", [network(), other], "x")
 
 
 def test_ground_truth_has_no_network_to_time():

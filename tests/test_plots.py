@@ -19,7 +19,7 @@ from ufmstar_torch.eval.run.colours import (
     colour_table,
 )
 from ufmstar_torch.eval.run.panels import FramePanel, contact_sheet, fit_scales, map_columns
-from ufmstar_torch.eval.run.video import preview_frame, write_video
+from ufmstar_torch.eval.run.pictures import preview_frame, write_video
 
 
 def panel(name: str = "a", *, error: bool = True, size: tuple[int, int] = (24, 32), seed: int = 0) -> FramePanel:

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
-from ufmstar_torch.eval.reconstruct.reconstruct import scale_model
-from ufmstar_torch.eval.reconstruct.scale import endpoint, similarity
+from ufmstar_torch.eval.reconstruct.reconstruct import endpoint, scale_model, similarity
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.tour.sequence import export_tour
 

@@ -179,6 +179,23 @@ def test_errors_that_neighbouring_anchors_do_not_share_are_not_taken_for_the_net
     assert shared.ratio("unseen") > 2 * own.ratio("unseen")
 
 
+@pytest.mark.parametrize("tier", [update, posterior_cpu.update], ids=["torch", "numba"])
+@pytest.mark.parametrize("p", [0.0, 0.5])
+def test_extreme_errors_and_probabilities_stay_finite(tier, p):
+    """Anchors off by up to e^5 that claim to be certain; no other surface at all, or one as probable as its own."""
+    model, packed = dataclasses.replace(MODEL, wrong=p), torch.zeros(1, SIZE, dtype=torch.float64)
+    for seed in range(3):
+        depth, _, claimed, pixel, g, _ = scene(seed, n=120)
+        g = g * np.exp(np.random.default_rng(seed).normal(0, 2, len(g)).clip(-4, 4))
+        frame = checked(depth, pixel, g, (1e-3 * g) ** 2)
+        packed, out = tier(packed, *frame, torch.from_numpy(claimed)[None], model)
+    seen = torch.from_numpy(depth > 0)[None]
+    assert bool(packed.isfinite().all())
+    for value in (out.depth, out.variance, out.inlier, out.outlier):
+        assert bool(value[seen].isfinite().all())
+    assert p > 0 or not bool(out.outlier[seen].any())
+
+
 def test_more_regions_on_another_surface_make_it_more_probable():
     def spots(share):
         def error(rng):

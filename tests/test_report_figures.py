@@ -16,7 +16,7 @@ from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting, setting_from
 from ufmstar_torch.eval.methods.suite import suite_named
-from ufmstar_torch.eval.report.data import Merged, Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.figures_cost import STAGES, draw_stages
 from ufmstar_torch.eval.report.figures_curves import (
     draw_calibration,
@@ -49,7 +49,7 @@ def results() -> Results:
         for row in ROWS:
             judged, _ = judge(draw_maps(row, sequence), references)
             records.append(record_of("own", "rooms", sequence, row, judged))
-            merged.setdefault(("rooms", row), Merged(judged.figures, judged.curves))
+            merged.setdefault(("rooms", row), judged.curves)
     empty = in_memory({(row, ("rooms", "a")): {} for row in ROWS})
     return replace(empty, records=tuple(records), merged=merged)
 
@@ -75,7 +75,7 @@ class TestCalibration:
         delta, quantile = drawn(shown[0]), drawn(shown[2])
         assert list(delta) == list(quantile) == ["exactly right", "alone", "UfM-100K", "UfM*"]
         for row in (ALONE, UFM, UFM_STAR):
-            curves = results.merged["rooms", row].curves
+            curves = results.merged["rooms", row]
             np.testing.assert_array_equal(quantile[look_of(row.method).name].get_ydata(), curves["ece_q_observed"])
             pixels = np.array(curves["ece_delta_pixels"])
             kept = pixels > 0.001 * pixels.sum()
@@ -97,7 +97,7 @@ class TestError:
         for axes, reference in zip(shown, ("Ensemble", "UfM-Ensemble-100K"), strict=True):
             for row in (ALONE, UFM, UFM_STAR):
                 line = drawn(axes)[look_of(row.method).name]
-                expected = results.merged["rooms", row].curves[f"nll_by_error:{reference}"]
+                expected = results.merged["rooms", row][f"nll_by_error:{reference}"]
                 np.testing.assert_array_equal(line.get_ydata(), expected)
                 np.testing.assert_array_equal(line.get_xdata(), np.arange(5, 100, 10))
         assert named(shown[0]) == {"alone", "UfM-100K", "UfM*"}

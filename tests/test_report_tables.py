@@ -33,10 +33,10 @@ from ufmstar_torch import cli
 from ufmstar_torch.eval.bench.measure import over_sequences
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.methods.setting import Setting, setting_from
 from ufmstar_torch.eval.methods.suite import names, suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.data import Results, ResultsError, load_results, setting_of
+from ufmstar_torch.eval.report.data import Results, ResultsError, load_results
 from ufmstar_torch.eval.report.means import Mean, difference, has_variance, mean_of, references
 from ufmstar_torch.eval.report.names import NLL, SPEARMAN, row_labels
 from ufmstar_torch.eval.report.paper import paper_tables
@@ -200,10 +200,9 @@ class TestSums:
         together = SequenceMetrics()
         together.update(*(torch.cat(parts) for parts in zip(*maps, strict=True)))
         merged = results.merged["scannet", UFM_STAR]
-        assert merged.figures == pytest.approx(together.compute(), rel=1e-12)
         for name, curve in together.curves().items():
-            assert merged.curves[name] == pytest.approx(curve, rel=1e-12, nan_ok=True), name
-        references = {name for name in merged.curves if name.startswith("nll_by_error")}
+            assert merged[name] == pytest.approx(curve, rel=1e-12, nan_ok=True), name
+        references = {name for name in merged if name.startswith("nll_by_error")}
         names = ("Ensemble", "UfM-Ensemble-100K")
         assert references == {f"nll_by_error:{name}" for name in names}
 
@@ -215,9 +214,8 @@ class TestSums:
         assert again.records == results.records
         assert again.merged.keys() == results.merged.keys()
         for key, merged in again.merged.items():
-            assert merged.figures == results.merged[key].figures
             # As text, since the NaN of an empty bin equals nothing.
-            assert repr(sorted(merged.curves.items())) == repr(sorted(results.merged[key].curves.items()))
+            assert repr(sorted(merged.items())) == repr(sorted(results.merged[key].items()))
         write_report(other, figures=False)
         assert (other / "results.csv").read_bytes() == (evaluation / "results.csv").read_bytes()
         assert (other / "tables" / "main.md").read_bytes() == (evaluation / "tables" / "main.md").read_bytes()
@@ -248,7 +246,7 @@ class TestLoading:
     @pytest.mark.parametrize("name", names())
     def test_settings_survive_their_dict(self, name):
         for row, label in row_labels(suite_named(name).rows).items():
-            assert setting_of(json.loads(json.dumps(row.setting.to_dict()))) == row.setting
+            assert setting_from(json.loads(json.dumps(row.setting.to_dict()))) == row.setting
             assert label.startswith(row.name)
             assert row.name.replace("-Anchored", "").replace("-Posterior", "") == row.method.name
 

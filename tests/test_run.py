@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -293,15 +294,15 @@ def between_files(count):
 
     def break_(monkeypatch):
         calls = []
-        write = writers.write_atomic
 
-        def broken(file, *rest):
+        def broken(write, file, *rest):
             write(file, *rest)
             calls.append(1)
             if len(calls) == count:
                 raise Crash
 
-        monkeypatch.setattr(writers, "write_atomic", broken)
+        for name in ("write_atomic", "write_bytes_atomic"):
+            monkeypatch.setattr(writers, name, partial(broken, getattr(writers, name)))
 
     return break_
 
@@ -358,15 +359,16 @@ def test_an_error_of_the_network_is_in_the_summary(path, tmp_path):
 
 
 def test_a_full_disk_leaves_finished_frames_and_resume_continues(path, tmp_path, uninterrupted, monkeypatch):
-    calls, write = [], writers.write_atomic
+    calls = []
 
-    def full(file, *rest):
+    def full(write, file, *rest):
         calls.append(1)
         if len(calls) > 4 * 3:  # files of a frame
             raise OSError(errno.ENOSPC, "No space left on device")
         write(file, *rest)
 
-    monkeypatch.setattr(writers, "write_atomic", full)
+    for name in ("write_atomic", "write_bytes_atomic"):
+        monkeypatch.setattr(writers, name, partial(full, getattr(writers, name)))
     out = tmp_path / "out"
     summary = run(network_job(path, *pair()), out)
     assert (summary["state"], summary["frames"]["done"]) == ("failed", 4)

@@ -18,7 +18,6 @@ from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.data import setting_of
 from ufmstar_torch.eval.sequences.frame import in_memory
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.sequence import open_tour
@@ -81,7 +80,7 @@ def assert_agrees(result, expected, used):
 def test_a_setting_survives_its_flat_form_and_json(values):
     setting = setting_from(values)
     assert setting.to_dict() == values
-    assert setting_of(json.loads(json.dumps(setting.to_dict()))) == setting
+    assert setting_from(json.loads(json.dumps(setting.to_dict()))) == setting
     assert configured(setting).anchors is not None
     assert ufm_star_config(row(NAME, anchors="corners")) == ON
 

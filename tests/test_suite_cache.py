@@ -11,9 +11,8 @@ import torch
 from layouts import truncate, write_generic, write_image
 from tiny_suite import CPU, base_network, evaluate, row, same
 
-from ufmstar_torch.eval.engine.predictions import Predicted, frame_digest, sequence_digest
+from ufmstar_torch.eval.engine.predictions import CacheError, Predicted, PredictionCache, frame_digest, sequence_digest
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.suite.cache import CacheError, PredictionCache
 from ufmstar_torch.prediction import DepthPrediction
 
 ROWS = [row(name) for name in ("Ensemble", "UfM*-Ensemble", "UfM*-MCD", "MC-Dropout", "Evidential", "UfM-DepthOnly")]

@@ -19,7 +19,6 @@ from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting, default_of, setting_from
-from ufmstar_torch.eval.report.data import setting_of
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -127,7 +126,7 @@ def test_frames_must_come_in_order():
 def test_a_setting_of_drift(name):
     setting = setting_from({name: 0.1, "seed": 2})
     assert setting.to_dict() == {name: 0.1, "seed": 2}
-    assert setting_of(json.loads(json.dumps(setting.to_dict()))) == setting
+    assert setting_from(json.loads(json.dumps(setting.to_dict()))) == setting
     assert len({setting.slug, Setting(**{name: 0.2, "seed": 2}).slug, Setting(**{name: 0.1}).slug, ""}) == 4
     assert default_of(name) == 0
     assert setting.pose_noise != Setting(**{name: 0.1}).pose_noise

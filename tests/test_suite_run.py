@@ -18,10 +18,10 @@ from tiny_suite import NAMES, TRUTH, Stub, evaluate, go, job_on, kept, rows_of, 
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
+from ufmstar_torch.eval.engine.predictions import CacheError
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.suite.cache import CacheError
 from ufmstar_torch.eval.suite.evaluate import with_references
 from ufmstar_torch.eval.suite.folder import EvalFolder
 from ufmstar_torch.eval.suite.record import Record
@@ -131,7 +131,7 @@ def test_images_without_poses_are_for_networks_alone(tmp_path):
     folder, (item,) = folder_of(job), job.items
     done = sorted(path.stem for path in folder.sequence_folder(item).glob("*.json") if path.stem != "failed")
     assert done == ["DepthOnly"]
-    failure = folder.failure(item)
+    failure = json.loads((folder.sequence_folder(item) / "failed.json").read_text())
     assert "no poses" in failure["reason"]
     assert failure["rows"] == ["UfM-DepthOnly", "UfM-DepthOnly-100K", "UfMstar-DepthOnly"]
     assert sum("failed" in line for line in message) == 1

@@ -8,7 +8,7 @@ import pytest
 from scipy.io import savemat
 from training_data import PLAIN, nyu_frame, truncated, write_h5, write_nyu
 
-from ufmstar_torch.train import NyuFrames, SampleDataset, SampleError, convert_labelled
+from ufmstar_torch.train import NyuFrames, SampleDataset, SampleError, convert_labelled, nyu
 
 
 def test_nyu_frames_are_what_the_files_hold(tmp_path):
@@ -95,12 +95,8 @@ def write_mat(path, width=64, height=48):
 
 def test_the_labelled_file_becomes_fastdepths_layout(tmp_path):
     rgb, depth, _ = write_mat(tmp_path / "labelled.mat")
-    message = []
-    counts = convert_labelled(
-        tmp_path / "labelled.mat", tmp_path / "nyu", progress=lambda done, of: message.append((done, of))
-    )
+    counts = convert_labelled(tmp_path / "labelled.mat", tmp_path / "nyu")
     assert counts == {"train": 4, "val": 2}  # every fourth scene, the den, with all its frames
-    assert message == [(i + 1, 6) for i in range(6)]
     train, val = NyuFrames(tmp_path / "nyu", "train"), NyuFrames(tmp_path / "nyu", "val")
     assert [f.parent.name for f in train.files] == SCENES[:4]
     assert [f.name for f in val.files] == ["00005.h5", "00006.h5"]
@@ -124,18 +120,19 @@ def test_the_official_split_and_the_sensors_own_depth(tmp_path):
         convert_labelled(tmp_path / "labelled.mat", tmp_path / "other", tmp_path / "splits.mat")
 
 
-def test_an_interrupted_conversion_goes_on(tmp_path):
+def test_an_interrupted_conversion_goes_on(tmp_path, monkeypatch):
     write_mat(tmp_path / "labelled.mat")
+    write = nyu.write_atomic
 
-    class Stop(Exception):
-        pass
+    def full_after_3(path, function):
+        if path.name == "00004.h5":
+            raise OSError("disk full")
+        write(path, function)
 
-    def stop_at_3(done, _):
-        if done == 3:
-            raise Stop
-
-    with pytest.raises(Stop):
-        convert_labelled(tmp_path / "labelled.mat", tmp_path / "nyu", progress=stop_at_3)
+    monkeypatch.setattr(nyu, "write_atomic", full_after_3)
+    with pytest.raises(OSError, match="disk full"):
+        convert_labelled(tmp_path / "labelled.mat", tmp_path / "nyu")
+    monkeypatch.setattr(nyu, "write_atomic", write)
     first = {p: p.stat().st_mtime_ns for p in (tmp_path / "nyu").rglob("*.h5")}
     assert len(first) == 3
     convert_labelled(tmp_path / "labelled.mat", tmp_path / "nyu")

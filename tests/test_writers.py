@@ -19,8 +19,7 @@ from runs import read_summary
 
 from ufmstar_torch import atomic
 from ufmstar_torch.eval.run.files import to_json, write_atomic, write_json_atomic
-from ufmstar_torch.eval.run.length_png import encode_length_png
-from ufmstar_torch.eval.run.writers import frame_file, read_frame, write_frame
+from ufmstar_torch.eval.run.writers import encode_length_png, frame_file, read_frame, write_frame
 from ufmstar_torch.eval.sequences.images import read_depth
 
 
@@ -90,18 +89,10 @@ def test_round_trip(tmp_path):
         assert back[name].dtype == value.numpy().dtype
 
 
-@pytest.mark.parametrize(
-    ("name", "change", "reason"),
-    [
-        *((name, {}, "plain file name") for name in ("", "../a", "a/b", ".hidden", "a\\b")),
-        ("a", {"variance": torch.ones(3, 17)}, "variance must have the depth's shape"),
-        ("a", {"depth": torch.ones(1, 12, 17)}, "depth must be a floating-point map"),
-        ("a", {"valid": torch.ones(12, 17)}, "valid must be a bool"),
-    ],
-)
-def test_refusals(tmp_path, name, change, reason):
-    with pytest.raises(ValueError, match=reason):
-        write(tmp_path, name, {**frame(), **change})
+@pytest.mark.parametrize("name", ["", "../a", "a/b", ".hidden", "a\\b"])
+def test_refusals(tmp_path, name):
+    with pytest.raises(ValueError, match="plain file name"):
+        write(tmp_path, name, frame())
     assert tree(tmp_path) == {}
 
 

@@ -72,7 +72,9 @@ class EpochBatches(Sampler[list[SampleKey]]):
         epoch, order = self.epoch, self._order()
         counts = self.shuffle or self.rank < self.length  # whether this process has frames of its own
         for batch in range(len(self)):
-            chosen = self._batch(order, batch).tolist()
+            step = self.batch_size * (self.world if self.shuffle else 1)
+            mine = slice(self.rank, None, self.world) if self.shuffle else slice(None)
+            chosen = order[batch * step : (batch + 1) * step][mine].tolist()
             frames = chosen if self.clips is None else [frame for clip in chosen for frame in self.clips[clip]]
             yield [SampleKey(epoch, frame, counts) for frame in frames]
 
@@ -80,9 +82,3 @@ class EpochBatches(Sampler[list[SampleKey]]):
         if not self.shuffle:
             return np.arange(min(self.rank, self.length - 1), self.length, self.world)
         return np.random.default_rng((self.seed, self.epoch)).permutation(self.length)
-
-    def _batch(self, order: np.ndarray, batch: int) -> np.ndarray:
-        if self.shuffle:
-            step = self.batch_size * self.world
-            return order[batch * step : (batch + 1) * step][self.rank :: self.world]
-        return order[batch * self.batch_size : (batch + 1) * self.batch_size]

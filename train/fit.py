@@ -68,11 +68,8 @@ def fit(
 
 
 def _meet(trainer: pl.Trainer, out: Path) -> None:
-    """Wait until the first process has prepared the folder: it joins Lightning's process group only then.
-
-    Raises:
-        FolderError: this machine does not see the first process's folder.
-    """
+    """Wait until the first process has prepared the folder: it joins Lightning's process group only then. Raises
+    FolderError: this machine does not see that folder."""
     if trainer.world_size == 1:
         return
     launcher: Any = trainer.strategy.launcher
@@ -97,16 +94,11 @@ def train_members(job: Job, *, end: float | None = None, asked: Callable[[], boo
     for index, member in enumerate(members):
         if asked is not None and asked():
             return first or "stopped"
-        reason = train_member(job, member, deadline=share_of_time(end, len(members) - index), asked=asked)
+        now, left = time.monotonic(), len(members) - index
+        deadline = None if end is None else now + max(0.0, end - now) / left
+        reason = train_member(job, member, deadline=deadline, asked=asked)
         first = first or reason
     return first
-
-
-def share_of_time(end: float | None, members: int) -> float | None:
-    """End of the first of ``members`` equal parts of the time from now to ``end``, in ``time.monotonic()``'s
-    seconds."""
-    now = time.monotonic()
-    return None if end is None else now + max(0.0, end - now) / members
 
 
 def _conclude(job: Job, stopped: str | None, seconds: float, command: Sequence[str]) -> dict[str, Any]:

@@ -8,7 +8,6 @@ layout from the labelled file that the dataset's own site offers (docs/training.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -67,7 +66,6 @@ def convert_labelled(
     splits: str | Path | None = None,
     *,
     raw: bool = False,
-    progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, int]:
     """Writes ``nyu_depth_v2_labeled.mat`` (MATLAB 7.3, which is HDF5) in FastDepth's layout.
 
@@ -80,7 +78,6 @@ def convert_labelled(
         splits: the site's ``splits.mat`` (``trainNdxs``, ``testNdxs``), whose 654 test frames become "val". None:
             every fourth scene does, as a whole.
         raw: the sensor's depth with its holes, and not the one with holes filled in.
-        progress: called with the number of frames done and of all.
 
     Returns:
         The number of frames of each part.
@@ -106,8 +103,6 @@ def convert_labelled(
             path = Path(out) / ("val" if i in validation else "train") / scene / f"{i + 1:05d}.h5"
             if not path.exists():
                 _write(path, images[i].transpose(0, 2, 1), depths[i].T)
-            if progress is not None:
-                progress(i + 1, len(scenes))
     return {"train": len(scenes) - len(validation), "val": len(validation)}
 
 

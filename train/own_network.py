@@ -125,7 +125,7 @@ def _of_checkpoint(
         declared = replace(declared, preprocess=preprocess)
     elif declared.preprocess is None and declared.keep_aspect is None:
         declared = replace(declared, keep_aspect=False)
-    network = HuggingFaceDepth.of_checkpoint(read, declared)
+    network = HuggingFaceDepth(read, declared)
     if not network.is_metric and declared.alignment is None:
         declared = replace(declared, alignment=_aligned(network, data))
     content = {"config": read.config, "processor": read.processor}

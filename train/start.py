@@ -11,10 +11,10 @@ from typing import Any
 
 from torch import nn
 
-from ufmstar_torch.models.checkpoints import CheckpointError, fill, read_safetensors
+from ufmstar_torch.models.checkpoints import CheckpointError, fill
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.models.spec import NetworkSpec, build_backbone, build_network
-from ufmstar_torch.models.trained import read_info
+from ufmstar_torch.models.trained import load_for_training, read_info
 
 IMAGENET = "imagenet"
 # [1] Spread of a BatchEnsemble's factors around pretrained weights. With .5, that of a start from nothing, FastDepth's
@@ -92,9 +92,7 @@ def _is_trained(path: Path) -> bool:
 def _from_trained(spec: NetworkSpec, path: Path, member: int, module: nn.Module | None) -> DepthNetwork:
     """The whole network where the spec is the file's but for input and dropout, otherwise its backbone."""
     info = read_info(path)
-    state, _ = read_safetensors(path, prefix=f"member.{member % info.networks}.")
-    source = build_network(info.spec, build_backbone(info.spec, copy.deepcopy(module)))
-    fill(source, {k: v.float() if v.is_floating_point() else v for k, v in state.items()}, str(path))
+    source = load_for_training(path, module)[member % info.networks]
     shared = ("size", "preprocess", "dropout", "dropout_both", "method", "members", "module")
     adapted = replace(info.spec, **{name: getattr(spec, name) for name in shared})
     if adapted != spec:

@@ -15,7 +15,7 @@ import logging
 import multiprocessing
 import os
 import random
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -116,7 +116,6 @@ def tour_frames(
     cache: str | Path | None = None,
     *,
     workers: int = 1,
-    progress: Callable[[int, int], None] | None = None,
 ) -> TourFrames:
     """The frames of tours, which are rendered if the cache does not have them.
 
@@ -128,7 +127,6 @@ def tour_frames(
         settings: what is rendered.
         cache: folder; None = ``ufmstar_torch/tours`` in the user's cache folder.
         workers: processes that render; 1 = this one.
-        progress: called with the number of stored tours and of all.
 
     Raises:
         ValueError: no seed, or a number out of range.
@@ -137,29 +135,20 @@ def tour_frames(
     seeds = tuple(seeds)
     if not seeds or workers < 1:
         raise ValueError(f"seeds must hold at least one and workers be at least 1, got {len(seeds)} and {workers}")
-    folder = (default_cache() if cache is None else Path(cache)) / f"tours-{settings.digest()}"
+    own = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ufmstar_torch" / "tours"
+    folder = (own if cache is None else Path(cache)) / f"tours-{settings.digest()}"
     folder.mkdir(parents=True, exist_ok=True)
     missing = [seed for seed in seeds if not tour_files(folder, seed)[-1].exists()]
     random.Random(os.getpid()).shuffle(missing)
-    done = len(seeds) - len(missing)
     if missing:
         _LOG.info("rendering %d tours of %d frames into %s", len(missing), settings.frames, folder)
-    for _ in _rendered(folder, missing, settings, min(workers, max(1, len(missing)))):
-        done += 1
-        if progress is not None:
-            progress(done, len(seeds))
+        _render(folder, missing, settings, min(workers, len(missing)))
     return TourFrames(folder, seeds, settings.frames)
 
 
 def tour_files(folder: Path, seed: int) -> tuple[Path, ...]:
     """A tour's images, depth maps, poses and camera."""
     return tuple(folder / f"{seed}.{part}.npy" for part in ("image", "depth", "pose", "camera"))
-
-
-def default_cache() -> Path:
-    """``ufmstar_torch/tours`` where the user's system keeps caches."""
-    named = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(named) if named else Path.home() / ".cache") / "ufmstar_torch" / "tours"
 
 
 def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
@@ -191,13 +180,13 @@ def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
     write_together({path: partial(np.save, arr=array) for path, array in zip(files, arrays, strict=True)})
 
 
-def _rendered(folder: Path, seeds: list[int], settings: TourSettings, workers: int) -> Iterable[None]:
-    """One item per tour as it gets ready."""
+def _render(folder: Path, seeds: list[int], settings: TourSettings, workers: int) -> None:
     task = partial(render_tour, folder, settings)
     if workers == 1:
-        yield from map(task, seeds)
+        for seed in seeds:
+            task(seed)
         return
     # "spawn" as for the loader's workers; each process renders with one thread.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        yield from pool.map(task, seeds)
+        list(pool.map(task, seeds))

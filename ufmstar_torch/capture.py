@@ -97,11 +97,7 @@ class Captured:
         self._ufm._store(self._state)
 
     def _take_over(self) -> None:
-        """The state of a module that was reset or loaded since the last call.
-
-        Raises:
-            ValueError: it has another shape than at the capture.
-        """
+        """The state of a module that was reset or loaded since the last call. Raises ValueError: another shape."""
         if not self._ufm.mean.shape[0]:
             self._restart()
         else:

@@ -95,11 +95,7 @@ def _run(name: str, words: Sequence[str]) -> int:
 
 
 def _set_up(options: Any) -> None:
-    """Check the options ``device`` and ``threads``, where a command has them, and set torch's CPU threads.
-
-    Raises:
-        ValueError: there is no such device, or the number of threads is not positive or absurd.
-    """
+    """Set torch's CPU threads. Raises ValueError: an impossible ``threads`` or ``device``."""
     threads, device = getattr(options, "threads", None), getattr(options, "device", None)
     if threads is not None:
         if threads < 1:

@@ -108,12 +108,6 @@ class LiveDepth:
     model, of ``on_result`` or of saving ends the worker; every later ``push_*``, ``reset``, ``wait_idle`` and ``close``
     raises it.
 
-    Example::
-
-        with LiveDepth(model, lambda result: plan(result.out.depth, result.out.std), (525, 525, 319.5, 239.5)) as live:
-            camera.on_image(live.push_image)  # stamp [s], [H, W, 3] uint8 RGB
-            slam.on_pose(live.push_pose)  # stamp [s], [4, 4] camera-to-world [m]
-            robot.spin()
     """
 
     def __init__(

@@ -259,15 +259,8 @@ def _joined(mixture: GaussianMixture, sums: Tensor, into: Tensor) -> tuple[Gauss
 
 
 class _Sums:
-    """Sums over the parts of a partition, always in the order of the slots.
-
-    Args:
-        into: [B, K] see :func:`partition`.
-        valid: [B, K] the slots that count.
-
-    Attributes:
-        parts: [B, K] how many slots went into each.
-    """
+    """Sums over the parts of a partition ``into`` [B, K] (:func:`partition`) of the slots that are ``valid`` [B, K],
+    always in the order of the slots. ``parts`` [B, K]: how many slots went into each."""
 
     def __init__(self, into: Tensor, valid: Tensor) -> None:
         k = into.shape[1]

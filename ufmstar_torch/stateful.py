@@ -41,12 +41,8 @@ class StatefulModule(nn.Module):
         self._buffers.update({name: state[name] for name in self.STATE})
 
     def _chosen(self, streams: Sequence[int] | Tensor, count: int) -> Tensor:
-        """Bool mask [count] of streams given as indices or as a mask, on the state's device.
-
-        Raises:
-            IndexError: an index is out of range.
-            ValueError: a mask of the wrong length.
-        """
+        """Bool mask [count] of streams given as indices or as a mask, on the state's device. Raises IndexError: an
+        index is out of range; ValueError: a mask of the wrong length."""
         device = getattr(self, self.STATE[0]).device
         given = torch.as_tensor(streams, device=device)
         if given.dtype == torch.bool and given.shape != (count,):
@@ -90,11 +86,7 @@ class StatefulModule(nn.Module):
             warnings.warn(f"the loaded state was made with another config: {each}", stacklevel=4)
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
-        """Check a state that is about to be loaded, in the buffers' dtypes; a class states its own rules.
-
-        Raises:
-            ValueError: tensors that do not fit together, or values that no run can produce.
-        """
+        """Check a state that is about to be loaded, in the buffers' dtypes; errors as :meth:`accepted`."""
 
     def accepted(self, state_dict: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
         """The tensors of a saved state, in the buffers' dtypes, once all of them are checked; nothing changes.
@@ -140,16 +132,10 @@ class StatefulModule(nn.Module):
 
 
 def _fitting(name: str, saved: object, own: Tensor) -> Tensor:
-    """A saved tensor in the dtype of its buffer.
-
-    Raises:
-        ValueError: it is no tensor, or of another kind of dtype.
-    """
-    kind = type(saved).__name__ if not isinstance(saved, Tensor) else str(saved.dtype)
-    fits = isinstance(saved, Tensor) and (
-        saved.is_floating_point() if own.is_floating_point() else saved.dtype == own.dtype
-    )
-    if not isinstance(saved, Tensor) or not fits:
+    """A saved tensor in the dtype of its buffer. Raises ValueError: it is no tensor, or of another kind of dtype."""
+    kind = saved.dtype if isinstance(saved, Tensor) else type(saved).__name__
+    both_floats = isinstance(saved, Tensor) and saved.is_floating_point() and own.is_floating_point()
+    if not isinstance(saved, Tensor) or not (both_floats or saved.dtype == own.dtype):
         raise ValueError(f"{name} must be a tensor that fits {own.dtype}, got {kind}")
     return saved.detach().to(own.dtype)
 
@@ -161,11 +147,7 @@ def _bytes_of(config: Checked) -> Tensor:
 
 
 def _config_of(state: object) -> dict[str, Any]:
-    """The config in a saved ``_extra_state``.
-
-    Raises:
-        ValueError: it is no tensor of bytes that hold a JSON object.
-    """
+    """The config in a saved ``_extra_state``. Raises ValueError: it is no tensor of bytes that hold a JSON object."""
     if not isinstance(state, Tensor) or state.dtype != torch.uint8 or state.dim() != 1:
         raise ValueError("_extra_state must be a tensor of bytes [n], the config as JSON")
     try:

@@ -171,10 +171,8 @@ def _segment(
 ) -> tuple[GaussianMixture, Tensor]:
     """Step 2: C_i in the camera frame, float64, and its labels.
 
-    SPGF's raw moments have no floor, and an exactly flat surface is singular. Eigenvalues are lifted to
-    the variance across one pixel at that depth, (z/f)^2/12: the depth map resolves nothing finer. A covariance that is
-    far longer than thick (``config.aleatoric_in_moments`` with a large A) would lose its least eigenvalue in the dtype
-    ``stored`` of the mixture; it is lifted to what that dtype holds, as the fusion does.
+    SPGF's raw moments have no floor: eigenvalues are lifted to the variance across one pixel at that depth, (z/f)^2/12,
+    and to what the dtype ``stored`` of the mixture holds, as the fusion does.
     """
     mixture, labels = kernels.spgf(SegmentInput.of_frame(frame, config))
     mixture = mixture.to(torch.float64)
@@ -193,10 +191,7 @@ def _room(
     """Slots that the frame needs, and a bound on the matches of any one component (None: the kernel reads it).
 
     This is the step's only wait for an accelerator: one small read, which growth needs. With a capacity that cannot
-    grow nothing is read and the static bounds serve.
-
-    Raises:
-        ValueError: growth on the meta device, which has no values.
+    grow nothing is read and the static bounds serve. Raises ValueError: growth on the meta device.
     """
     device, limit = mixture.mean.device.type, config.max_components
     if not grow or (device != "cpu" and limit is not None and mixture.capacity >= limit):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -30,31 +31,16 @@ class StepObserver(Protocol):
         ...
 
 
-class SegmentKernel(Protocol):
-    """Step 2: C_i in the camera frame without a floor, and labels [B, H, W] (:func:`ufmstar_torch.segment.segment`)."""
-
-    def __call__(self, given: SegmentInput, /) -> tuple[GaussianMixture, Tensor]: ...
-
-
-class FloorKernel(Protocol):
-    """Covariances [..., 3, 3] whose eigenvalues are at least a floor [...] [m^2]
-    (:func:`ufmstar_torch.gaussian.floor_covariance`)."""
-
-    def __call__(self, covariance: Tensor, floor: Tensor, /) -> Tensor: ...
-
-
-class CorrespondKernel(Protocol):
-    """Step 3: M_(i-1) and C_i in the camera frame, K, (H, W) -> pairs (:func:`ufmstar_torch.correspond.correspond`)."""
-
-    def __call__(
-        self,
-        previous_cam: GaussianMixture,
-        current_cam: GaussianMixture,
-        intrinsics: Tensor,
-        size: tuple[int, int],
-        config: UfMStarConfig,
-        /,
-    ) -> Correspondence: ...
+# Step 2: C_i in the camera frame without a floor, and labels [B, H, W] (segment.segment).
+SegmentKernel = Callable[[SegmentInput], tuple[GaussianMixture, Tensor]]
+# Covariances [..., 3, 3] whose eigenvalues are at least a floor [...] [m^2] (gaussian.floor_covariance).
+FloorKernel = Callable[[Tensor, Tensor], Tensor]
+# Step 3: M_(i-1) and C_i in the camera frame, K, (H, W) -> pairs (correspond.correspond).
+CorrespondKernel = Callable[[GaussianMixture, GaussianMixture, Tensor, tuple[int, int], UfMStarConfig], Correspondence]
+# Memory, map, alpha -> new memory, map to show (regress.smooth).
+SmoothKernel = Callable[[Tensor, Tensor, float], tuple[Tensor, Tensor]]
+# M_i in the camera frame and values at points -> their sums by component (regress.distribute).
+DistributeKernel = Callable[[GaussianMixture, Tensor, Tensor, UfMStarConfig], Tensor]
 
 
 class FuseKernel(Protocol):
@@ -85,20 +71,6 @@ class RegressKernel(Protocol):
         /,
         pixels: Tensor | None = None,
     ) -> Regression: ...
-
-
-class SmoothKernel(Protocol):
-    """Memory, map, alpha -> new memory, map to show (:func:`ufmstar_torch.regress.smooth`)."""
-
-    def __call__(self, previous: Tensor, current: Tensor, alpha: float, /) -> tuple[Tensor, Tensor]: ...
-
-
-class DistributeKernel(Protocol):
-    """Values at points, summed by component (:func:`ufmstar_torch.regress.distribute`)."""
-
-    def __call__(
-        self, mixture_cam: GaussianMixture, points: Tensor, values: Tensor, config: UfMStarConfig, /
-    ) -> Tensor: ...
 
 
 @dataclass(frozen=True)

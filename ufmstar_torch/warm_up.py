@@ -6,63 +6,34 @@ import gc
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
 from ufmstar_torch.anchors.anchors import Anchors
-from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.select import compile_triangulation
 
 _DISTANCE = 2.0  # [m]
 _TOTAL = 3 * 7  # stages of a step, for two frames and an image average
 
 
-class Module(Protocol):
-    """A ``UfMStar``."""
-
-    config: UfMStarConfig
-    observer: Any
-
-    @property
-    def mean(self) -> torch.Tensor:
-        """The mixture's means [B, K, 3]."""
-        ...
-
-    def __call__(self, *frame: Any, **options: Any) -> Any:
-        """Process a frame."""
-        ...
-
-    def mean_uncertainty(self, *frame: Any, **options: Any) -> Any:
-        """Process a frame and average its variance."""
-        ...
-
-
 class _Stages:
-    """Counts the stages of the frames (``ufmstar_torch.step_parts.StepObserver``), at whose first a stage compiles.
+    """Reports the stages of the frames (``ufmstar_torch.step_parts.StepObserver``), at whose first a stage compiles, as
+    steps of ``total``; ``progress`` as of :func:`warm_up`."""
 
-    Args:
-        progress: see :func:`warm_up`.
-        total: steps to report at most, whatever a step counts as a stage.
-    """
-
-    def __init__(self, progress: Callable[[int, int], object], total: int) -> None:
-        self._progress, self._total = progress, total
-        self._done = -1
-        self.step()
-
-    def step(self) -> None:
-        """Report one more step."""
-        self._done += 1
-        self._progress(min(self._done, self._total), self._total)
+    def __init__(self, progress: Callable[[int, int], object] | None, total: int) -> None:
+        self._progress, self._total, self._done = progress, total, -1
+        self.stage("")
 
     def stage(self, name: str) -> None:
-        """A stage has ended."""
-        self.step()
+        """One more step is done, at most ``total``, whatever a step counts as a stage."""
+        self._done += 1
+        if self._progress is not None:
+            self._progress(min(self._done, self._total), self._total)
 
 
 def warm_up(
-    module: Module,
+    module: Any,
     size: tuple[int, int],
     streams: int,
     progress: Callable[[int, int], object] | None = None,
@@ -71,7 +42,7 @@ def warm_up(
     """Take a module through two frames of ``size`` (H, W) and an image average; see ``UfMStar.warm_up``.
 
     Args:
-        module: without frames so far; it is changed.
+        module: a ``UfMStar`` without frames so far; it is changed.
         size, streams, progress: see there.
         also: functions of modules, which call further kernels that the caller will need.
 
@@ -85,7 +56,7 @@ def warm_up(
     distance = min(_DISTANCE, config.segment.depth_limit)
     depth = torch.full((streams, height, width), distance, device=device)
     pose = torch.eye(4)
-    K = _camera(height, width)
+    K = torch.tensor([[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]])
     features = depth.new_zeros(streams, config.features, height, width) if config.features else None
     aleatoric = depth if config.aleatoric_in_h else None
     corner = depth[:, 0, :1]
@@ -94,7 +65,7 @@ def warm_up(
         anchors = Anchors(torch.zeros(streams, 1, 2, device=device), corner, 1e-4 * corner)
     with warnings.catch_warnings(), _no_collection():
         warnings.simplefilter("ignore", UserWarning)  # a small image has no segment
-        stages = _Stages(progress or _unseen, _TOTAL + len(also))
+        stages = _Stages(progress, _TOTAL + len(also))
         module.observer = stages
         for _ in range(2):  # the fusion meets a mixture from the second on
             module(depth, pose, K, aleatoric, features=features, **({} if anchors is None else {"anchors": anchors}))
@@ -103,7 +74,7 @@ def warm_up(
             compile_triangulation()
         for function in also:
             function()
-            stages.step()
+            stages.stage("")
 
 
 @contextmanager
@@ -118,11 +89,3 @@ def _no_collection() -> Iterator[None]:
         if enabled:
             gc.enable()
             gc.collect()
-
-
-def _camera(height: int, width: int) -> torch.Tensor:
-    return torch.tensor([[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]])
-
-
-def _unseen(done: int, total: int) -> None:
-    """Nobody follows the progress."""

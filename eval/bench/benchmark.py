@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,7 +14,6 @@ from torch import Tensor, nn
 from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.parts import MULTIVIEW
-from ufmstar_torch.eval.bench.settings import ARCHITECTURES, TOUR, BenchSettings
 from ufmstar_torch.eval.bench.timing import most_threads
 from ufmstar_torch.eval.engine.load import load_members
 from ufmstar_torch.eval.methods.method import BASES, Method
@@ -26,16 +27,61 @@ from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.prediction import DepthPrediction
 
+TOUR = "tour:1"
+ARCHITECTURES = ("fastdepth", "monodepth2")  # that are timed with random weights
 _ERROR, _GRID = 0.03, 4  # [1] standard deviation of a network's smooth relative error, and its nodes per side
 Progress = Callable[[str], object]
 
 
-def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None) -> dict[str, Any]:
-    """Measure what the options ask for.
+@dataclass(frozen=True, kw_only=True)
+class BenchSettings:
+    """Measure the time of UfM* (plain, anchored, with the posterior) and of a depth network on the same frames.
 
-    Returns:
-        "schema", "date", "options" and "results": what :func:`ufmstar_torch.eval.bench.measure.measure` returns, for
-        every size.
+    With --weights, the network predicts the depth. Without, it has random weights, and UfM* gets the rendered depth
+    with smooth errors of 3 %. Times depend on the machine and on its other load: compare ratios.
+    docs/results/speed.md explains each figure.
+
+    Attributes:
+        sequence: folder of a recording, or tour:SEED
+        model: kind of network, as in `ufmstar run`; without --weights fastdepth or monodepth2
+        weights: its file or directory
+        spec: JSON file that declares what the weights do not say, as in `ufmstar run`
+        runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
+        sizes: sides of the square images without --weights [px], multiples of 32
+        backends: implementations of the step that are timed
+        frames: number of timed frames
+        history: number of frames before them
+        threads: number of CPU threads; default: the cores of this process
+        device: cpu, cuda or cuda:N, for network and UfM*
+        json: file for the report
+    """
+
+    sequence: str = TOUR
+    model: str = "fastdepth"
+    weights: Path | None = None
+    spec: Path | None = None
+    runtime: str = field(default="auto", metadata={"choices": ("auto", "torch", "onnx")})
+    sizes: tuple[int, ...] = (224, 512)
+    backends: tuple[str, ...] = field(default=("auto",), metadata={"choices": ("auto", "numba", "triton", "torch")})
+    frames: int = 40
+    history: int = 60
+    threads: int | None = None
+    device: str = "cpu"
+    json: Path | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("frames", "history", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"--{name} must be at least 1, got {value}")
+        if self.weights is None and self.model not in ARCHITECTURES:
+            raise ValueError(f"--model {self.model} needs --weights; without, it is one of {', '.join(ARCHITECTURES)}")
+        if not self.sizes or any(size < 64 or size % 32 for size in self.sizes):
+            raise ValueError(f"--sizes must be multiples of 32 from 64 on [px], got {list(self.sizes)}")
+
+
+def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None) -> dict[str, Any]:
+    """Measure what the options ask for: "schema", "date", "options" and, for every size, ``measure``'s "results".
 
     Raises:
         ValueError: an option is out of range, or the sequence has too few frames.
@@ -54,9 +100,8 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
         name = f"{TOUR}?frames={options.history + options.frames}&size={height}x{width}"
         sequence = open_sequence(name if options.sequence == TOUR else options.sequence)
         rows = [Row(Method.parse(name), setting) for name, setting in _rows(network.base, options.backends)]
-        results.append(
-            measure(rows, {network.base: network}, sequence, device=device, multiview_device=device, plan=plan)
-        )
+        how: dict[str, Any] = {"device": device, "multiview_device": device, "plan": plan}
+        results.append(measure(rows, {network.base: network}, sequence, **how))
     used = {name: str(value) for name, value in vars(options).items() if value is not None}
     return {"schema": 2, "date": datetime.now(UTC).isoformat(timespec="seconds"), "options": used, "results": results}
 

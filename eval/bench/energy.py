@@ -31,15 +31,9 @@ Energy = NDArray[np.float64] | str
 
 
 class EnergyMeter:
-    """The energy of the GPU and of the processor.
-
-    Args:
-        gpu: index of the GPU as torch counts; None = none is used.
-        monitor: of zeus; None = one for this machine, where zeus is installed.
-
-    Attributes:
-        missing: by unit, "gpu" or "cpu", why it has no meter.
-    """
+    """The energy of the GPU (its index as torch counts; None = none is used) and of the processor, by zeus's
+    ``monitor`` (None = one for this machine, where zeus is installed). ``missing`` has by unit, "gpu" or "cpu", why it
+    has none."""
 
     def __init__(self, gpu: int | None = None, monitor: Any = None) -> None:
         self._monitor = _open(gpu) if monitor is None else monitor
@@ -101,15 +95,9 @@ def measure_energy(
     seconds: float,
     windows: int,
 ) -> dict[Key, Energy]:
-    """Measure every part.
-
-    Args:
-        meter: of this machine.
-        work: by part: the unit whose meter counts ("gpu" or "cpu"), and a call for each frame, which returns when its
-            device has finished; a window makes them over and over.
-        seconds: that a window lasts, at least [s].
-        windows: per part.
-    """
+    """Measure every part: the unit whose meter counts ("gpu" or "cpu"), and a call for each frame, which returns when
+    its device has finished. A window, of at least ``seconds``, makes them over and over; there are ``windows`` per
+    part."""
     results: dict[Key, list[list[float]]] = {key: [] for key in work}
     reasons = {key: meter.missing[unit] for key, (unit, _) in work.items() if unit in meter.missing}
     for turn in range(windows):

@@ -56,20 +56,15 @@ def measure(
     plan: Plan | None = None,
     meter: EnergyMeter | None = None,
 ) -> dict[str, Any]:
-    """Measure every row on the first frames of a sequence.
+    """Measure every row on the first frames of a sequence with images; plain values for JSON. A row whose base has no
+    network, or has one member where it needs several, is left out and named in the result.
 
     Args:
-        rows: different ones.
-        networks: by base. A row whose base is missing, or has one member where it needs several, is left out and
-            named in the result.
-        sequence: with images.
+        rows, networks, sequence: different ones; by base.
         device: of the networks, on which they lie.
         multiview_device: of UfM and UfM*; the paper runs them on the CPU.
         plan: how much; None = the defaults.
         meter: of energy; None = what this machine has.
-
-    Returns:
-        Plain values for JSON, described in the docs; in place of numbers the reason where a part was not measured.
 
     Raises:
         ValueError: no row can be measured, or too few frames can be read.
@@ -87,9 +82,8 @@ def measure(
         frames = list(islice(sequence.readable(lambda error: None), wanted := plan.warm_up + plan.frames))
         if len(frames) < wanted:
             raise ValueError(f"{sequence.name} has {len(frames)} readable frames, the plan needs {wanted}")
-        parts = time_parts(
-            chosen, networks, frames, warm_up=plan.warm_up, device=device, multiview_device=multiview_device
-        )
+        devices = {"device": device, "multiview_device": multiview_device}
+        parts = time_parts(chosen, networks, frames, warm_up=plan.warm_up, **devices)
         work = {}
         for (owner, part), calls in parts.calls.items():
             where = multiview_device if part == MULTIVIEW else device
@@ -113,10 +107,8 @@ def measure(
 
 def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
     """Measure the rows on the sequences of an evaluation, and write their means to OUT/efficiency.json, those of the
-    job's further architectures under "further".
-
-    UfM and UfM* run on the CPU, as the paper's do, the networks on the job's device. Sequences may have fewer frames
-    than the plan; its windows of energy are divided among them.
+    job's further architectures under "further". UfM and UfM* run on the CPU, as the paper's do. Sequences may have
+    fewer frames than the plan; its windows of energy are divided among them.
 
     Raises:
         ValueError: no sequence can be opened, none has frames enough, or no row can be measured.
@@ -129,7 +121,7 @@ def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
 
 
 def _over_items(job: EvalJob, plan: Plan, choices: Mapping[str, NetworkChoice]) -> dict[str, Any]:
-    """The means of one architecture over the sequences. Raises ValueError, see :func:`measure_job`."""
+    """The means of one architecture over the sequences; errors as :func:`measure_job`."""
     device = device_of(job.device, 0)
     networks = timed_networks(job.load(torch.device(device), choices), job.suite.rows)
     measured: dict[tuple[str, str], dict[str, Any]] = {}
@@ -138,9 +130,8 @@ def _over_items(job: EvalJob, plan: Plan, choices: Mapping[str, NetworkChoice]) 
         try:
             sequence = item.open()
             of_item = replace(plan, frames=max(1, min(plan.frames, len(sequence) - plan.warm_up)))
-            measured[item.dataset, item.sequence] = measure(
-                job.suite.rows, networks, sequence, device=device, plan=of_item
-            )
+            result = measure(job.suite.rows, networks, sequence, device=device, plan=of_item)
+            measured[item.dataset, item.sequence] = result
         except (OSError, ValueError) as error:
             failed.append(f"{item.label}: {error}")
     if not measured:
@@ -150,27 +141,20 @@ def _over_items(job: EvalJob, plan: Plan, choices: Mapping[str, NetworkChoice]) 
 
 def over_sequences(measured: Mapping[tuple[str, str], Mapping[str, Any]]) -> dict[str, Any]:
     """Average the results of :func:`measure` over sequences, by (data set, sequence): every number is the mean, and
-    "sequences" has what uncertainty costs on each of them, for intervals.
-
-    Of each sequence and row: "energy_mj", gross, of uncertainty in the network and of the multiview step [mJ]; None
-    where a part was not measured.
-    """
+    "sequences" has the energy, gross, of uncertainty on each of them [mJ], None where a part was not measured."""
     runs = list(measured.values())
-    single = [
-        {"dataset": d, "sequence": s, "energy_mj": {row["row"]: _uncertainty_mj(row["energy"]) for row in run["rows"]}}
-        for (d, s), run in measured.items()
-    ]
+    single = []
+    for (dataset, name), run in measured.items():
+        energy = {}
+        for row in run["rows"]:
+            parts = [part for key, part in row["energy"].items() if key != DEPTH and "none" not in part]
+            known = all("gross" in part for part in parts)
+            energy[row["row"]] = sum(max(0.0, p["gross"]["millijoules"]) for p in parts) if known else None
+        single.append({"dataset": dataset, "sequence": name, "energy_mj": energy})
     mean: dict[str, Any] = _mean(runs)
     if len(runs) > 1:
         mean["sequence"] |= {"name": f"{len(runs)} sequences"}
     return mean | {"sequences": single}
-
-
-def _uncertainty_mj(energy: Mapping[str, Mapping[str, Any]]) -> float | None:
-    parts = [part for name, part in energy.items() if name != DEPTH and "none" not in part]
-    if not all("gross" in part for part in parts):
-        return None
-    return sum(max(0.0, part["gross"]["millijoules"]) for part in parts)
 
 
 def _mean(values: Sequence[Any]) -> Any:
@@ -258,12 +242,11 @@ def overhead_percent(uncertainty: float, depth: float) -> float:
 
 
 def _energy_overhead(energies: Mapping[str, Energy]) -> dict[str, float] | None:
-    """Share of uncertainty in all energy [%], negative differences as nothing; None unless all of it was measured."""
+    """Share of uncertainty in all energy [%], negative differences as nothing; None unless all was measured."""
     joules = {key: max(0.0, float(np.median(e[:, 0]))) for key, e in energies.items() if not isinstance(e, str)}
     depth = joules.pop(DEPTH, 0.0)
-    return (
-        {"gross": overhead_percent(sum(joules.values()), depth)} if depth and len(joules) + 1 == len(energies) else None
-    )
+    measured = depth and len(joules) + 1 == len(energies)
+    return {"gross": overhead_percent(sum(joules.values()), depth)} if measured else None
 
 
 def _memory(memory: Mapping[str, int] | None, state: Mapping[str, float] | None) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDropout
-from ufmstar_torch.models.ensemble import Ensemble, LazyMember
+from ufmstar_torch.models.ensemble import LazyMember
 from ufmstar_torch.models.heads import DepthOnlyNetwork, UncertaintyNetwork
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.models.onnx_network import OnnxNetwork
@@ -40,17 +40,10 @@ class TimedNetwork:
         passes: inferences that all members, or all samples, take.
         depth: the network without anything that uncertainty adds: of the first member, a copy.
         why_whole: None, or why ``depth`` is the whole network instead.
-
-    Raises:
-        ValueError: several members in one, or members that want different inputs.
     """
 
     def __init__(self, base: str, members: Sequence[DepthNetwork], label: str, samples: int = SAMPLES) -> None:
-        if any(isinstance(member, Ensemble) for member in members):
-            raise ValueError("members must be the ensemble's members one by one, not an Ensemble")
         opened = [member.network() if isinstance(member, LazyMember) else member for member in members]
-        if any(member.preprocess != opened[0].preprocess for member in opened):
-            raise ValueError(f"{base}: members must want the same input")
         self.base, self.label, self.members = base, label, tuple(opened)
         self._turns = NetworksInTurn(opened, samples=samples if base == "mc_dropout" else None)
         self.passes, self.preprocess = self._turns.passes, opened[0].preprocess
@@ -59,31 +52,25 @@ class TimedNetwork:
         self.why_whole = None if alone else f"a {type(opened[0]).__name__} predicts all that it predicts in one"
 
     def predict(self, part: str, x: Tensor, intrinsics: Tensor, *, turn: int = 0) -> DepthPrediction:
-        """Depth without uncertainty ("depth"), with it by the member whose turn it is ("once"), or by "every" member
-        (or sample) one after the other, combined.
-
-        Args:
-            part: see above.
-            x: [1, 3, H, W] the networks' input.
-            intrinsics: [1, 3, 3] of the input [px], for networks that take them.
-            turn: number of the image, for "once".
-        """
+        """A ``part`` for the networks' input x [1, 3, H, W] with intrinsics [1, 3, 3] [px]: depth without uncertainty
+        ("depth"), with it by the member whose turn it is at image ``turn`` ("once"), or by "every" member (or sample)
+        one after the other, combined."""
         with torch.inference_mode():
             if part == DEPTH:
                 prediction: DepthPrediction = infer(self.depth, x, intrinsics)
                 return prediction
-            every = part == EVERY
-            return self._turns.every(x, intrinsics) if every else self._turns.member(x, intrinsics, turn)
+            if part == EVERY:
+                return self._turns.every(x, intrinsics)
+            return self._turns.member(x, intrinsics, turn)
 
     def prepare(self, frame: Frame, device: torch.device) -> tuple[Tensor, Tensor]:
-        """The networks' input of a frame, [1, 3, H, W], and its intrinsics [1, 3, 3] [px], on a device. Raises
-        FrameError where the frame has no image."""
+        """The networks' input of a frame, and its intrinsics, on a device. Raises FrameError: it has no image."""
         K = torch.from_numpy(frame.intrinsics)[None].to(device)
         return self.preprocess(image_tensor(frame).to(device), K)
 
     def memory(self) -> dict[str, int] | None:
-        """Weights and buffers [bytes] of "depth" alone, and of all else as "uncertainty": heads, further members,
-        factors of a BatchEnsemble; None where weights are not known (a wrapped function's)."""
+        """Bytes of the weights and buffers of "depth" alone, and of all else as "uncertainty"; None where weights are
+        not known (a wrapped function's)."""
         everything, alone = weight_bytes(*self.members), weight_bytes(self.depth)
         if not everything:
             return None
@@ -100,12 +87,8 @@ def weight_bytes(*modules: nn.Module) -> int:
 
 
 def timed_networks(sources: Mapping[str, DepthSource], rows: Sequence[Row] = ()) -> dict[str, TimedNetwork]:
-    """The networks of an evaluation by base, without ground truth, for which no network runs.
-
-    Args:
-        sources: by base.
-        rows: that are measured; images are prepared as the first row of a base has it.
-    """
+    """The networks of an evaluation by base, without ground truth, for which no network runs. Images are prepared as
+    the first of the ``rows`` of a base has it."""
     how = {row.method.base: row.setting.preprocess for row in reversed(rows)}
     timed = {b: TimedNetwork(b, one.networks, one.label, one.passes) for b, one in sources.items() if one.networks}
     for base, network in timed.items():

@@ -10,7 +10,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence, in_memory
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.tour import tour_sequence
-from ufmstar_torch.live import LiveDepth, LiveResult
+from ufmstar_torch.live import LiveDepth
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.quantise import quantise
@@ -70,26 +69,17 @@ class Contrast:
 
 
 def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: Report) -> dict[str, Any]:
-    """Run live for some seconds, then judge the frames, and draw the picture.
-
-    Args:
-        out: folder, for the quantised graph and the picture.
-        weights: networks of ``ufmstar train``, of which the first is quantised; or a FastDepth (.onnx, .tflite) as it
-            is.
-        seconds: of 30 images each.
-        seed: of the rooms.
-        progress: called after every step.
-
-    Raises:
-        FileNotFoundError, ValueError, ModuleNotFoundError: the network cannot be loaded or quantised.
-    """
+    """Run live for some seconds of 30 images each in the rooms of a seed, then judge the frames, and draw the picture.
+    ``out`` gets the quantised graph and the picture; ``weights`` are networks of ``ufmstar train``, of which the first
+    is quantised, or a FastDepth (.onnx, .tflite) as it is. Raises FileNotFoundError, ValueError, ModuleNotFoundError:
+    the network cannot be loaded or quantised."""
     network, about = _network(weights, out, seed)
     h, w = network.preprocess.size or _HALF_VGA
     way = tour_sequence(seed, frames=_PATH, size=_SIZES.get((h, w), _HALF_VGA), style="scales")
     part = replace(way, entries=way.entries[:_WALKED])
     sequence = in_memory(part, lambda done: progress(Progress("rooms", done, _WALKED)))
     config, cpu = UfMStarConfig(on_bad_frame="skip"), torch.device("cpu")
-    warm_up_command(config, cpu, lambda done, total: progress(Progress("kernels", done, total)))
+    warm_up_command(config, cpu, progress)
     model = UncertainDepth(network, config)
     summary = {"network": about, "realtime": _live(model, sequence, seconds, progress), "load_average": load_average()}
     contrasts = _contrasts(UncertainDepth(network, config), sequence)
@@ -126,14 +116,9 @@ def _live(model: UncertainDepth, sequence: FrameSequence, seconds: float, progre
     frames, times, total = list(sequence), RealTime(model), round(seconds * FPS)
     there_and_back = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
 
-    def on_result(result: LiveResult) -> None:
-        times.take(result)
-
-    with LiveDepth(model, on_result, frames[0].intrinsics) as live:
+    with LiveDepth(model, times.take, frames[0].intrinsics) as live:
         started = time.perf_counter()
-        for n in count():
-            if n == total:
-                break
+        for n in range(total):
             time.sleep(max(0.0, started + n / FPS - time.perf_counter()))
             frame = frames[there_and_back[n % len(there_and_back)]]
             live.push_pose(n / FPS, frame.T_world_cam)

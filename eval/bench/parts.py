@@ -43,29 +43,19 @@ class MultiviewStep:
         self._landmarks = None if anchors is None else StreamLandmarks(landmark_source(anchors))
 
     def __call__(self, image: Tensor | None, frame: Frame, predicted: Predicted, *, first: bool = False) -> Answer:
-        """Move a frame's maps to the device, and run the step; the ``first`` one begins with an empty state.
-
-        Args:
-            image: [1, 3, H, W] of the frame, in which landmarks are tracked.
-            frame: its pose and intrinsics are used.
-            predicted: of the network.
-            first: see above.
-        """
+        """Move a frame's maps to the device, track landmarks in its ``image`` [1, 3, H, W], and run the step; the
+        ``first`` one begins with an empty state."""
         if first:
-            self._start()
+            assert isinstance(self.estimator, Pointwise | Gaussians)
+            self.estimator.ufm.reset()
+            if self._landmarks is not None:
+                self._landmarks.reset()
         anchors, T = None, torch.from_numpy(frame.T_world_cam)
         if self._landmarks is not None:
             K = torch.from_numpy(frame.intrinsics)
             anchors = self._landmarks.update(image, T, K, UfMStarConfig.rotation_tolerance)
             anchors = anchors.moved(K, predicted.intrinsics).to(self._device)
         return self.estimator.update(predicted.to(self._device), T, anchors)
-
-    def _start(self) -> None:
-        """Forget all frames."""
-        assert isinstance(self.estimator, Pointwise | Gaussians)
-        self.estimator.ufm.reset()
-        if self._landmarks is not None:
-            self._landmarks.reset()
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points or components, with what anchors add; bytes of the map for smoothing."""
@@ -76,10 +66,8 @@ class MultiviewStep:
 
 
 class TimedParts:
-    """The parts that were run on the frames, and their times.
-
-    On odd frames the parts run in the reverse order: no part always follows the same neighbour, and a busy machine
-    slows all parts of a frame alike.
+    """The parts that were run on the frames, and their times. On odd frames the parts run in the reverse order: no part
+    always follows the same neighbour, and a busy machine slows all parts of a frame alike.
 
     Attributes:
         warm_up: frames at the beginning that are not counted.
@@ -101,7 +89,7 @@ class TimedParts:
         return self._ms.get((owner, part), [])[self.warm_up :]
 
     def run(self, number: int, calls: Mapping[Part, Callable[[], Any]], device: torch.device) -> dict[Part, Any]:
-        """Time the parts of frame ``number``, which compute on a device; what they return."""
+        """Time the parts of frame ``number`` on a device; what they return."""
         results = {}
         for part in list(calls)[:: -1 if number % 2 else 1]:
             self.calls.setdefault(part, []).append(calls[part])
@@ -127,8 +115,7 @@ def time_parts(
     device: torch.device,
     multiview_device: torch.device,
 ) -> TimedParts:
-    """Run every part of every row on every frame; the first ``warm_up`` are not counted. Other arguments: see
-    ``measure.measure``. Raises FrameError: a frame has no image."""
+    """Run every part of every row on every frame. Arguments as ``measure.measure``. Raises FrameError: no image."""
     parts, steps = TimedParts(warm_up), dict[str, MultiviewStep]()
     forms = {row.method.base: {DEPTH} for row in rows}
     for row in rows:

@@ -32,11 +32,8 @@ def most_threads() -> int:
 
 @contextmanager
 def pinned_threads(count: int) -> Iterator[None]:
-    """Set the number of threads of torch, numba and OpenCV; restore the previous numbers afterwards.
-
-    Raises:
-        ValueError: ``count`` is not positive or more than numba has started.
-    """
+    """Set the number of threads of torch, numba and OpenCV; restore the previous numbers afterwards. Raises ValueError:
+    ``count`` is not positive or more than numba has started."""
     numba: Any = import_module("numba")
     if not 1 <= count <= numba.config.NUMBA_NUM_THREADS:
         raise ValueError(f"threads must be 1 to {numba.config.NUMBA_NUM_THREADS} (numba's), got {count}")
@@ -56,15 +53,7 @@ def pinned_threads(count: int) -> Iterator[None]:
 
 
 def spread(milliseconds: Sequence[float]) -> dict[str, float | int]:
-    """Median, interquartile range, quartiles and minimum [ms] of at least one measurement, and their count.
-
-    Quartiles are interpolated linearly between the sorted values (NumPy's default).
-
-    Raises:
-        ValueError: no measurement.
-    """
-    if not len(milliseconds):
-        raise ValueError("milliseconds must hold at least one measurement")
+    """Median, interquartile range, quartiles and minimum [ms] of at least one measurement, and their count."""
     low, middle, high = (float(q) for q in np.percentile(np.asarray(milliseconds, np.float64), (25, 50, 75)))
     return {
         "median_ms": middle,
@@ -77,31 +66,16 @@ def spread(milliseconds: Sequence[float]) -> dict[str, float | int]:
 
 
 def paired_ratio(numerator: Sequence[float], denominator: Sequence[float]) -> dict[str, float | int]:
-    """Median and quartiles of the ratios of measurements taken one right after the other.
-
-    Another program that slows both down for a while then cancels, as it does not in a ratio of medians.
-
-    Raises:
-        ValueError: the two differ in length or are empty.
-    """
-    if len(numerator) != len(denominator) or not len(numerator):
-        raise ValueError(f"expected as many numerators as denominators, got {len(numerator)} and {len(denominator)}")
+    """Median and quartiles of the ratios of measurements taken one right after the other. Another program that slows
+    both down for a while then cancels, as it does not in a ratio of medians."""
     ratios = np.asarray(numerator, np.float64) / np.asarray(denominator, np.float64)
     low, middle, high = (float(q) for q in np.percentile(ratios, (25, 50, 75)))
     return {"median": middle, "q1": low, "q3": high, "count": len(ratios)}
 
 
 class StagedStep:
-    """Times the stages of UfM*'s steps: the observer (``ufmstar_torch.step_parts.StepObserver``) of a module.
-
-    The stages are those that the step names; the output's assembly after the last one belongs to none. The module's
-    device is waited for at both ends of every stage.
-
-    Args:
-        module: is observed.
-        step: a call that runs one step of it.
-        device: of the module.
-    """
+    """Times the stages of UfM*'s steps: the observer (``ufmstar_torch.step_parts.StepObserver``) of a module on a
+    device, which ``step`` runs once. The output's assembly after the last stage belongs to none."""
 
     def __init__(self, module: UfMStar, step: Callable[..., Any], device: torch.device = _CPU) -> None:
         self.module, self._step, self._timer = module, step, StageTimer(device)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+from ufmstar_torch.eval.check.data_check import check_data, lines, page
 from ufmstar_torch.eval.commands.opening import SequenceOptions
-from ufmstar_torch.eval.commands.options import UsageError, option, parse, positional
+from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
+from ufmstar_torch.eval.run.files import to_json
+from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of, require_layout
+from ufmstar_torch.eval.sequences.options import Options
 
 # With one of these the user means one sequence, whatever lies below its folder.
 _OF_ONE = ("trajectory", "images", "drive")
@@ -39,20 +42,13 @@ class CheckOptions:
     opening: SequenceOptions
 
 
-def read(words: Sequence[str]) -> CheckOptions:
-    """The options of a command line; errors as :func:`parse`."""
-    return parse(CheckOptions, words, "ufmstar data")
+read = reader(CheckOptions, "ufmstar data")
 
 
 def main(options: CheckOptions) -> int:
     """Check, and print what was found; the exit code."""
-    from ufmstar_torch.eval.check.data_check import lines, page
-    from ufmstar_torch.eval.run.files import to_json
-
-    try:
+    with usage_errors(OSError, ValueError):
         reports, several = _check(options)
-    except (OSError, ValueError) as error:
-        raise UsageError(error) from error
     if options.json:
         plain = [{"ok": report.ok, "compared": report.compared, **to_json(report)} for report in reports]
         print(json.dumps(plain, indent=2))
@@ -68,10 +64,6 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
         OSError: no such path.
         ValueError: an option out of range, or nothing below the folder has a known layout.
     """
-    from ufmstar_torch.eval.check.data_check import check_data
-    from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of, require_layout
-    from ufmstar_torch.eval.sequences.options import Options
-
     path, opening = options.path, options.opening.given()
     require_layout(options.opening.layout, options.opening.plugin)
     Options(**{name: value for name, value in opening.items() if name not in ("layout", "poses")})

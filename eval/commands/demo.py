@@ -6,14 +6,18 @@ the networks were trained, and a larger hall with other textures.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.commands.options import UsageError, as_dict, reader
+from ufmstar_torch import models
+from ufmstar_torch.eval.bench.onboard import GRAPH, PICTURE, run_onboard
+from ufmstar_torch.eval.commands import evaluate
+from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, reader, usage_errors
+from ufmstar_torch.eval.commands.terminal import Bars
+from ufmstar_torch.eval.run.files import to_json, write_json_atomic
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
+from ufmstar_torch.eval.run.machine import hardware, share_threads, versions
 
 _WEIGHTS = ("weights", "demo.safetensors")
 _WALK = 150  # frames of a whole walk, of which the first are used: neighbours overlap
@@ -21,7 +25,7 @@ _ROOMS = {"familiar": "home", "unfamiliar": "hall"}  # style by data set
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoOptions:
+class DemoOptions(MachineOptions):
     """The method on rendered rooms, without data or weights.
 
     Walks through rendered rooms with small depth networks that come with the package, compares their own variance with
@@ -36,9 +40,7 @@ class DemoOptions:
             (.onnx, .tflite)
         onboard: live instead, as on a small robot: one network, quantised, at 30 images/s among things of many sizes
         seconds: of --onboard
-        device: cpu, cuda or cuda:N
         threads: number of CPU threads; default: all cores, with --onboard but one
-        debug: show tracebacks
     """
 
     out: Path = Path("ufmstar_demo")
@@ -48,9 +50,6 @@ class DemoOptions:
     weights: Path | None = None
     onboard: bool = False
     seconds: float = 120.0
-    device: str = "cpu"
-    threads: int | None = None
-    debug: bool = False
 
     def __post_init__(self) -> None:
         if not 2 <= self.frames <= _WALK:
@@ -68,14 +67,12 @@ read = reader(DemoOptions, "ufmstar demo")
 
 def main(options: DemoOptions) -> int:
     """Run the demo, and print its table; the exit code."""
-    from ufmstar_torch.eval.commands import evaluate
-    from ufmstar_torch.eval.run.folder import FolderError
-
-    try:
-        with _weights(options.weights) as file:
-            return _onboard(options, file) if options.onboard else evaluate.main(evaluate.read(_words(options, file)))
-    except (FileNotFoundError, FolderError) as error:
-        raise UsageError(error) from error
+    with usage_errors(FileNotFoundError, FolderError):
+        file = options.weights or Path(models.__file__).parent.joinpath(*_WEIGHTS)
+        if not file.is_file():
+            missing = f"the package was installed without {'/'.join(_WEIGHTS)}; --weights FILE names another"
+            raise FileNotFoundError(f"--weights: no such file: {file}" if options.weights else missing)
+        return _onboard(options, file) if options.onboard else evaluate.main(evaluate.read(_words(options, file)))
 
 
 def _words(options: DemoOptions, weights: Path) -> list[str]:
@@ -91,14 +88,8 @@ def _words(options: DemoOptions, weights: Path) -> list[str]:
 
 
 def _onboard(options: DemoOptions, weights: Path) -> int:
-    """Run ``--onboard`` into the folder, and print its table; the exit code. Raises FolderError: the folder contains
-    other files, or an earlier demo and ``overwrite`` is off; further errors as ``run_onboard``."""
-    from ufmstar_torch.eval.bench.onboard import GRAPH, PICTURE, run_onboard
-    from ufmstar_torch.eval.commands.terminal import Bars
+    """Run ``--onboard`` into the folder, and print its table; the exit code."""
     from ufmstar_torch.eval.report.text import onboard_table
-    from ufmstar_torch.eval.run.files import to_json, write_json_atomic
-    from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
-    from ufmstar_torch.eval.run.machine import hardware, share_threads, versions
 
     if options.threads is None:
         share_threads()
@@ -114,19 +105,3 @@ def _onboard(options: DemoOptions, weights: Path) -> int:
     write_json_atomic(options.out / "summary.json", summary)
     print(onboard_table(summary))
     return 0
-
-
-@contextmanager
-def _weights(path: Path | None) -> Iterator[Path]:
-    """The file with the networks: the user's, or the package's own wherever that is installed. Raises
-    FileNotFoundError: it is not there."""
-    if path is not None:
-        if not path.is_file():
-            raise FileNotFoundError(f"--weights: no such file: {path}")
-        yield path
-        return
-    packaged = files("ufmstar_torch.models").joinpath(*_WEIGHTS)
-    if not packaged.is_file():
-        raise FileNotFoundError(f"the package was installed without {'/'.join(_WEIGHTS)}; --weights FILE names another")
-    with as_file(packaged) as file:
-        yield file

@@ -5,20 +5,28 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
-from ufmstar_torch.config import AnchorConfig, PosteriorConfig
+import torch
+
+from ufmstar_torch.anchors.landmarks import DENSE
+from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
+from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
 from ufmstar_torch.eval.commands.opening import SequenceOptions
-from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, reader
+from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, option, reader, usage_errors
+from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+from ufmstar_torch.eval.engine.load import NetworkChoice
+from ufmstar_torch.eval.engine.warm_up import warm_up_command
+from ufmstar_torch.eval.methods.method import UFM_STAR
+from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
+from ufmstar_torch.eval.suite.shards import EvalOutcome, evaluate_suite
+from ufmstar_torch.eval.suite.work_items import Shard, find_work, read_names
 
-PRESETS = ("paper", "default")
 # Options that a job has under their names.
 _OF_JOB = ("device", "bins", "examples", "samples", "runtime", "precision")
-
-if TYPE_CHECKING:
-    from ufmstar_torch.eval.suite.job import EvalJob
-    from ufmstar_torch.eval.suite.shards import EvalOutcome
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +51,7 @@ class SuiteOptions:
 
     suite: str | None = None
     base: str | None = None
-    ufm_preset: str | None = option(None, choices=PRESETS)
+    ufm_preset: str | None = option(None, choices=("paper", "default"))
     network: tuple[str, ...] = option((), repeat=True)
     spec: str | None = None
     samples: int | None = None
@@ -96,7 +104,7 @@ class EvalOutputOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalOptions:
+class EvalOptions(MachineOptions):
     """The rows of a table or figure of the paper, on sequences of your own.
 
     A sequence's rows are written when its last frame is done: whatever ends the program, --resume computes what is
@@ -108,19 +116,15 @@ class EvalOptions:
         processes: number of processes on this computer
         shard: i/n, only the i-th of n parts of the sequences, 1/n to n/n; torchrun's processes are shards as well
         dry_run: show rows and sequences, and stop
-        debug: show tracebacks
     """
 
     USAGE: ClassVar[str] = (
         "ufmstar eval --suite NAME --root [DATASET=]DIR ... --network BASE=MODEL:FILE[,FILE...] ... --out OUT [options]"
     )
 
-    device: str = "cpu"
-    threads: int | None = None
     processes: int = 1
     shard: str | None = None
     dry_run: bool = False
-    debug: bool = False
     what: SuiteOptions
     data: DataOptions
     opening: SequenceOptions
@@ -133,8 +137,7 @@ class EvalOptions:
         for name in ("suite", "root", "network", "out"):
             if not values[name]:
                 raise ValueError(f"--{name} is missing; ufmstar eval --help, and --list for the suites")
-        parse_slice(self.data.frames)
-        least_of = {"processes": 1, "examples": 0, "threads": 1, "seed": 0, "samples": 2}
+        least_of = {"processes": 1, "examples": 0, "seed": 0, "samples": 2}
         for name, least in least_of.items():
             if values[name] is not None and values[name] < least:
                 raise ValueError(f"--{name} must be at least {least}, got {values[name]}")
@@ -150,36 +153,21 @@ read = reader(EvalOptions, "ufmstar eval")
 def main(options: EvalOptions) -> int:
     """Evaluate, print the results, and draw them; the exit code."""
     if options.what.list:
-        from ufmstar_torch.eval.methods.suite import listing
-
         print(listing())
         return 0
-    try:
+    with usage_errors(FileNotFoundError, ValueError):
         return _dry_run(options) if options.dry_run else _evaluate(options)
-    except (FileNotFoundError, ValueError) as error:
-        raise UsageError(error) from error
 
 
 def job_from(options: EvalOptions) -> EvalJob:
-    """The job that the options describe; nothing is opened but folders.
-
-    Raises:
-        FileNotFoundError: something that was named does not exist.
-        ValueError: options that do not go together, a base given twice, no row with a network, no sequence.
-    """
-    from ufmstar_torch.eval.engine.load import NetworkChoice
-    from ufmstar_torch.eval.methods.suite import suite_named
-    from ufmstar_torch.eval.sequences.options import Options
-    from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
-    from ufmstar_torch.eval.suite.work_items import find_work, read_names
-
+    """The job that the options describe; nothing is opened but folders. Raises FileNotFoundError, ValueError: something
+    does not exist, options do not go together, a base is given twice, no row has a network, or there is no sequence."""
     what, data, output, values = options.what, options.data, options.output, as_dict(options)
     suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), what.recalibration)
     require_methods(suite, options.opening.plugin)
     architectures: list[dict[str, NetworkChoice]] = [{}]
-    for choice in (
-        NetworkChoice.parse(text).with_spec(what.spec) for text in what.network
-    ):  # a base's n-th network belongs to the n-th architecture
+    for text in what.network:  # a base's n-th network belongs to the n-th architecture
+        choice = NetworkChoice.parse(text).with_spec(what.spec)
         number = sum(choice.base in known for known in architectures)
         architectures += [{}] if number == len(architectures) else []
         architectures[number][choice.base] = choice
@@ -207,17 +195,6 @@ def job_from(options: EvalOptions) -> EvalJob:
 
 
 def _evaluate(options: EvalOptions) -> int:
-    import torch
-
-    from ufmstar_torch import UfMStarConfig
-    from ufmstar_torch.anchors.landmarks import DENSE
-    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-    from ufmstar_torch.eval.engine.progress import Progress
-    from ufmstar_torch.eval.engine.warm_up import warm_up_command
-    from ufmstar_torch.eval.methods.method import UFM_STAR
-    from ufmstar_torch.eval.suite.shards import evaluate_suite
-    from ufmstar_torch.eval.suite.work_items import Shard
-
     how: dict[str, Any] = {"resume": options.output.resume, "overwrite": options.output.overwrite}
     how |= {"processes": options.processes, "threads": options.threads}
     with Bars() as bars, stop_signals(bars.say) as stop:
@@ -230,11 +207,7 @@ def _evaluate(options: EvalOptions) -> int:
                 anchors=AnchorConfig() if anchors != {""} else None,
                 posterior=PosteriorConfig() if any(row.setting.posterior for row in rows) else None,
             )
-
-            def compiling(done: int, total: int) -> None:
-                bars.show(Progress("kernels", done, total))
-
-            warm_up_command(config, torch.device("cpu"), compiling, dense=DENSE in anchors)
+            warm_up_command(config, torch.device("cpu"), bars.show, dense=DENSE in anchors)
         shard = Shard.parse(options.shard) if options.shard else None
         if sys.stderr.isatty():
             how["progress"] = bars.show
@@ -243,7 +216,7 @@ def _evaluate(options: EvalOptions) -> int:
 
 
 def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
-    """Print the table, make the measurements and pictures that belong to it, name what failed; the exit code."""
+    """Print the table, measure, draw the report, name what failed; the exit code."""
     from ufmstar_torch.eval.report.data import ResultsError, load_results
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
@@ -277,8 +250,6 @@ def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
 
 def _measure(job: EvalJob, threads: int | None) -> None:
     """Measure time, energy and memory, unless that was done; print why where it is not possible."""
-    from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
-
     if (job.out / EFFICIENCY).exists():
         return
     print("ufmstar eval: measuring time, energy and memory ...", file=sys.stderr)
@@ -290,10 +261,6 @@ def _measure(job: EvalJob, threads: int | None) -> None:
 
 def _dry_run(options: EvalOptions) -> int:
     """Print the rows with their networks, and the sequences with their number of frames."""
-    import torch
-
-    from ufmstar_torch.eval.suite.work_items import Shard
-
     job = job_from(options)
     for base in job.unused:
         print(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from ufmstar_torch.eval.commands.opening import SequenceOptions
-from ufmstar_torch.eval.commands.options import UsageError, option, parse, positional
+from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
+from ufmstar_torch.eval.run import export
+from ufmstar_torch.eval.run.export_bag import export_bag
+from ufmstar_torch.eval.run.rerun_log import export_rerun
 from ufmstar_torch.eval.sequences.frame import FrameSequence
-
-if TYPE_CHECKING:
-    from ufmstar_torch.eval.run.export import Gated
+from ufmstar_torch.eval.sequences.open import open_sequence
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,17 +48,13 @@ class ExportOptions:
                 raise ValueError(f"--{name.replace('_', '-')} must be positive, got {getattr(self, name)}")
 
 
-def read(words: Sequence[str]) -> ExportOptions:
-    """The options of a command line; errors as :func:`parse`."""
-    return parse(ExportOptions, words, "ufmstar export")
+read = reader(ExportOptions, "ufmstar export")
 
 
 def main(options: ExportOptions) -> int:
     """Export, and print what was written; the exit code."""
-    from ufmstar_torch.eval.run import export
-
     out = options.out
-    try:
+    with usage_errors(FileNotFoundError, ValueError):
         frames = export.gated_frames(out, options.max_sigma, options.max_relative_sigma)
         if options.to == "depth":
             print(export.export_depth(frames, out))
@@ -67,33 +64,24 @@ def main(options: ExportOptions) -> int:
             print(export.export_transforms(frames, out, _sequence(out)))
         else:
             print(_with_images(options, frames))
-    except (FileNotFoundError, ValueError) as error:
-        raise UsageError(error) from error
     return 0
 
 
-def _with_images(options: ExportOptions, frames: Iterator[Gated]) -> str:
+def _with_images(options: ExportOptions, frames: Iterator[export.Gated]) -> str:
     """Export to a format that has the recording's images where they can be read; what was written."""
-    from ufmstar_torch.eval.run.export import export_cloud
-    from ufmstar_torch.eval.run.export_bag import export_bag
-    from ufmstar_torch.eval.run.export_rerun import export_rerun
-
     try:
         sequence: FrameSequence | None = _sequence(options.out)
     except (OSError, ValueError) as error:
         print(f"no colours: {error}")
         sequence = None
     if options.to == "cloud":
-        return export_cloud(frames, options.out, options.voxel, sequence)
+        return export.export_cloud(frames, options.out, options.voxel, sequence)
     return (export_bag if options.to == "mcap" else export_rerun)(frames, options.out, sequence)
 
 
 def _sequence(out: Path) -> FrameSequence:
     """The recording of a run. Raises FileNotFoundError, ValueError: it is there no more, or the summary is damaged."""
-    from ufmstar_torch.eval.run.export import run_settings
-    from ufmstar_torch.eval.sequences.open import open_sequence
-
-    settings = run_settings(out)
+    settings = export.run_settings(out)
     names = [f.name for f in fields(SequenceOptions) if f.name in settings]
     values: dict[str, Any] = {name: tuple(v) if isinstance(v := settings[name], list) else v for name in names}
     return open_sequence(settings["sequence"], **SequenceOptions(**values).given())

@@ -5,28 +5,41 @@ from __future__ import annotations
 import json
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, fields
-from itertools import takewhile
+from itertools import count, takewhile
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
 
 from ufmstar_torch.eval.commands.opening import SequenceOptions
-from ufmstar_torch.eval.commands.options import UsageError, as_dict, positional
+from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, positional, usage_errors
 from ufmstar_torch.eval.commands.run import NetworkOptions, UfMOptions, read_ufm
-from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+from ufmstar_torch.eval.commands.terminal import Bars
+from ufmstar_torch.eval.engine.anchors import landmarks_of
+from ufmstar_torch.eval.engine.load import network_source
+from ufmstar_torch.eval.engine.realtime import RealTime
+from ufmstar_torch.eval.engine.warm_up import warm_up_command
+from ufmstar_torch.eval.run.export import Gated
+from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
+from ufmstar_torch.eval.run.job import recalibration_of
+from ufmstar_torch.eval.run.machine import share_threads
+from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
+from ufmstar_torch.eval.sequences import live as sources
+from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics, read_intrinsics
+from ufmstar_torch.eval.sequences.live import LiveEvent
+from ufmstar_torch.eval.sequences.open import open_sequence
+from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
+from ufmstar_torch.models.checkpoints import read_tensors
+from ufmstar_torch.models.inference import Inference
+from ufmstar_torch.pipeline import UncertainDepth
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ufmstar_torch.eval.engine.realtime import RealTime
-    from ufmstar_torch.eval.sequences.live import LiveEvent
-    from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
-    from ufmstar_torch.pipeline import UncertainDepth
-
-    _View = Callable[[LiveResult, dict[str, float]], None]
+_View = Callable[[LiveResult, dict[str, float]], None]
 
 _STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
 # Options for opening that also go with a source that is no recording.
@@ -34,7 +47,7 @@ _OF_LIVE = ("intrinsics", "trajectory", "poses", "pose_scale", "max_pose_gap")
 
 
 @dataclass(frozen=True, kw_only=True)
-class LiveOptions:
+class LiveOptions(MachineOptions):
     """Depth with a variance for the newest image, as images and poses come.
 
     A recording is replayed at its pace. A camera, and a folder with --follow, take their poses from the file
@@ -55,9 +68,6 @@ class LiveOptions:
         overwrite: replace the results in --out
         view: show the images, depth and plots in rerun, on this computer alone
         json: print a line of JSON per image instead of the status
-        device: cpu, cuda or cuda:N
-        threads: number of CPU threads of network and step; default: all cores but one
-        debug: show tracebacks
     """
 
     USAGE: ClassVar[str] = "ufmstar live SOURCE --model NAME --weights FILE... [options]"
@@ -74,16 +84,12 @@ class LiveOptions:
     overwrite: bool = False
     view: bool = False
     json: bool = False
-    device: str = "cpu"
-    threads: int | None = None
-    debug: bool = False
     opening: SequenceOptions
     network: NetworkOptions
     uncertainty: UfMOptions
 
     def __post_init__(self) -> None:
         _ = self.uncertainty.config  # checks the settings
-        parse_intrinsics(self.opening.intrinsics, "--intrinsics")
         for name in ("speed", "seconds", "idle"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"--{name} must be positive, got {getattr(self, name)}")
@@ -110,23 +116,20 @@ class LiveOptions:
 
 def read(words: Sequence[str]) -> LiveOptions:
     """The options of a command line; errors as :func:`read_ufm`."""
-    return read_ufm(LiveOptions, words, "ufmstar live", {})
+    options: LiveOptions = read_ufm(LiveOptions, words, "ufmstar live", {})
+    return options
 
 
 def main(options: LiveOptions) -> int:
     """Run until the source ends, and print the real-time table; the exit code."""
-    from ufmstar_torch.eval.engine.realtime import RealTime
     from ufmstar_torch.eval.report.text import realtime_table
-    from ufmstar_torch.eval.run.files import write_json_atomic
-    from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
-    from ufmstar_torch.eval.run.machine import share_threads
 
     if options.threads is None:
         share_threads()
     kind = FolderKind("ufmstar live", "live run", _SUMMARY, remover("*.npz"), lock=".lock")
     started = {"state": "started"}  # and not finished, which would allow the next run to replace it
     with ExitStack() as held:
-        try:
+        with usage_errors(ImportError, OSError, ValueError):
             if options.out is not None:
                 kind.earlier(options.out, resume=False, overwrite=options.overwrite)
             events = _events(options)
@@ -134,8 +137,6 @@ def main(options: LiveOptions) -> int:
             view = _view() if options.view else None
             if options.out is not None:
                 held.enter_context(OutputFolder.open(options.out, kind, started, overwrite=options.overwrite))
-        except (ImportError, OSError, ValueError) as error:
-            raise UsageError(error) from error
         times = RealTime(model)
         statistics, failure = _run(options, model, events, times, view)
         summary = times.summary(statistics)
@@ -153,10 +154,8 @@ def _run(
     options: LiveOptions, model: UncertainDepth, events: Iterator[LiveEvent], times: RealTime, view: _View | None
 ) -> tuple[LiveStatistics, Exception | None]:
     """Push the events until they end, the time is over, or a signal comes. Returns the counts, and what failed."""
-    from ufmstar_torch.live import LiveDepth
-
-    ends = monotonic() + options.seconds
-    K = None if not options.opening.intrinsics else _intrinsics(options)
+    ends, given = monotonic() + options.seconds, parse_intrinsics(options.opening.intrinsics, "--intrinsics")
+    K = None if given is None else read_intrinsics(given)
 
     def on_result(result: LiveResult) -> None:
         times.take(result)
@@ -187,37 +186,23 @@ def _run(
 
 def _events(options: LiveOptions) -> Iterator[LiveEvent]:
     """The source's images and poses; errors as ``open_sequence``."""
-    from ufmstar_torch.eval.sequences import live
-    from ufmstar_torch.eval.sequences.open import open_sequence
-
     opening = options.opening
     if options.recorded:
         sequence = open_sequence(options.source, **opening.given())
         if not sequence.posed:
             raise ValueError(f"{options.source} has no poses; ufmstar poses computes them")
-        return live.replay(sequence, options.speed)
+        return sources.replay(sequence, options.speed)
     scale = 1.0 if opening.pose_scale is None else opening.pose_scale
     if options.source == _STANDARD_INPUT:
-        return live.json_lines(sys.stdin, ".", opening.poses, scale)
-    poses = live.PoseFile(str(opening.trajectory), opening.poses, scale)
+        return sources.json_lines(sys.stdin, ".", opening.poses, scale)
+    poses = sources.PoseFile(str(opening.trajectory), opening.poses, scale)
     if options.follow:
-        return live.growing_folder(options.source, poses, options.idle)
-    return live.camera(int(options.source), poses)
+        return sources.growing_folder(options.source, poses, options.idle)
+    return sources.camera(int(options.source), poses)
 
 
 def _model(options: LiveOptions) -> UncertainDepth:
     """The networks with UfM*, compiled, in the state of ``--state``; errors as ``network_source``."""
-    import torch
-
-    from ufmstar_torch.eval.commands.terminal import Bars
-    from ufmstar_torch.eval.engine.load import network_source
-    from ufmstar_torch.eval.engine.progress import Progress
-    from ufmstar_torch.eval.engine.warm_up import warm_up_command
-    from ufmstar_torch.eval.run.make_job import recalibration_of
-    from ufmstar_torch.models.checkpoints import read_tensors
-    from ufmstar_torch.models.inference import Inference
-    from ufmstar_torch.pipeline import UncertainDepth
-
     chosen = options.network
     own = {name: getattr(chosen, name) for name in ("model", "weights", "spec", "mode", "samples", "offload")}
     inference = Inference(chosen.runtime, chosen.precision, options.threads)
@@ -229,17 +214,12 @@ def _model(options: LiveOptions) -> UncertainDepth:
         mode="full" if chosen.mode == "full" else "alternate",
         posterior=options.uncertainty.posterior,
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
-        anchors=_anchors(anchors),
+        anchors=None if anchors is False else landmarks_of(anchors, None),
         recalibration=recalibration_of(as_dict(options.uncertainty) | as_dict(chosen), config, source),
     ).to(options.device)
     with Bars() as bars:
         dense = config.anchors is not None and anchors in (False, "dense")
-        warm_up_command(
-            model.ufm.config,
-            torch.device(options.device),
-            lambda done, total: bars.show(Progress("kernels", done, total)),
-            dense=dense,
-        )
+        warm_up_command(model.ufm.config, torch.device(options.device), bars.show, dense=dense)
     if options.state is not None and options.state.exists():
         try:
             with options.state.open("rb") as file:
@@ -250,26 +230,8 @@ def _model(options: LiveOptions) -> UncertainDepth:
     return model
 
 
-def _anchors(value: bool | str) -> Path | Literal["corners", "dense"] | None:
-    """The anchors of ``UncertainDepth`` that ``--anchors`` names."""
-    if value is True or value == "corners":
-        return "corners"
-    return "dense" if value == "dense" else Path(value) if isinstance(value, str) else None
-
-
-def _intrinsics(options: LiveOptions) -> Any:
-    from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
-
-    given = parse_intrinsics(options.opening.intrinsics, "--intrinsics")
-    return None if given is None else read_intrinsics(given)
-
-
 def _write(out: Path, result: LiveResult) -> None:
     """The maps of an image, as OUT/STAMP.npz."""
-    import numpy as np
-
-    from ufmstar_torch.eval.run.files import write_atomic
-
     maps = {"depth": result.out.depth, "variance": result.out.variance, "disagreement": result.out.disagreement}
     arrays = {name: value[0].cpu().numpy() for name, value in maps.items()}
     camera = {"T_world_cam": result.T_world_cam, "intrinsics": result.out.intrinsics[0].cpu().numpy()}
@@ -278,14 +240,6 @@ def _write(out: Path, result: LiveResult) -> None:
 
 def _view() -> _View:
     """A function that shows results in a new viewer. Errors as ``open_viewer``."""
-    from itertools import count
-
-    import numpy as np
-    import torch
-
-    from ufmstar_torch.eval.run.export import Gated
-    from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
-
     log, numbers = RerunLog(open_viewer()[0]), count()
 
     def show(result: LiveResult, about: dict[str, float]) -> None:

@@ -32,8 +32,8 @@ from __future__ import annotations
 
 import types
 from argparse import SUPPRESS, Action
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from functools import cache, reduce
 from operator import or_
@@ -55,19 +55,39 @@ class UsageError(Exception):
     """A request of the user that cannot be carried out; the message is one line with the reason."""
 
 
+@contextmanager
+def usage_errors(*kinds: type[Exception]) -> Iterator[None]:
+    """Errors of these kinds are the user's."""
+    try:
+        yield
+    except kinds as error:
+        raise UsageError(error) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineOptions:
+    """Options that many commands have, at the end of their own.
+
+    Attributes:
+        device: cpu, cuda or cuda:N
+        threads: number of CPU threads of network and step; default: all cores but one
+        debug: show tracebacks
+    """
+
+    device: str = "cpu"
+    threads: int | None = None
+    debug: bool = False
+
+
 def positional() -> Any:
     """A field that is an argument without a name."""
     return field(metadata={"positional": True})
 
 
 def option(default: Any = MISSING, **how: Any) -> Any:
-    """A field whose form is not clear from its type.
-
-    Args:
-        default: without one, the option must be given.
-        **how: ``choices``: the values that are allowed; ``const``: the value of the option without a word behind it;
-            ``repeat``: whether words of further occurrences are added (else they replace the earlier ones).
-    """
+    """A field whose form is not clear from its type; without a default, the option must be given. ``how`` has
+    ``choices``: the values that are allowed; ``const``: the value of the option without a word behind it; ``repeat``:
+    whether words of further occurrences are added (else they replace the earlier ones)."""
     return field(default=default, metadata=how)
 
 
@@ -75,19 +95,20 @@ def option(default: Any = MISSING, **how: Any) -> Any:
 class _Fields:
     """The arguments of :func:`fields_of`."""
 
-    config: type  # a dataclass. ``choices``, ``symbol``, ``unit`` and ``range`` in its fields' metadata are used.
-    # of the options' names; with a dot (``ufm.``) the names keep their underscores, and a configuration file has the
-    # values below that key.
+    config: type
     prefix: str = ""
-    without: Sequence[str] = ()  # fields that are no options
-    unset: bool = False  # leave out what is not given, instead of the class's own default
-    defaults: Mapping[str, Any] = field(default_factory=dict)  # other defaults than the class's own
+    without: Sequence[str] = ()
+    unset: bool = False
+    defaults: Mapping[str, Any] = field(default_factory=dict)
 
 
 def fields_of(config: type, prefix: str = "", **how: Any) -> Any:
-    """A field of type ``dict[str, Any]``: an option for every field of a settings class, nested ones included; the
-    arguments are :class:`_Fields`'s. A section that is None by default is None unless one of its options is given. The
-    value of a bool is written out: ``--ufm.add_aleatoric false``."""
+    """A field of type ``dict[str, Any]``: an option for every field of a settings class, nested ones included, but
+    those ``without``. With a dot in the ``prefix`` (``ufm.``) their names keep their underscores, and a configuration
+    file has the values below that key. ``unset`` leaves out what is not given, instead of the class's own default;
+    ``defaults`` are other ones. A section that is None by default is None unless one of its options is given. The value
+    of a bool is written out: ``--ufm.add_aleatoric false``. ``choices``, ``symbol``, ``unit`` and ``range`` in the
+    fields' metadata are used."""
     return field(default_factory=dict, metadata={"fields_of": _Fields(config, prefix, **how)})
 
 
@@ -102,7 +123,6 @@ def parse(options: type[T], words: Sequence[str], prog: str, defaults: Mapping[s
 
     Raises:
         ValueError: an unknown option, a value of the wrong kind, or what ``options`` itself refuses; one line.
-        SystemExit: help was asked for.
     """
     from jsonargparse import ArgumentError
 
@@ -126,8 +146,8 @@ def reader(options: type[T], prog: str) -> Callable[[Sequence[str]], T]:
 
 
 def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser:
-    """The parser for a dataclass of options; it raises ``ArgumentError`` instead of ending the program. Its help has
-    the options with a dot in their name (``--ufm.eta``) only if it is ``full``."""
+    """The parser for a dataclass of options; it raises ``ArgumentError`` instead of ending the program. Options with a
+    dot in their name (``--ufm.eta``) have help only if it is ``full``."""
     from jsonargparse import ActionConfigFile, ArgumentParser, DefaultHelpFormatter
 
     class BoundedConfigFile(ActionConfigFile):
@@ -157,11 +177,7 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
 
 def _require_bounded(config: str) -> None:
     """Check a configuration, a file's name or the text itself, by YAML's events, which neither recurse nor expand.
-
-    Raises:
-        ValueError: it is larger than 1 MB, nested deeper than 50 levels, or has over 100,000 values with its aliases
-            expanded; the message names it.
-    """
+    Raises ValueError: too large, nested too deeply, or too many values with its aliases expanded."""
     import yaml
 
     name, text = "--config", config
@@ -204,7 +220,7 @@ def as_dict(options: Any) -> dict[str, Any]:
 
 def _add_options(parser: ArgumentParser, group: Any, options: type, full: bool) -> None:
     hints, (_, help_) = get_type_hints(options), _documentation(options)
-    for f in fields(options):
+    for f in sorted(fields(options), key=lambda f: f.name not in options.__annotations__):  # what is inherited last
         hint = hints[f.name]
         if "fields_of" in f.metadata:
             _add_fields(group, f.metadata["fields_of"], full)

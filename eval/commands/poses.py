@@ -2,13 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from ufmstar_torch.eval.commands.options import UsageError, parse, positional
-from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+import numpy as np
+
+from ufmstar_torch.eval.commands.options import positional, reader, usage_errors
+from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+from ufmstar_torch.eval.engine.progress import Progress
+from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
+from ufmstar_torch.eval.reconstruct.reconstruct import (
+    POSES,
+    gaps,
+    landmarks,
+    reconstruct,
+    require_pycolmap,
+    scale_model,
+)  # fmt: skip
+from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.folder import FolderError, OutputFolder
+from ufmstar_torch.eval.run.machine import available_cores
+from ufmstar_torch.eval.sequences.frame import check_intrinsics, parse_slice
+from ufmstar_torch.eval.sequences.generic import INTRINSICS, open_images
+from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics, read_intrinsics
+from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
+from ufmstar_torch.eval.sequences.options import Options, resolve
+from ufmstar_torch.eval.sequences.poses import read_trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,35 +99,22 @@ class PosesOptions:
         return first, second, metres
 
 
-def read(words: Sequence[str]) -> PosesOptions:
-    """The options of a command line; errors as :func:`parse`."""
-    return parse(PosesOptions, words, "ufmstar poses")
+read = reader(PosesOptions, "ufmstar poses")
 
 
 def main(options: PosesOptions) -> int:
     """Reconstruct, write the folder, and print what was found; the exit code."""
-    from ufmstar_torch.eval.reconstruct.reconstruct import POSES, require_pycolmap
-    from ufmstar_torch.eval.run.folder import FolderError, OutputFolder
-
     require_pycolmap()
-    try:
+    with usage_errors(FolderError, FileNotFoundError, ValueError):
         images, size = _images(options)
         with OutputFolder.open(options.out, POSES, {}, overwrite=options.overwrite):
             found = _reconstruct(options, images, size)
-    except (FolderError, FileNotFoundError, ValueError) as error:
-        raise UsageError(error) from error
     _report(found, options.out)
     return 0
 
 
 def _images(options: PosesOptions) -> tuple[list[Any], tuple[int, int]]:
     """The entries of the images with their times, and their (H, W). Raises ValueError: there is none."""
-    from dataclasses import replace
-
-    from ufmstar_torch.eval.sequences.frame import parse_slice
-    from ufmstar_torch.eval.sequences.generic import open_images
-    from ufmstar_torch.eval.sequences.options import Options
-
     path = Path(options.source)
     if not path.exists():
         raise FileNotFoundError(f"no such file or folder: {path}")
@@ -122,45 +129,27 @@ def _images(options: PosesOptions) -> tuple[list[Any], tuple[int, int]]:
 
 
 def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]) -> dict[str, Any]:
-    import numpy as np
-
-    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-    from ufmstar_torch.eval.engine.progress import Progress
-    from ufmstar_torch.eval.reconstruct.keyframes import write_keyframes
-    from ufmstar_torch.eval.reconstruct.reconstruct import POSES, gaps, landmarks, reconstruct, scale_model
-    from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
-    from ufmstar_torch.eval.run.machine import available_cores
-    from ufmstar_torch.eval.sequences.options import Options, resolve
-    from ufmstar_torch.eval.sequences.poses import read_trajectory
-
     root = Path(options.source) if Path(options.source).is_dir() else Path(options.source).parent
     lens = _lens(options, root, size)
     if lens is not None:  # COLMAP's mapper fails on some lenses, and `run` has less to do
         images = [lens.see(entry) for entry in images]
     trajectory = None if options.trajectory is None else read_trajectory(resolve(root, options.trajectory))
-    length = options.known_length
     out = options.out
     (out / "images").mkdir()
     with Bars() as bars, stop_signals(bars.say) as stop:
         named = {word.partition(":")[0] for word in options.length[:2]}
         always = {e.name for e in images if e.name in named or (e.name.isdecimal() and str(int(e.name)) in named)}
-        chosen, broken = write_keyframes(
-            images,
-            out / "images",
-            always=always,
-            progress=lambda done: bars.show(Progress("frames", done, len(images))),
-            stop=stop,
-        )
+        how: dict[str, Any] = {"progress": lambda done: bars.show(Progress("frames", done, len(images))), "stop": stop}
+        chosen, broken = write_keyframes(images, out / "images", always=always, **how)
         keyframes = [images[index] for index in chosen]
         names = [entry.name for entry in keyframes]
         if keyframes and keyframes[0].timestamp is not None:
             lines = "".join(f"{entry.timestamp:.9f} images/{entry.name}.jpg\n" for entry in keyframes)
             write_atomic(out / "rgb.txt", lambda file: file.write(lines.encode()))
-        models = reconstruct(
-            out, names, None if lens is None else lens.K, threads=options.threads or available_cores(), say=bars.say
-        )
+        K, threads = None if lens is None else lens.K, options.threads or available_cores()
+        models = reconstruct(out, names, K, threads=threads, say=bars.say)
     opening = Options(fps=options.fps, max_pose_gap=options.max_pose_gap)
-    scale = scale_model(models[0], images, length=length, trajectory=trajectory, options=opening)
+    scale = scale_model(models[0], images, length=options.known_length, trajectory=trajectory, options=opening)
     for number, model in enumerate(models):
         (out / "sparse" / str(number)).mkdir()
         model.write(out / "sparse" / str(number))
@@ -184,11 +173,6 @@ def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]
 
 def _lens(options: PosesOptions, root: Path, size: tuple[int, int]) -> Any:
     """The camera, or None where it is to be estimated. Raises ValueError: intrinsics that do not fit the images."""
-    from ufmstar_torch.eval.sequences.frame import check_intrinsics
-    from ufmstar_torch.eval.sequences.generic import INTRINSICS
-    from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
-    from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
-
     source = parse_intrinsics(options.intrinsics, "--intrinsics")
     if source is None:
         source = next((str(root / name) for name in INTRINSICS if (root / name).is_file()), None)

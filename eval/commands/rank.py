@@ -5,21 +5,29 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from ufmstar_torch.eval.commands.opening import SequenceOptions
-from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, positional
+from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, option, positional, usage_errors
 from ufmstar_torch.eval.commands.run import MapOptions, NetworkOptions, RunOptions, UfMOptions, job_from, read_ufm
-
-if TYPE_CHECKING:
-    from ufmstar_torch.eval.run.rank import ImageScores
+from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+from ufmstar_torch.eval.engine.progress import ProgressSink
+from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
+from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
+from ufmstar_torch.eval.run.machine import share_threads
+from ufmstar_torch.eval.run.panels import contact_sheet
+from ufmstar_torch.eval.run.pictures import SHEET
+from ufmstar_torch.eval.run.rank import ImageScores, require_part
+from ufmstar_torch.eval.run.run import warm_up_job
+from ufmstar_torch.eval.run.run_folder import Checkpoint
 
 SCORES, SETTINGS = "scores.csv", "rank.json"
 _SHOWN = 10  # lines of the printed table
 
 
 @dataclass(frozen=True, kw_only=True)
-class RankOptions:
+class RankOptions(MachineOptions):
     """Rank the images of sequences by their uncertainty: the most uncertain ones are to be labelled first.
 
     Writes scores.csv, a line per image, and a contact sheet of the least and the most certain images. Each sequence
@@ -34,9 +42,6 @@ class RankOptions:
         measured: smallest share of pixels seen in two views; images below it get no rank by total or disagreement
         frames: START:STOP:STEP, which frames of each sequence
         overwrite: replace the ranking in --out
-        device: cpu, cuda or cuda:N
-        threads: number of CPU threads; default: all cores but one
-        debug: show tracebacks
     """
 
     USAGE: ClassVar[str] = "ufmstar rank SEQUENCE... (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
@@ -49,9 +54,6 @@ class RankOptions:
     measured: float = 0.5
     frames: str | None = None
     overwrite: bool = False
-    device: str = "cpu"
-    threads: int | None = None
-    debug: bool = False
     opening: SequenceOptions
     network: NetworkOptions
     maps: MapOptions
@@ -74,45 +76,32 @@ class RankOptions:
 
 def read(words: Sequence[str]) -> RankOptions:
     """The options of a command line; errors as ``commands.run.read``. M is the frame's alone, at measured pixels."""
-    return read_ufm(RankOptions, words, "ufmstar rank", {"ufm.unmeasured": "nan", "ufm.ema_alpha": 1.0})
+    own = {"ufm.unmeasured": "nan", "ufm.ema_alpha": 1.0}
+    options: RankOptions = read_ufm(RankOptions, words, "ufmstar rank", own)
+    return options
 
 
 def main(options: RankOptions) -> int:
     """Score the sequences, and write table and pictures; the exit code."""
-    from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
-    from ufmstar_torch.eval.run.machine import share_threads
-    from ufmstar_torch.eval.run.pictures import SHEET
-
     if options.threads is None:
         share_threads()
     kind = FolderKind("ufmstar rank", "ranking", SETTINGS, remover(SCORES, SHEET))
-    try:
+    with usage_errors(FolderError):
         kind.earlier(Path(options.out), resume=False, overwrite=options.overwrite)
         scores = _scores(options)
         OutputFolder.open(Path(options.out), kind, {}, overwrite=options.overwrite).close()
-    except FolderError as error:
-        raise UsageError(error) from error
     return _write(options, scores)
 
 
 def _scores(options: RankOptions) -> ImageScores:
-    """Stream the sequences. Raises UsageError: one cannot be opened, or the network does not state what ranks them."""
-    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-    from ufmstar_torch.eval.engine.progress import ProgressSink
-    from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
-    from ufmstar_torch.eval.run.rank import ImageScores, require_part
-    from ufmstar_torch.eval.run.run import warm_up_job
-    from ufmstar_torch.eval.run.run_folder import Checkpoint
-
+    """Stream the sequences."""
     scores, source = ImageScores(options.by, options.measured), None
     with Bars() as bars, stop_signals(bars.say) as stop:
         for path in options.sequences:
-            try:
+            with usage_errors(ImportError, OSError, ValueError):
                 job = job_from(options.of(path), source)
                 if source is None:
                     require_part(job, options.by)
-            except (ImportError, OSError, ValueError) as error:
-                raise UsageError(error) from error
             if source is None:
                 warm_up_job(job, bars.show)
             source, scores.sequence = job.source, path
@@ -130,9 +119,6 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
 
     from ufmstar_torch.eval.report.table import csv_text
     from ufmstar_torch.eval.report.text import aligned
-    from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
-    from ufmstar_torch.eval.run.panels import contact_sheet
-    from ufmstar_torch.eval.run.pictures import SHEET
 
     out, chosen = Path(options.out), scores.chosen(options.count, diverse=options.diverse)
     rest = sorted(set(range(len(scores.images))) - set(chosen))

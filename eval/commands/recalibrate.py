@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-from ufmstar_torch.eval.commands.options import UsageError, option, positional, reader
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from ufmstar_torch.eval.methods.row import Row
-    from ufmstar_torch.eval.metrics.recalibration import Array
-    from ufmstar_torch.eval.report.data import Results
-    from ufmstar_torch.recalibrate import Recalibration
-
-
-CONFIDENCE = "confidence"  # as ``engine.judge`` names its samples
+from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
+from ufmstar_torch.eval.engine.estimators import ufm_star_config
+from ufmstar_torch.eval.engine.judge import CONFIDENCE, METRICS
+from ufmstar_torch.eval.methods.method import UFM_STAR
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.report.data import Results, load_results, read_sums
+from ufmstar_torch.eval.suite.work_items import WorkItem
+from ufmstar_torch.recalibrate import Recalibration
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,11 +47,9 @@ read = reader(RecalibrateOptions, "ufmstar recalibrate")
 
 def main(options: RecalibrateOptions) -> int:
     """Fit, write the file, and print how well it fits sequences that it was not fitted to; the exit code."""
-    from ufmstar_torch.eval.methods.method import UFM_STAR
-    from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import aligned
 
-    try:
+    with usage_errors(ValueError):
         results = load_results(options.out, with_sums=False)
         rows = [row for row in results.rows if row.method.fusion == UFM_STAR and not row.setting.recalibration]
         row = next((row for row in rows if row.label == options.row), None)
@@ -61,8 +59,6 @@ def main(options: RecalibrateOptions) -> int:
         counts = _counts(results, row, options.covariate)
         fitted = _fit(list(counts.values()), options.covariate)
         _about(fitted, results, row).save(options.to)
-    except ValueError as error:
-        raise UsageError(error) from error
     print("\n".join(aligned(_table(counts, options.covariate))))
     if len(counts) == 1:
         print("fitted to a single sequence, on which it is not judged: evaluate more of them")
@@ -70,19 +66,15 @@ def main(options: RecalibrateOptions) -> int:
     return 0
 
 
-def _fit(counts: Sequence[Array], covariate: str) -> Recalibration:
+def _fit(counts: Sequence[NDArray[Any]], covariate: str) -> Recalibration:
     from ufmstar_torch.eval.metrics.recalibration import fit, fit_confidence
 
     return fit_confidence(counts) if covariate == CONFIDENCE else fit(counts)
 
 
-def _counts(results: Results, row: Row, covariate: str) -> dict[str, Array]:
+def _counts(results: Results, row: Row, covariate: str) -> dict[str, NDArray[Any]]:
     """[V, e] pixels of every sequence by variance and squared error, by "DATASET/SEQUENCE"; for the confidence samples
     [n, 3]. Raises ValueError: the network states none."""
-    from ufmstar_torch.eval.engine.judge import METRICS
-    from ufmstar_torch.eval.report.data import read_sums
-    from ufmstar_torch.eval.suite.work_items import WorkItem
-
     counts = {}
     for record in results.of(row):
         item = WorkItem(record.dataset, record.sequence, path="", layout="")
@@ -95,13 +87,12 @@ def _counts(results: Results, row: Row, covariate: str) -> dict[str, Array]:
     return counts
 
 
-def _table(counts: Mapping[str, Array], covariate: str) -> list[list[str]]:
+def _table(counts: Mapping[str, NDArray[Any]], covariate: str) -> list[list[str]]:
     """Figures of every sequence as it is, and under the map that was fitted to the others."""
     from ufmstar_torch.eval.metrics.recalibration import figures, figures_of_samples
     from ufmstar_torch.eval.report.text import number
 
     judged = figures_of_samples if covariate == CONFIDENCE else figures
-
     lines = [["", "coverage error", "recalibrated", "NLL", "recalibrated"]]
     for name, joint in counts.items():
         others = [other for label, other in counts.items() if label != name]
@@ -113,8 +104,6 @@ def _table(counts: Mapping[str, Array], covariate: str) -> list[list[str]]:
 
 def _about(fitted: Recalibration, results: Results, row: Row) -> Recalibration:
     """The map with what it was fitted to."""
-    from ufmstar_torch.eval.engine.estimators import ufm_star_config
-
     records = results.of(row)
     network: Mapping[str, object] = results.about["networks"][row.method.base]
     files = network.get("files")

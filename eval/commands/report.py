@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ufmstar_torch.eval.commands.options import UsageError, positional, reader
+from ufmstar_torch.eval.commands.options import positional, reader, usage_errors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,10 +35,8 @@ def main(options: ReportOptions) -> int:
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
 
-    try:
+    with usage_errors(ResultsError):
         print(summary(load_results(options.out, with_sums=False)))
         report = write_report(options.out, figures=not options.no_figures)
-    except ResultsError as error:
-        raise UsageError(error) from error
     print(written(options.out, report))
     return 0

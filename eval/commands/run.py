@@ -5,23 +5,31 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar
 
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.opening import SequenceOptions
-from ufmstar_torch.eval.commands.options import UsageError, as_dict, fields_of, option, parse, positional
-from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
-from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+from ufmstar_torch.eval.commands.options import (
+    MachineOptions,
+    as_dict,
+    fields_of,
+    option,
+    parse,
+    positional,
+    usage_errors,
+)  # fmt: skip
+from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.run.folder import FolderError
+from ufmstar_torch.eval.run.job import RunJob, make_job
+from ufmstar_torch.eval.run.machine import share_threads
+from ufmstar_torch.eval.run.run import run
+from ufmstar_torch.eval.run.summary import FINISHED, INTERRUPTED
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.stateful import flat
-
-if TYPE_CHECKING:
-    from ufmstar_torch.eval.engine.predictions import DepthSource
-    from ufmstar_torch.eval.run.job import RunJob
 
 PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
 _OF_FOLDER = ("variance", "depth_scale", "map_intrinsics")
-
-
 # Of UfM*'s settings, those that are off by default.
 _SECTIONS = ("anchors", "confidence", "posterior", "merge")
 
@@ -109,7 +117,7 @@ class UfMOptions:
         return UfMStarConfig.from_dict(self.ufm | sections)
 
     def preset_defaults(self) -> dict[str, Any]:
-        """Other defaults than the options' own, by their names, as ``preset`` and ``ufm_preset`` ask."""
+        """Other defaults than the options' own, by name, as ``preset`` and ``ufm_preset`` ask."""
         defaults: dict[str, Any] = {}
         if self.ufm_preset == "paper":
             changed = flat(UfMStarConfig.paper().to_dict()) | {"on_bad_frame": "skip"}
@@ -121,7 +129,7 @@ class UfMOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions:
+class RunOptions(MachineOptions):
     """Depth with a variance for every pixel of a sequence of posed images.
 
     The depth comes from a network (--model, --weights), from maps that another program predicted (--depth DIR), or
@@ -135,9 +143,7 @@ class RunOptions:
         overwrite: replace the run in --out
         no_video: leave preview.mp4 out
         no_sheet: leave contact_sheet.png out
-        device: cpu, cuda or cuda:N
         threads: number of CPU threads of network and step; default: all cores but one, which reads and writes
-        debug: show tracebacks
     """
 
     USAGE: ClassVar[str] = "ufmstar run SEQUENCE (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
@@ -149,9 +155,6 @@ class RunOptions:
     overwrite: bool = False
     no_video: bool = False
     no_sheet: bool = False
-    device: str = "cpu"
-    threads: int | None = None
-    debug: bool = False
     opening: SequenceOptions
     network: NetworkOptions
     maps: MapOptions
@@ -159,14 +162,6 @@ class RunOptions:
 
     def __post_init__(self) -> None:
         _ = self.config  # checks the settings
-        parse_slice(self.frames)
-        parse_size(self.maps.size)
-        for words, name in (
-            (self.opening.intrinsics, "--intrinsics"),
-            (self.opening.depth_intrinsics, "--depth-intrinsics"),
-            (self.maps.map_intrinsics, "--map-intrinsics"),
-        ):
-            parse_intrinsics(words, name)
         _check_depth(as_dict(self.network) | as_dict(self.maps))
         if self.resume and self.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
@@ -184,31 +179,15 @@ class RunOptions:
         return plain | {"ufm": ufm}
 
 
-class _WithUfM(Protocol):
-    """A dataclass of options with those of UfM*."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    @property
-    def uncertainty(self) -> UfMOptions: ...
-
-
-T = TypeVar("T", bound=_WithUfM)
-
-
 def read(words: Sequence[str]) -> RunOptions:
-    """The options of a command line.
-
-    Raises:
-        ValueError: an unknown option, or values that are impossible or contradict each other.
-        SystemExit: help was asked for.
-    """
-    return read_ufm(RunOptions, words, "ufmstar run", {})
+    """The options of a command line; errors as :func:`parse`."""
+    options: RunOptions = read_ufm(RunOptions, words, "ufmstar run", {})
+    return options
 
 
-def read_ufm(kind: type[T], words: Sequence[str], prog: str, own: Mapping[str, Any]) -> T:
+def read_ufm(kind: type[Any], words: Sequence[str], prog: str, own: Mapping[str, Any]) -> Any:
     """The options of a command with :class:`UfMOptions`, whose presets are defaults; ``own`` are the command's, by
-    name. Errors as :func:`read`."""
+    name. Errors as :func:`parse`."""
     options = parse(kind, words, prog, own)
     defaults = options.uncertainty.preset_defaults()
     return parse(kind, words, prog, {**defaults, **own}) if defaults else options
@@ -216,32 +195,19 @@ def read_ufm(kind: type[T], words: Sequence[str], prog: str, own: Mapping[str, A
 
 def main(options: RunOptions) -> int:
     """Run, and print the results' table; the exit code."""
-    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-    from ufmstar_torch.eval.run.folder import FolderError
-    from ufmstar_torch.eval.run.machine import share_threads
-    from ufmstar_torch.eval.run.run import run
-
     if options.threads is None:
         share_threads()
-    try:
+    with usage_errors(ImportError, OSError, ValueError):
         job = job_from(options)
-    except (ImportError, OSError, ValueError) as error:
-        raise UsageError(error) from error
-    try:
-        with Bars() as bars, stop_signals(bars.say) as stop:
-            how = {"resume": options.resume, "overwrite": options.overwrite}
-            summary = run(job, options.out, **how, progress=bars.show, stop=stop)
-    except FolderError as error:
-        raise UsageError(error) from error
+    how = {"resume": options.resume, "overwrite": options.overwrite}
+    with usage_errors(FolderError), Bars() as bars, stop_signals(bars.say) as stop:
+        summary = run(job, options.out, **how, progress=bars.show, stop=stop)
     return _report(summary, options.out)
 
 
 def job_from(options: RunOptions, networks: DepthSource | None = None) -> RunJob:
     """Open the sequence, and make the job that the options describe, with the networks of an earlier one; errors as
     ``open_sequence`` and ``make_job``."""
-    from ufmstar_torch.eval.run.make_job import make_job
-    from ufmstar_torch.eval.sequences.open import open_sequence
-
     sequence = open_sequence(options.sequence, **options.opening.given())
     return make_job(options.settings(), options.config, sequence, networks)
 
@@ -249,7 +215,6 @@ def job_from(options: RunOptions, networks: DepthSource | None = None) -> RunJob
 def _report(summary: Mapping[str, Any], out: str) -> int:
     """Print the table and where the outputs are; the exit code."""
     from ufmstar_torch.eval.report.text import run_table
-    from ufmstar_torch.eval.run.summary import FINISHED, INTERRUPTED
 
     if summary["frames"]["done"]:
         print(run_table(summary))

@@ -6,10 +6,9 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from ufmstar_torch.eval.engine.progress import Progress
+from ufmstar_torch.eval.engine.progress import Progress
 
 
 class Bars:
@@ -19,26 +18,26 @@ class Bars:
     """
 
     def __init__(self) -> None:
-        self._bars: dict[str, Any] = {}
+        self._stage = ""
+        self._bar: Any = None
 
     def show(self, progress: Progress) -> None:
         """Bring the bar of the stage up to date; the bar of an earlier stage goes."""
         from tqdm import tqdm
 
         stage = progress.stage
-        if stage not in self._bars:
+        if stage != self._stage:
             self._close()
             first = progress.done if progress.components is None and stage == "frames" else 0
             unit = "frame" if stage == "frames" else "step"
             # None: no bar where standard error is no terminal
             how = {"unit": unit, "dynamic_ncols": True, "leave": False, "disable": None}
-            bar = tqdm(total=progress.total, initial=first, desc=stage, **how)
-            if bar.disable:
+            self._stage, self._bar = stage, tqdm(total=progress.total, initial=first, desc=stage, **how)
+            if self._bar.disable:
                 self.say(f"{stage}: {progress.done} of {progress.total}")
             if stage == "kernels":
-                bar.set_postfix_str("compiled on the first run")
-            self._bars = {stage: bar}
-        bar = self._bars[stage]
+                self._bar.set_postfix_str("compiled on the first run")
+        bar = self._bar
         bar.total = progress.total
         if progress.components is not None:
             skipped = {"skipped": progress.skipped} if progress.skipped else {}
@@ -60,17 +59,15 @@ class Bars:
         self._close()
 
     def _close(self) -> None:
-        for bar in self._bars.values():
-            bar.close()
+        if self._bar is not None:
+            self._bar.close()
 
 
 @contextmanager
 def stop_signals(say: Callable[[str], None], what: str = "frame") -> Iterator[Callable[[], bool]]:
     """Ctrl-C and SIGTERM end the run after the current frame (or step); a second one ends it at once.
 
-    Yields:
-        Whether one has come.
-    """
+    The value is whether one has come."""
     received: list[int] = []
 
     def handle(number: int, _: object) -> None:

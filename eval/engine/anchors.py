@@ -35,24 +35,16 @@ _NO_IMAGE = Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked=0, non
 
 
 class Tracks:
-    """Landmarks of rows that see the same images at the same poses: each image is processed once.
-
-    Args:
-        source: in its initial state; None = a tracker of corners.
-    """
+    """Landmarks of rows that see the same images at the same poses: each image is processed once. ``source`` is in its
+    initial state; None = a tracker of corners."""
 
     def __init__(self, source: LandmarkSource | None = None) -> None:
         self._streams = StreamLandmarks(landmark_source(CORNERS) if source is None else source)
         self._last: tuple[Frame, Landmarks, float] | None = None
 
     def of(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:
-        """Landmarks of the next frame, at the pose [4, 4] with its noise [m], and the time that they took [ms]. None
-        without an image that the source needs; the source stays as it is.
-
-        Raises:
-            ModuleNotFoundError: OpenCV is not installed.
-            ValueError: the image is not of the size of those before.
-        """
+        """Landmarks of the next frame, at the pose [4, 4] with its noise [m], and the time that they took [ms]; None
+        without an image that the source needs. Errors as ``StreamLandmarks.update``."""
         if self._last is not None and self._last[0] is frame:
             return self._last[1:]
         if frame.image is None and self._streams.needs_image:
@@ -65,7 +57,7 @@ class Tracks:
         return self._last[1:]
 
     def undo(self) -> None:
-        """Forget the last frame: UfM* skipped it, and its pose is not to be trusted."""
+        """Forget the last frame, which UfM* skipped."""
         self._streams.undo()
 
     def state(self) -> dict[str, Tensor]:
@@ -73,22 +65,18 @@ class Tracks:
         return self._streams.state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken. Raises ValueError: it is of a tracker of another size."""
+        """Continue where ``state`` was taken. Raises ValueError: it is of another source."""
         self._streams.load_state(state)
         self._last = None
 
 
 class AnchorSource:
-    """The anchors of a row.
+    """The anchors of a row, from ``tracks``; None = ground truth at random pixels.
 
     Noise on tracked positions acts where it would in the end: an anchor is moved in the image by it, and its depth
     errs by as much as one of that many pixels in every view makes it, to first order (``track_noise`` times the
-    standard deviation that the tracker states for ``pixel_noise``). The variance is left as the tracker states it,
-    which does not know of the noise. Frames are disturbed independently of each other.
-
-    Args:
-        setting: of the row, with anchors.
-        tracks: where they come from; None = ground truth at random pixels.
+    standard deviation that the tracker states for ``pixel_noise``). The variance is left as the tracker states it.
+    Frames are disturbed independently of each other.
     """
 
     def __init__(self, setting: Setting, tracks: Tracks | None) -> None:
@@ -97,17 +85,14 @@ class AnchorSource:
     def of(
         self, frame: Frame, T_world_cam: NDArray[np.float64], predicted: Predicted, truth: NDArray[np.float32] | None
     ) -> tuple[Landmarks, Anchors | None, float | None]:
-        """The landmarks of the next frame, the same as anchors, and the time that they took [ms].
+        """The landmarks of the next frame, in the pixels of the image (of ground truth: of the depth map); the same as
+        anchors [1, N] in the pixels of the depth map, None without an image; and the time that they took [ms].
 
         Args:
             frame: its image is tracked in.
             T_world_cam: [4, 4] the pose that the row sees [m].
             predicted: has the camera of the anchors' pixels.
             truth: [h, w] ground truth at its pixels [m], 0 = none, or None.
-
-        Returns:
-            The landmarks in the pixels of the image (of ground truth, in those of the depth map); anchors [1, N] in the
-            pixels of the depth map, None without an image to track in; None for the time if nothing was tracked.
         """
         device, K = predicted.maps.depth.device, predicted.intrinsics[0]
         if self.tracks is None:
@@ -123,15 +108,13 @@ class AnchorSource:
 
     def _sampled(self, truth: NDArray[np.float32], index: int) -> Landmarks:
         v, u = np.nonzero(truth > 0)
-        count = TRUTH_COUNT if self._setting.anchor_count is None else self._setting.anchor_count
-        chosen = self._drawn(index, _TAKEN).permutation(len(v))[:count]
-        depth = truth[v[chosen], u[chosen]].astype(np.float64)
-        pixel = np.stack([u[chosen], v[chosen]], axis=-1).astype(np.float64)
-        return Landmarks(pixel, depth, np.square(TRUTH_SIGMA * depth), tracked=0, none="no ground truth")
+        depth, pixel = truth[v, u].astype(np.float64), np.stack([u, v], axis=-1).astype(np.float64)
+        every = Landmarks(pixel, depth, np.square(TRUTH_SIGMA * depth), tracked=0, none="no ground truth")
+        return self._thinned(every, index, TRUTH_COUNT)
 
     def _disturbed(self, landmarks: Landmarks, index: int) -> Landmarks:
         size = self._setting.track_noise
-        if not size or self.tracks is None:
+        if not size:
             return landmarks
         drawn = size * self._drawn(index, _NOISE).standard_normal((len(landmarks.depth), 3))
         of_one_pixel = np.sqrt(landmarks.variance) / TrackerConfig.pixel_noise
@@ -139,8 +122,8 @@ class AnchorSource:
             landmarks, pixel=landmarks.pixel + drawn[:, :2], depth=landmarks.depth + of_one_pixel * drawn[:, 2]
         )
 
-    def _thinned(self, landmarks: Landmarks, index: int) -> Landmarks:
-        count = self._setting.anchor_count
+    def _thinned(self, landmarks: Landmarks, index: int, most: int | None = None) -> Landmarks:
+        count = most if self._setting.anchor_count is None else self._setting.anchor_count
         if count is None or len(landmarks.depth) <= count:
             return landmarks
         chosen = self._drawn(index, _TAKEN).permutation(len(landmarks.depth))[:count]
@@ -152,14 +135,9 @@ class AnchorSource:
 
 
 def landmarks_of(value: str | bool, folder: Path | None, scale: float = 1.0) -> LandmarkSource:
-    """The source of landmarks of a sequence; True means "corners", other values are as
-    ``landmark_source`` takes them. A file of landmarks lies in the sequence's folder or the working folder; its lengths
-    are in the unit of the recording's poses, of ``scale`` metres.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no source of that name, or no file of landmarks.
-    """
+    """The source of landmarks of a sequence; True means corners, other values are as ``landmark_source`` takes them. A
+    file lies in the sequence's folder or the working folder; its lengths are in the unit of the poses, of ``scale``
+    metres. Raises FileNotFoundError, ValueError, as ``landmark_source``."""
     word = CORNERS if value is True else str(value)
     is_file = Path(word).suffix.lower() in FILE_TYPES
     source = landmark_source(resolve(folder or Path(), word) if is_file else word)
@@ -169,16 +147,15 @@ def landmarks_of(value: str | bool, folder: Path | None, scale: float = 1.0) -> 
 
 
 def landmark_digests(rows: Iterable[Row], folder: Path | None, scale: float = 1.0) -> dict[str, str]:
-    """Digests of the landmarks of those rows that have them from a file, by the rows' slugs. Raises FileNotFoundError,
-    ValueError, as :func:`landmarks_of`."""
+    """Digests of the landmarks of rows that have them from a file, by slug. Errors as :func:`landmarks_of`."""
     files = {row.slug: row.setting.anchors for row in rows if row.setting.anchors not in ("", CORNERS, DENSE, TRUTH)}
     identities = {file: landmarks_of(file, folder, scale).identity for file in set(files.values())}
     return {slug: identities[file]["landmarks"] for slug, file in files.items() if "landmarks" in identities[file]}
 
 
 def anchor_sources(rows: Iterable[Row], folder: Path | None = None, scale: float = 1.0) -> dict[Row, AnchorSource]:
-    """The source of every row with anchors; rows of the same images and poses share a tracker. Raises
-    FileNotFoundError, ValueError, as :func:`landmarks_of`."""
+    """The source of every row with anchors; rows of the same images and poses share a tracker. Errors as
+    :func:`landmarks_of`."""
     tracks: dict[tuple[object, ...], Tracks] = {}
     sources = {}
     for row in rows:

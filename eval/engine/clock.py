@@ -10,11 +10,7 @@ import torch
 
 
 class StageTimer:
-    """Milliseconds per named stage since the last :meth:`take`. On an accelerator, its work is waited for.
-
-    Args:
-        device: whose work belongs to the stages.
-    """
+    """Milliseconds per named stage since the last :meth:`take`. The work of the ``device`` is waited for."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device

@@ -42,15 +42,12 @@ class Estimator(ABC):
 
     @abstractmethod
     def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
-        """Process the next frame.
+        """Process the next frame: "depth", "variance", "valid" and others of ``RowResult``.
 
         Args:
             predicted: maps on the estimator's device.
             T_world_cam: [4, 4] float64 camera-to-world [m], on the CPU.
             anchors: [1, N] of the frame in the map's pixels; None = none.
-
-        Returns:
-            "depth", "variance", "valid" and others of ``RowResult``.
         """
 
     def memory(self) -> dict[str, float]:
@@ -63,22 +60,15 @@ class Estimator(ABC):
         return dict(self.module.state_dict())
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken; raises ValueError for that of another kind of estimator."""
-        result = self.module.load_state_dict(dict(state), strict=False)
-        if result.missing_keys or result.unexpected_keys:
-            raise ValueError(f"the saved state lacks {result.missing_keys} and has {result.unexpected_keys} too many")
+        """Continue where ``state`` was taken. Raises RuntimeError: it is that of another kind of estimator."""
+        self.module.load_state_dict(dict(state))
 
 
 def make_estimator(
     row: Row, device: torch.device, source: DepthSource | None = None, own: Mapping[str, Any] = MappingProxyType({})
 ) -> Estimator:
-    """The estimator of a row, in its initial state.
-
-    Args:
-        row: method and setting.
-        device: where it runs.
-        source: of its depth, which states a largest depth and a confidence; None: neither.
-        own: methods of one's own (``sequences.plugins``), by name.
+    """The estimator of a row on a device, in its initial state. ``source`` states a largest depth and a confidence;
+    ``own`` are methods of one's own (``sequences.plugins``), by name.
 
     Raises:
         ValueError: a recalibration that was fitted under other settings, or no method of that name.
@@ -104,10 +94,8 @@ def ufm_star_config(row: Row) -> UfMStarConfig:
     """The settings of a row's UfM*.
 
     "fixed-param" is the paper's run on 518 x 518 images with "the same hyperparameters used for 224 x 224 inputs". Ours
-    are stated for 224 x 224 and follow the image (``SPGFConfig.scaled_to``), so it takes them literally: areas, lengths
-    and rows in pixels are not scaled, and the threshold a z^2 / f has the image's own focal length, where scaling keeps
-    a / f. Segments are then smaller and more. Thresholds in metres, overlaps and radii are alike in both. At 224 x 224
-    only the second part makes a difference, as far as the focal length is not 200 px.
+    follow the image (``SPGFConfig.scaled_to``), so it takes them literally: areas, lengths and rows in pixels are not
+    scaled, and the threshold a z^2 / f has the image's own focal length. Segments are then smaller and more.
     """
     config = configured(row.setting).replace(on_bad_frame="skip")
     return config.replace(segment=replace(config.segment, scale_with_image=False)) if row.method.fixed_param else config
@@ -154,15 +142,7 @@ class Pointwise(Estimator):
 
 
 class Gaussians(Estimator):
-    """UfM*.
-
-    Args:
-        config: its settings.
-        device: of the mixture.
-        setting: of the row: whether it answers with the posterior.
-        uses_variances: False leaves A and E aside.
-        recalibration: of the variance; None = as it is.
-    """
+    """UfM*; ``setting`` is the row's: whether it answers with the posterior."""
 
     def __init__(
         self,

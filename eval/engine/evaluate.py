@@ -1,8 +1,7 @@
 """Evaluates many rows on a sequence in one stream: every network sees a frame once, every row the same frames.
 
-A frame that one row cannot use (its file is broken, its pose is not rigid, a network has nothing to predict from) is
-left out for all rows; otherwise their tables could not be compared. Each row is judged on the pixels that have ground
-truth and a prediction of that row; ``left_out_share`` is the share of pixels without a prediction.
+A frame that one row cannot use is left out for all rows; otherwise their tables could not be compared. Each row is
+judged on the pixels that have ground truth and a prediction of that row; ``left_out_share`` is the share of the rest.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.estimators import make_estimator
-from ufmstar_torch.eval.engine.judge import RowFigures, RowJudge, RowJudges, SequenceError, references
-from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionStore
+from ufmstar_torch.eval.engine.judge import RowFigures, RowJudge, SequenceError, references
+from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionCache
 from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream
@@ -44,7 +43,7 @@ class Judge:
 
     networks: Mapping[str, DepthSource]  # by base
     device: torch.device  # where UfM and UfM* run
-    store: PredictionStore | None = None  # of predictions; None = all are computed
+    store: PredictionCache | None = None  # of predictions; None = all are computed
     limit: slice = field(default_factory=lambda: slice(None))  # which frames, before a setting's skip
     bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
     plugins: Plugins = field(default_factory=Plugins)  # methods and metrics of one's own
@@ -59,24 +58,16 @@ def evaluate_sequence(
     progress: Callable[[Progress], object] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> list[RowFigures]:
-    """Judge every row on the frames of a sequence.
+    """Judge every row on the frames of a posed sequence with ground truth; a result for each row, in their order.
 
     Args:
-        sequence: posed frames with ground truth.
-        rows: different ones.
-        judge: networks, device and metrics.
+        sequence, rows, judge: see above.
         sinks: receive the frames after the metrics; a row's key is its slug.
-        progress: called at the start and after every frame.
-        stop: called before every frame.
-
-    Returns:
-        A result for each row, in their order.
+        progress, stop: called at the start and after every frame; called before every frame.
 
     Raises:
         SequenceError: the sequence cannot be judged.
-        ValueError: no row, one of them twice, a base without a network, an override that UfM* does not know, or
-            preprocessing of maps that exist already.
-        FrameError, RuntimeError, ValueError: what readers and networks raise.
+        FrameError, RuntimeError, ValueError: rows that cannot be judged at all, or what readers and networks raise.
         Stopped: ``stop`` returned True.
     """
     indices = range(len(sequence))[judge.limit]
@@ -84,25 +75,25 @@ def evaluate_sequence(
     expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
     sources = {(base, how): judge.networks[base].prepared(how) for base, how in expected}
     anchors = anchor_sources(rows, sequence.folder, sequence.pose_scale)
-    runners, judges = [], {}
+    runners, judges = [], []
     for row in rows:
         source = sources[row.method.base, row.setting.preprocess]
         estimator = make_estimator(row, judge.device, source, judge.plugins.methods)
         how: dict[str, Any] = {"every": row.method.every_member, "setting": row.setting, "device": judge.device}
         runners.append(RowRunner(row.slug, source, estimator, anchors=anchors.get(row), **how))
         named = {other.slug: other.method.name for other in references(row, rows)}
-        judges[row.slug] = RowJudge(row, named, judge.bins, judge.plugins.metrics)
+        judges.append(RowJudge(row, named, judge.bins, judge.plugins.metrics))
     tracked = any(row.setting.anchors in (CORNERS, DENSE) for row in rows)
     check = partial(_check_frame, sources=sources.values(), tracked=tracked)
     stream = FrameStream(sequence, indices, runners, store=judge.store, device=judge.device, check=check)
-    stream.drive([RowJudges(judges), *sinks, ProgressSink(progress)], stop=stop)
+    stream.drive([*judges, *sinks, ProgressSink(progress)], stop=stop)
     opened = dict(sorted(Counter(skipped.reason for skipped in sequence.skipped).items()))
-    figures = [judges[row.slug].figures() for row in rows]
+    figures = [one.figures() for one in judges]
     return [replace(one, frames={**one.frames, "left_out_on_opening": opened}) for one in figures]
 
 
 def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) -> None:
-    """Raises FrameError unless all sources and UfM* can use a frame, in whose image anchors may be ``tracked``."""
+    """Raises FrameError unless all sources, UfM* and, where anchors are ``tracked``, a tracker can use a frame."""
     if frame.image is None and (tracked or any(source.needs_image for source in sources)):
         raise FrameError(frame.name, "no image")
     if frame.depth is None and not all(source.needs_image for source in sources):
@@ -117,8 +108,7 @@ def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) 
 
 
 def _check(sequence: FrameSequence, rows: Sequence[Row], indices: range, networks: Mapping[str, DepthSource]) -> None:
-    """Raises ValueError for rows that cannot be judged on any sequence, and SequenceError where no frame of this one
-    can be judged, or the poses that rows compare views by are not known."""
+    """Raises ValueError for rows that cannot be judged on any sequence, SequenceError for those on this one."""
     if not rows or len({row.slug for row in rows}) < len(rows):
         raise ValueError(f"rows must be one or more different ones, got {[row.label for row in rows]}")
     missing = sorted({row.method.base for row in rows} - networks.keys())

@@ -1,8 +1,8 @@
 """Figures against ground truth, as sinks of a stream: of a run, and of the rows of an evaluation.
 
 For the figure of NLL by error, the paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is
-confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, the half of the
-reference's pixels with the smallest variance in every frame. All rows on the same frames are judged on the same pixels.
+confident. Which these are it leaves open; here, the half of the reference's pixels with the smallest variance in every
+frame (``RowResult.confident``). All rows on the same frames are judged on the same pixels.
 """
 
 from __future__ import annotations
@@ -51,9 +51,8 @@ def metrics_of(metrics: dict[str, SequenceMetrics], key: str, **how: Any) -> Seq
 
 
 class RunMetrics(FrameSink):
-    """The figures of a run's row, ``UFM``, beside them those of its network alone, ``ALONE``, and of its ``POSTERIOR``.
-    All are of the pixels that the row uses; the others are masked. ``sums`` are those of an earlier part of the run.
-    Its time is added to ``FrameResult.ms`` as "metrics" [ms]."""
+    """The figures of a run's row, ``UFM``, of its network ``ALONE``, and of its ``POSTERIOR``, on the pixels that the
+    row uses. ``sums`` are those of an earlier part of the run. Adds its time to ``FrameResult.ms`` as "metrics"."""
 
     def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]], own: Own = NONE) -> None:
         self._key, self._own = key, own
@@ -62,7 +61,7 @@ class RunMetrics(FrameSink):
             metrics_of(self._metrics, name, own=own).load_state_dict(dict(state))
 
     def sums(self) -> dict[str, dict[str, Tensor]]:
-        """The sums by name. Updates exchange them and never change them in place."""
+        """The sums by name. Updates replace them and never change them in place."""
         return {name: metrics.sums() for name, metrics in self._metrics.items()}
 
     def figures(self) -> dict[str, dict[str, float]]:
@@ -106,33 +105,36 @@ class RowFigures:
     sums: dict[str, dict[str, Tensor]]
 
 
-class RowJudge:
+class RowJudge(FrameSink):
     """Collects counts, metrics, times and memory of one row over a sequence; ``named`` are the references by whose
     confident pixels its NLL is binned by error: their names by key."""
 
     def __init__(self, row: Row, named: Mapping[str, str], bins: str, own: Own = NONE) -> None:
-        self.row, self.named, self._bins, self._own = row, named, bins, own
+        self.row, self._named, self._bins, self._own = row, named, bins, own
         self._metrics: dict[str, SequenceMetrics] = {}
         self._by_error: dict[str, NLLByError] = {}
         self._samples: list[Tensor] = []
-        self._judged, self.reasons, self._idle = 0, Counter[str](), Counter[str]()
+        self._judged, self._reasons, self._idle = 0, Counter[str](), Counter[str]()
         self._ms: list[Mapping[str, float]] = []
         self._memory: list[Mapping[str, float]] = []
 
-    def add(self, result: RowResult, memory: Mapping[str, float], masks: Mapping[str, Tensor]) -> None:
-        """Add a frame. Pixels that the row leaves out are NaN, not masked, so that the metrics count them.
+    def begin(self, stream: FrameStream) -> None:
+        self._runner = next(row for row in stream.rows if row.key == self.row.slug)
 
-        Args:
-            result: of this row.
-            memory: of the row after the frame.
-            masks: confident pixels by reference.
-        """
+    def take(self, result: FrameResult) -> None:
+        """Add a frame. Pixels that the row leaves out are NaN, not masked, so that the metrics count them."""
+        if self.row.slug in result.skipped:
+            self._reasons[result.skipped[self.row.slug]] += 1
+        if self.row.slug in result.rows:
+            self._add(result.rows[self.row.slug], result.rows)
+
+    def _add(self, result: RowResult, rows: Mapping[str, RowResult]) -> None:
         if result.statistics is not None:
             segments, matched = (int(count[0]) for count in (result.statistics.segments, result.statistics.matched))
             # The first frame has nothing to match.
             self._idle.update(without_segment=int(not segments), without_match=int(bool(self._ms) and not matched))
         self._ms.append(result.ms)
-        self._memory.append(memory)
+        self._memory.append(self._runner.memory())
         if result.truth is None:
             return
         from ufmstar_torch.eval.metrics import NLLByError
@@ -148,13 +150,13 @@ class RowJudge:
             return
         if result.confidence is not None:
             self._samples.append(_samples(result.confidence, depth, variance, target))
-        for other, name in self.named.items():
+        for other, name in self._named.items():
             by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
-            by_error.update(depth, variance, target, masks[other])
+            by_error.update(depth, variance, target, rows[other].confident)
 
     def figures(self) -> RowFigures:
         """The figures after the last frame. Raises SequenceError: no frame was judged."""
-        reasons, done, skipped = dict(sorted(self.reasons.items())), len(self._ms), self.reasons.total()
+        reasons, done, skipped = dict(sorted(self._reasons.items())), len(self._ms), self._reasons.total()
         if not self._judged:
             worst = "; ".join(f"{count} x {reason}" for reason, count in list(reasons.items())[:3])
             raise SequenceError(f"no frame could be judged: {worst or 'none of those that were read has ground truth'}")
@@ -192,26 +194,6 @@ class RowJudge:
         return state
 
 
-class RowJudges(FrameSink):
-    """Judges every row of an evaluation, by key."""
-
-    def __init__(self, judges: Mapping[str, RowJudge]) -> None:
-        self._judges = judges
-
-    def begin(self, stream: FrameStream) -> None:
-        self._rows = {row.key: row for row in stream.rows}
-
-    def take(self, result: FrameResult) -> None:
-        """Add a frame."""
-        for key, reason in result.skipped.items():
-            self._judges[key].reasons[reason] += 1
-        judged = [key for key, row in result.rows.items() if row.truth is not None]
-        expected = {other for key in judged for other in self._judges[key].named}
-        masks = {other: confident_pixels(result.rows[other]) for other in expected}
-        for key, row in result.rows.items():
-            self._judges[key].add(row, self._rows[key].memory(), masks)
-
-
 def _samples(confidence: Tensor, depth: Tensor, variance: Tensor, target: Tensor) -> Tensor:
     """[n, 3] float64 confidence, variance [m^2] and squared error [m^2] at ``EACH`` of the pixels with all of them."""
     maps = torch.stack([confidence, variance, (target - depth).square()], -1).double()
@@ -220,10 +202,8 @@ def _samples(confidence: Tensor, depth: Tensor, variance: Tensor, target: Tensor
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:
-    """The rows by whose confidence a row is judged: its base alone, and behind UfM with the fewest points.
-
-    They are among ``rows`` and see the same frames. Of several settings, the row's own is preferred, then the default.
-    """
+    """The rows by whose confidence a row is judged, among ``rows`` that see the same frames: its base alone, and behind
+    UfM with the fewest points. Of several settings, the row's own is preferred, then the default."""
 
     def seen(other: Row) -> tuple[str, int, str]:  # from which frames, and which part of them
         return other.method.base, other.setting.skip, other.setting.preprocess
@@ -242,13 +222,3 @@ def references(row: Row, rows: Sequence[Row]) -> list[Row]:
                 min(kind, key=lambda other: (other.setting.pose_noise != row.setting.pose_noise, other.setting.slug))
             )
     return chosen
-
-
-def confident_pixels(row: RowResult) -> Tensor:
-    """[h, w] bool, True where there is ground truth and the variance is at or below the frame's median."""
-    assert row.variance is not None
-    assert row.truth is not None
-    judged = row.valid & torch.from_numpy(row.truth > 0)
-    if not judged.any():
-        return judged
-    return judged & (torch.where(judged, row.variance, torch.inf) <= row.variance[judged].median())

@@ -38,11 +38,9 @@ class NetworkChoice:
     """
 
     base: str  # a key of ``method.BASES``
-    # a name that ``load_network`` accepts, or "ground-truth" (of "depth_only": the sequence's own depth, which shows
-    # what a method makes of perfect depth).
-    model: str
-    # weights, one or several files, in the order of the members: "FILE#2" is member 2 of a file of "trained" alone, a
-    # file .json the spec that belongs to the weights; for "ground-truth" nothing, or "HxW".
+    model: str  # a name that ``load_network`` accepts, or "ground-truth": of "depth_only", the sequence's own depth
+    # Weights, in the order of the members: "FILE#2" is member 2 of a file of "trained" alone, a file .json the spec of
+    # the weights; for "ground-truth" nothing, or "HxW".
     files: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -99,19 +97,8 @@ class NetworkChoice:
     def load(
         self, device: torch.device, *, samples: int = SAMPLES, inference: Inference = _AS_USERS
     ) -> NetworkSource | MapSource:
-        """The depth source.
-
-        An ensemble's or BatchEnsemble's members take turns: image i is member i mod N's. MC-Dropout draws one sample
-        an image, or ``samples`` of them.
-
-        Args:
-            device: where networks run.
-            samples: MC-Dropout's, on every image of a row that needs all of them.
-            inference: runtime and precision.
-
-        Raises:
-            FileNotFoundError, ValueError: as :func:`load_members`, or as ``check_members``.
-        """
+        """The depth source on a device: an ensemble's or BatchEnsemble's members in turn; of MC-Dropout one sample an
+        image, or ``samples`` of them. Errors as :func:`load_members` and ``check_members``."""
         if self.model == TRUTH:
             return own_depth(self.size)
         try:
@@ -136,18 +123,10 @@ def network_source(
     inference: Inference = _AS_USERS,
     device: str = "cpu",
 ) -> NetworkSource:
-    """One network, or the members of an ensemble, from files, as ``ufmstar run`` runs them.
-
-    Args:
-        model, weights, spec, offload, inference, device: see :func:`load_members`.
-        mode: "alternate" (one member per image in turn) or "full" (all of them on every image, or ``samples``
-            passes of a network that samples).
-        samples: None: as many as the paper's baseline.
-
-    Raises:
-        FileNotFoundError, ValueError: as :func:`load_members`; mode "full" of one network that does not sample, or
-            ``samples`` for any other.
-    """
+    """One network, or the members of an ensemble, from files (:func:`load_members`), as ``ufmstar run`` runs them. Mode
+    is "alternate" (one member per image in turn) or "full" (all of them on every image, or ``samples`` passes of a
+    network that samples; None: as many as the paper's baseline). Raises FileNotFoundError, ValueError, also for mode
+    "full" of one network that does not sample, and ``samples`` for any other."""
     files, where = tuple(str(file) for file in weights), torch.device(device)
     members = load_members(model, files, spec=spec, offload=offload, inference=inference, device=where)
     alone = len(members) == 1 and mode == "full"
@@ -210,20 +189,18 @@ def load_members(
             of which FILE#2 is number 2, counted from 0.
         spec: declares what an ONNX file or saved program does not say.
         offload: of "trained": weights stay in host memory and come to the device for their turn only.
-        inference: runtime, precision and threads.
-        device: where they will run.
+        inference, device: how and where they will run.
 
     Raises:
         FileNotFoundError: a file is missing.
         ValueError: unknown model, files that do not fit it, members that want different inputs.
     """
     named = [(Path(path), member) for path, member in map(_path, files)]
-    of_files = [*([] if model in DIRECTORIES else [path for path, _ in named]), *([Path(spec)] if spec else [])]
     for path, _ in named if model in DIRECTORIES else ():
         if not path.is_dir():
             fetch = "`hf download NAME --local-dir DIR` fetches a checkpoint from the hub"
             raise FileNotFoundError(f"no such directory: {path}; {fetch}")
-    for path in of_files:
+    for path in (*(path for path, _ in named if model not in DIRECTORIES), *([Path(spec)] if spec else [])):
         if not path.is_file() and not (model == "monodepth2" and path.is_dir()):
             raise FileNotFoundError(f"no such file: {path}")
     members: list[DepthNetwork] = []
@@ -247,7 +224,7 @@ def load_members(
 
 
 def sha256(file: Path) -> str:
-    """Hex digest of a file's content; of a directory's files and their names, but for hidden ones (a download's)."""
+    """Hex digest of a file's content; of a directory's files and their names, but for hidden ones."""
     if file.is_dir():
         names = sorted(path.relative_to(file) for path in file.rglob("*") if path.is_file())
         shown = [name for name in names if not any(part.startswith(".") for part in name.parts)]
@@ -258,7 +235,7 @@ def sha256(file: Path) -> str:
 
 
 def _label(model: str, file: Path, network: DepthNetwork) -> str:
-    """ "FastDepth", "ResNet50-Monodepth2", "Depth Anything V2", or the name of the file with the (first) weights."""
+    """As tables show it: the name of the architecture, or of the file with the (first) weights."""
     if model == "trained":
         spec = read_info(file).spec
         if spec.module is not None:

@@ -74,15 +74,9 @@ def folder_source(
 ) -> MapSource:
     """Maps that another program predicted for the frames of a sequence (see :class:`DepthFolder`).
 
-    Without ``intrinsics``, the maps must show the whole image; theirs are then the image's, scaled by the
-    sizes' ratio. The output folder of a run brings its own intrinsics; a frame that the run skipped has no map.
-
-    Args:
-        sequence: the frames.
-        folder, scale, variance: as :class:`DepthFolder` takes them.
-        intrinsics: of the maps [px], where the network saw a part of the image.
-        size: see :class:`MapSource`.
-        indices: the frames whose maps are wanted; None = all.
+    Without ``intrinsics`` [px], the maps must show the whole image; theirs are then the image's, scaled by the sizes'
+    ratio. The output folder of a run brings its own; a frame that the run skipped has no map. ``indices`` are the
+    frames whose maps are wanted (None = all).
 
     Raises:
         NotADirectoryError: no such folder.

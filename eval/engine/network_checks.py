@@ -24,7 +24,7 @@ def without_sampling(network: DepthNetwork) -> DepthNetwork:
 
 
 def check_members(base: str, members: Sequence[DepthNetwork], device: torch.device) -> None:
-    """Try the networks of a base.
+    """Try the networks of a base. Raises ValueError: they do not deliver what it needs; the message names both.
 
     ============== =====================================================================
     ensemble       two members or more, each with an aleatoric variance
@@ -34,13 +34,13 @@ def check_members(base: str, members: Sequence[DepthNetwork], device: torch.devi
     aleatoric      one network, with an aleatoric variance and no epistemic one
     depth_only     one network; a variance is ignored
     ============== =====================================================================
-
-    Raises:
-        ValueError: they do not deliver that; the message names what they do deliver.
     """
     shared = [member for member in members if isinstance(member, BatchEnsembleMember)]
     if base == "batch_ensemble":
-        _require(len(shared) == len(members) > 1, base, "a file with a BatchEnsemble", _kinds(members))
+        kinds = ", ".join(sorted({type(member).__name__ for member in members}))
+        note = " (as one network; give the trained file itself)" if BatchEnsemble.__name__ in kinds.split(", ") else ""
+        several = f"{len(members)} of the kind {kinds}{note}"
+        _require(len(shared) == len(members) > 1, base, "a file with a BatchEnsemble", several)
         one = len({id(member.ensemble) for member in shared}) == 1
         _require(one, base, "one BatchEnsemble", "several of them")
     elif base == "ensemble":
@@ -57,8 +57,13 @@ def check_members(base: str, members: Sequence[DepthNetwork], device: torch.devi
         _require(bool(samples), base, "a network trained as mc_dropout, which samples", "one that does not")
     if base in ("depth_only", "mc_dropout"):
         return
+    height, width = _PROBE
+    K = torch.tensor([[[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]]], dtype=torch.float64)
     for member in members:
-        prediction = _tried(member, device)
+        with torch.no_grad():
+            grey = torch.full((1, 3, height, width), 128, dtype=torch.uint8, device=device)
+            x, K_member = member.preprocess(grey, K)
+            prediction: DepthPrediction = infer(member.to(device).eval(), x, K_member)
         has = prediction.aleatoric_variance is not None, prediction.epistemic_variance is not None
         got = {(True, True): "both variances", (True, False): "an aleatoric one", (False, True): "an epistemic one"}
         if base == "evidential":
@@ -66,22 +71,6 @@ def check_members(base: str, members: Sequence[DepthNetwork], device: torch.devi
         else:
             _require(has[0], base, "an aleatoric variance", got.get(has, "none"))
             _require(base != "aleatoric" or not has[1], base, "an aleatoric variance alone", "an epistemic one as well")
-
-
-def _tried(member: DepthNetwork, device: torch.device) -> DepthPrediction:
-    """Its prediction for a grey image."""
-    height, width = _PROBE
-    K = torch.tensor([[[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]]], dtype=torch.float64)
-    with torch.no_grad():
-        x, K = member.preprocess(torch.full((1, 3, height, width), 128, dtype=torch.uint8, device=device), K)
-        prediction: DepthPrediction = infer(member.to(device).eval(), x, K)
-    return prediction
-
-
-def _kinds(members: Sequence[DepthNetwork]) -> str:
-    kinds = sorted({type(member).__name__ for member in members})
-    note = " (as one network; give the trained file itself)" if BatchEnsemble.__name__ in kinds else ""
-    return f"{len(members)} of the kind {', '.join(kinds)}{note}"
 
 
 def _require(fulfilled: bool, base: str, wanted: str, got: str) -> None:

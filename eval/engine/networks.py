@@ -29,18 +29,11 @@ _SAMPLE_STRIDE = 1_000_003
 
 
 class NetworkSource(DepthSource):
-    """Depth from networks.
+    """Depth from networks, moved to ``device``; ``precision`` is as ``Inference.precision``, but predictions are of
+    single precision in any case.
 
     Where a network samples (decoder dropout), sample n of frame i is seeded by i and n, so that it is the same whatever
     ran before, on one process or many, in a run that continues or in one that does not.
-
-    Args:
-        networks: moved to ``device``.
-        device: where they run.
-        identity: plain values for the record of what was run.
-        precision: of the inference, as ``Inference.precision``; predictions are of single precision in any case.
-        label: as tables show it.
-        digest: distinguishes these networks from others in a store; "" = their predictions are not stored.
     """
 
     needs_image = True

@@ -1,23 +1,34 @@
-"""Predictions of depth sources for one frame; each inference runs once and may be cached on disk."""
+"""Predictions of depth sources for one frame; each inference runs once and may be cached on disk: in one npz for each
+network, frame and member, ``NETWORK/SEQUENCE/FRAME@MEMBER.npz``, with the maps in float32.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch.array_files import read_npz_whole
+from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction
 
 _SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
+# Names of the maps in a file, and in a ``DepthPrediction``.
+_MAPS = {
+    "depth": "depth",
+    "aleatoric": "aleatoric_variance",
+    "epistemic": "epistemic_variance",
+    "confidence": "confidence",
+}
 
 
 class Predicted(NamedTuple):
@@ -62,49 +73,85 @@ class DepthSource(ABC):
 
     @property
     def cacheable(self) -> bool:
-        """True if a store may keep its predictions. They are then of single precision, read or computed."""
+        """True if a store may keep its predictions, which are then of single precision, read or computed."""
         return self.needs_image and bool(self.digest)
 
     @property
     def runtime(self) -> Mapping[str, Any] | None:
-        """The runtime of the networks, for the record: name, version, threads, precision; None of maps."""
+        """Name, version, threads and precision of the networks' runtime, for the record; None of maps."""
         return None
 
     @abstractmethod
     def prepared(self, how: str) -> DepthSource:
-        """The same source with its images prepared by ``Setting.preprocess``; itself where that is no change. Raises
-        ValueError: there are no images to prepare."""
+        """The same source with its images prepared by ``Setting.preprocess``. Raises ValueError: it has no images."""
 
     def turn(self, position: int) -> int:
         """The member for the image that a row uses after ``position`` others; 0 for maps."""
         return 0
 
     def prepare(self, frame: Frame) -> None:
-        """Do ahead of :meth:`one`, in another thread, what can be done before a network runs."""
+        """In another thread, what can be done before a network runs."""
 
     @abstractmethod
     def one(self, frame: Frame, n: int) -> Predicted:
         """One timed inference, of member (or sample) n. Raises FrameError: the frame has nothing to predict from."""
 
 
-class PredictionStore(Protocol):
-    """Keeps predictions, so that a network sees an image once, however often the rows on it change. A prediction is
-    named by a ``path`` of networks, sequence, frame and member, and by a digest of the frame's ``content``."""
+class CacheError(Exception):
+    """The folder cannot be used; the message names it and the reason."""
+
+
+class PredictionCache:
+    """Predictions by a ``path`` of networks, sequence, frame and member, and a digest of the frame's ``content``.
+    Several processes may use one folder: a file is whole or absent, and all write the same into it.
+
+    Raises:
+        CacheError: the folder cannot be made or written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        # Tried by writing: permissions say nothing about file systems that are mounted read-only.
+        self._write(Path(".writable"), lambda opened: opened.write(b""))
 
     def load(self, path: Path, content: str, device: torch.device) -> Predicted | None:
-        """The prediction bit for bit as it was stored, or None where it has to be computed."""
-        ...
+        """The prediction bit for bit as it was stored, or None where it has to be made: there is no file, it belongs to
+        another image of that name, was cut off or changed, or cannot be read."""
+        try:
+            arrays = read_npz_whole(self.folder / path)
+        except (OSError, ValueError):
+            return None
+        if bytes(arrays.pop("content")).decode() != content:
+            return None
+        K = torch.from_numpy(arrays.pop("intrinsics"))
+        maps = {_MAPS[name]: torch.from_numpy(value)[None].to(device) for name, value in arrays.items()}
+        return Predicted(DepthPrediction(**maps), K[None])
 
     def store(self, path: Path, content: str, predicted: Predicted) -> None:
-        """Keep a prediction."""
-        ...
+        """Keep a prediction. Raises CacheError: it cannot be written."""
+        named = {name: getattr(predicted.maps, field) for name, field in _MAPS.items()}
+        arrays = {name: value[0].cpu().numpy() for name, value in named.items() if value is not None}
+        arrays["intrinsics"] = predicted.intrinsics[0].numpy()
+        arrays["content"] = np.frombuffer(content.encode(), np.uint8)
+        self._write(path, lambda opened: np.savez(opened, allow_pickle=False, **arrays))
+
+    def _write(self, path: Path, write: Callable[[BinaryIO], object]) -> None:
+        file = self.folder / path
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(file, write)
+        except OSError as error:
+            text = (
+                f"the cache of predictions cannot be written to {self.folder} ({error}): choose another folder, or none"
+            )
+            raise CacheError(text) from error
 
 
 class FramePredictions:
-    """The predictions for one frame, on a device: each is looked up in memory, then in the store (None = there is
-    none), then computed. ``sequence`` is the digest of the sequence."""
+    """The predictions for one frame, on a device: from memory, else from the store (None = there is none), else
+    computed. ``sequence`` is the digest of the sequence."""
 
-    def __init__(self, frame: Frame, device: torch.device, store: PredictionStore | None, sequence: str) -> None:
+    def __init__(self, frame: Frame, device: torch.device, store: PredictionCache | None, sequence: str) -> None:
         self.frame, self._device, self._store, self._sequence = frame, device, store, sequence
         self._content = "" if store is None else frame_digest(frame)
         # By source: predictions by member ("0", "1", ... or "all"), and single inferences.
@@ -125,26 +172,23 @@ class FramePredictions:
         if found is None:
             members = range(source.passes) if combined else [int(member)]
             made = [self._inference(source, n) for n in members]
-            found = _combined(made) if combined else made[0]
+            times = [one.ms for one in made if one.ms is not None]
+            found = made[0]
+            if combined:
+                ms = sum(times) if len(times) == len(made) else None
+                found = Predicted(combine([one.maps for one in made]), made[0].intrinsics, ms)
             if store is not None:
                 store.store(path, self._content, found)
         self._cached[key] = found
         return found
 
     def _inference(self, source: DepthSource, n: int) -> Predicted:
-        """Return the prediction of member (or sample) n; it is computed once and shared by all rows."""
+        """Member (or sample) n, computed once for all rows."""
         key = (source.digest or source, n)
         if key not in self._inferences:
             made = source.one(self.frame, n).to(self._device)
             self._inferences[key] = made.to(torch.float32) if source.cacheable else made
         return self._inferences[key]
-
-
-def _combined(made: Sequence[Predicted]) -> Predicted:
-    """The mixture of all members' or samples' predictions (see ``pipeline.combine``); the times are added."""
-    times = [one.ms for one in made if one.ms is not None]
-    ms = sum(times) if len(times) == len(made) else None
-    return Predicted(combine([one.maps for one in made]), made[0].intrinsics, ms)
 
 
 def sequence_digest(sequence: FrameSequence) -> str:

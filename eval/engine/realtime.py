@@ -17,11 +17,8 @@ _STATM = Path("/proc/self/statm")
 
 
 class RealTime:
-    """Times of the results of one ``LiveDepth``.
-
-    Args:
-        model: the model of the ``LiveDepth``. The time after its last inference on an image counts as UfM*'s.
-    """
+    """Times of the results of one ``LiveDepth``: the time after the last inference of its ``model`` on an image counts
+    as UfM*'s."""
 
     def __init__(self, model: UncertainDepth) -> None:
         self.latency, self.compute, self.network = array("d"), array("d"), array("d")  # [s]
@@ -49,8 +46,8 @@ class RealTime:
             self._memory = resident_bytes()
 
     def summary(self, statistics: LiveStatistics) -> dict[str, Any]:
-        """Summarise as plain values: counts, results per second, latencies and times [ms], and memory [bytes]. A value
-        without a measurement is None."""
+        """Plain values: counts, results per second, latencies and times [ms], and memory [bytes]; None where there is
+        no measurement."""
         compute, network = np.array(self.compute), np.array(self.network)
         now, seconds = resident_bytes(), self._last - self._first
         lost = sum(statistics.dropped.values()) + sum(statistics.skipped.values())
@@ -82,7 +79,7 @@ def _quantiles(seconds: np.ndarray) -> dict[str, float] | None:
 
 
 def resident_bytes() -> int | None:
-    """The resident memory of this process [bytes]; None on systems without /proc (other than Linux)."""
+    """The resident memory of this process [bytes]; None without /proc (on systems other than Linux)."""
     import resource
 
     return int(_STATM.read_text().split()[1]) * resource.getpagesize() if _STATM.exists() else None

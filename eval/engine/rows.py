@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -29,12 +30,10 @@ _IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drif
 class RowResult:
     """One row's result for a frame: its maps [h, w] on the CPU, its prediction and its anchors."""
 
-    depth: Tensor  # as predicted, or corrected by the anchors, where the row is about that [m]
-    # total variance [m^2], NaN where not valid; None for a network that predicts depth alone.
-    variance: Tensor | None
-    # bool, True where there is a prediction: depth is positive and finite, and so is every variance used.
-    valid: Tensor
-    # aleatoric, epistemic: A and E as far as the row uses them [m^2], or None.
+    depth: Tensor  # as predicted, or corrected by the anchors where the row does so [m]
+    variance: Tensor | None  # total [m^2], NaN where not valid; None of a network that predicts depth alone
+    valid: Tensor  # bool, True where depth is positive and finite, and so is every variance used
+    # A and E as far as the row uses them [m^2], or None.
     aleatoric: Tensor | None = None
     epistemic: Tensor | None = None
     disagreement: Tensor | None = None  # M of UfM* [m^2], or None
@@ -49,8 +48,7 @@ class RowResult:
     confidence: Tensor | None = None  # of the prediction, in its own unit, where UfM* had it; or None
     network_variance: Tensor | None  # A + E of the prediction, whatever the row uses [m^2]; None if it states neither
     intrinsics: NDArray[np.float64]  # [3, 3] of the maps [px]
-    # [h, w] ground truth at the maps' pixels [m], 0 = none; None without a depth map.
-    truth: NDArray[np.float32] | None
+    truth: NDArray[np.float32] | None  # [h, w] ground truth at the maps' pixels [m], 0 = none; None without a depth map
     T_world_cam: NDArray[np.float64]  # [4, 4] the pose as the row sees it [m]
     member: int | None  # which network predicted; None where all did, and of maps
     landmarks: Landmarks | None  # of the frame, behind its anchors; None of a row without anchors
@@ -68,23 +66,28 @@ class RowResult:
         """(h, w)."""
         return self.depth.shape[0], self.depth.shape[1]
 
+    @cached_property
+    def confident(self) -> Tensor:
+        """[h, w] bool, True where there is ground truth and the variance is at or below the frame's median."""
+        assert self.variance is not None
+        assert self.truth is not None
+        judged = self.valid & torch.from_numpy(self.truth > 0)
+        if not judged.any():
+            return judged
+        return judged & (torch.where(judged, self.variance, torch.inf) <= self.variance[judged].median())
+
 
 class RowRunner:
-    """A row in the middle of a sequence.
+    """A row in the middle of a sequence, after ``images`` that its estimator was given.
 
     Args:
         key: its name, unique in its stream.
         source: of its depth.
-        estimator: of its variance, in its initial state.
+        estimator: of its variance, in its initial state, on ``device``.
         every: all members (or samples) predict on every image, instead of one in turn.
         setting: which images it leaves out, and how poses and anchors are disturbed.
         anchors: None = it has none.
-        skips_faults: the estimator decides by its own config whether pose and intrinsics can be used. A frame that it
-            refuses is skipped, and counts as an image for the turns all the same.
-        device: of the estimator, whose work is timed.
-
-    Attributes:
-        images: that the estimator was given so far.
+        skips_faults: skip frames whose pose or intrinsics the estimator refuses; they count as images for the turns.
     """
 
     def __init__(
@@ -107,12 +110,8 @@ class RowRunner:
         self._drift = Drift(setting)
 
     def update(self, frame: Frame, predicted: Predicted, truth: NDArray[np.float32] | None) -> RowResult:
-        """Process the next frame. Its ground truth [h, w] is only for anchors that are drawn from it.
-
-        Raises:
-            FrameError: the estimator refuses the pose or the intrinsics, and the row skips such frames.
-            RuntimeError, ValueError: as the estimator.
-        """
+        """Process the next frame. Its ground truth [h, w] is only for anchors that are drawn from it. Raises
+        FrameError: the row skips frames with faults, and the pose or the intrinsics have one."""
         T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
         landmarks, anchors, tracking_ms = (
             (None, None, None) if self.anchors is None else self.anchors.of(frame, T, predicted, truth)
@@ -140,14 +139,14 @@ class RowRunner:
         )
 
     def memory(self) -> dict[str, float]:
-        """Size of the state as ``Estimator.memory`` has it, with the bytes behind the anchors: tracks or evidence."""
+        """``Estimator.memory``, with the bytes behind the anchors: tracks or evidence."""
         memory = self.estimator.memory()
         if self._tracks is not None:
             memory["bytes"] += sum(value.nbytes for value in self._tracks.state().values())
         return memory
 
     def state(self) -> dict[str, Tensor]:
-        """All tensors on which the next frame depends, networks left aside: they remember nothing."""
+        """All tensors on which the next frame depends; networks remember nothing."""
         anchors = {} if self._tracks is None else self._tracks.state()
         parts = ((_ESTIMATOR, self.estimator.state()), (_TRACKER, anchors), (_DRIFT, self._drift.state()))
         tensors = {prefix + name: value for prefix, state in parts for name, value in state.items()}

@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
 
@@ -17,8 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.clock import StageTimer
-from ufmstar_torch.eval.engine.predictions import FramePredictions, Predicted, PredictionStore, sequence_digest
-from ufmstar_torch.eval.engine.prefetch import prefetch
+from ufmstar_torch.eval.engine.predictions import FramePredictions, Predicted, PredictionCache, sequence_digest
 from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
 from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
@@ -31,17 +31,17 @@ class Stopped(Exception):
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """The result of one frame."""
+    """The result of one frame. ``skipped`` is why a row that selects the frame cannot use it, ``state`` the stream's
+    after the frame, for sinks in a ``WriterThread``. ``ms`` has "read" (time spent waiting: frames are read ahead),
+    "predict" and "truth" [ms]; sinks may add their own."""
 
     number: int  # of the frame among those that the stream selects, from 0
     index: int  # of the frame in its sequence
     name: str  # of the frame
     frame: Frame | None = None  # as it was read; None where no row selects it, or it cannot be used
     rows: Mapping[str, RowResult] = field(default_factory=dict)  # by key, of the rows that used it
-    skipped: Mapping[str, str] = field(default_factory=dict)  # by key, why a row that selects the frame cannot use it
-    # "read" (time spent waiting: frames are read ahead), "predict" and "truth" [ms]; sinks may add their own.
+    skipped: Mapping[str, str] = field(default_factory=dict)  # by key
     ms: dict[str, float] = field(default_factory=dict)
-    # ``FrameStream.state`` after the frame, for sinks in a ``WriterThread``; else empty.
     state: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
 
 
@@ -60,10 +60,8 @@ class FrameSink(ABC):
 
 
 class FrameStream:
-    """The frames of a sequence, passed through rows.
-
-    A frame that no row selects is not decoded. A frame that cannot be read or predicted from is skipped by all rows
-    that select it, and counts for none of them.
+    """The frames of a sequence, passed through rows. A frame that no row selects is not decoded. One that cannot be
+    read or predicted from is skipped by all rows that select it, and counts for none of them.
 
     Args:
         sequence: posed frames.
@@ -72,10 +70,7 @@ class FrameStream:
         store: of predictions; None = every prediction is computed.
         device: of the rows' estimators, where they want their maps.
         check: raises ``FrameError`` for a frame that no row is to use.
-        start: position in ``indices`` to begin at; the rows are in the state of that moment.
-
-    Attributes:
-        position: number of finished frames, skipped ones included.
+        start: number of frames that are finished, skipped ones included (``position``); the rows are in that state.
     """
 
     def __init__(
@@ -84,7 +79,7 @@ class FrameStream:
         indices: Sequence[int],
         rows: Sequence[RowRunner],
         *,
-        store: PredictionStore | None = None,
+        store: PredictionCache | None = None,
         device: torch.device | None = None,
         check: Callable[[Frame], None] | None = None,
         start: int = 0,
@@ -99,11 +94,8 @@ class FrameStream:
         self.position = start
 
     def drive(self, sinks: Sequence[FrameSink], *, stop: Callable[[], bool] = lambda: False) -> None:
-        """Process the frames that are left, and hand each one's result to the sinks in their order.
-
-        Args:
-            sinks: receive the results.
-            stop: called before every frame.
+        """Process the frames that are left, and hand each one's result to the sinks in their order. ``stop`` is called
+        before every frame.
 
         Raises:
             Stopped: ``stop`` returned True.
@@ -164,19 +156,17 @@ class FrameStream:
         return [self.indices[n] for n in left if not self.rows or any(selects(row.setting, n) for row in self.rows)]
 
     def _prepare(self, frame: Frame) -> None:
-        """Compute the networks' input in the thread that reads ahead, unless a store may have all predictions.
-
-        Only where torch computes with one thread. With more, torch's operations in this thread would start a second
-        team of OpenMP threads, beside which the first one no longer spins: networks took three times as long.
-        """
+        """Compute the networks' input in the thread that reads ahead, unless a store may have all predictions. Only
+        where torch computes with one thread: this thread would start a second team of OpenMP threads, beside which the
+        first one no longer spins, and networks took three times as long."""
         if self._store is None and torch.get_num_threads() == 1:
             for row in self.rows:
                 row.source.prepare(frame)
 
 
 def _truths(frame: Frame, predictions: Mapping[str, Predicted]) -> dict[str, NDArray[np.float32] | None]:
-    """Ground truth at the pixels of every row's maps, [h, w] [m], 0 = none; once for every camera. Raises FrameError:
-    the depth map has no camera."""
+    """Ground truth at the pixels of every row's maps, once for every camera. Raises FrameError: the depth map has
+    none."""
     computed: dict[tuple[object, ...], NDArray[np.float32] | None] = {}
     truths = {}
     for key, predicted in predictions.items():
@@ -186,3 +176,28 @@ def _truths(frame: Frame, predictions: Mapping[str, Predicted]) -> dict[str, NDA
             computed[camera] = truth_at(frame, K, predicted.size)
         truths[key] = computed[camera]
     return truths
+
+
+_AHEAD = 2  # frames; decoding releases Python's lock
+
+
+def prefetch(
+    sequence: FrameSequence, indices: Iterable[int], prepare: Callable[[Frame], None] = lambda _: None
+) -> Generator[Future[Frame]]:
+    """The frames of a sequence at some indices, in order, read by one thread that is at most two frames ahead and calls
+    ``prepare`` with each. A frame's ``result()`` raises FrameError if it cannot be read. Closing it ends the thread."""
+
+    def read(index: int) -> Frame:
+        frame = sequence[index]
+        prepare(frame)
+        return frame
+
+    thread, reading = ThreadPoolExecutor(1), deque[Future[Frame]]()
+    try:
+        for index in indices:
+            reading.append(thread.submit(read, index))
+            if len(reading) > _AHEAD:
+                yield reading.popleft()
+        yield from reading
+    finally:
+        thread.shutdown(cancel_futures=True)

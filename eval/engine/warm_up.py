@@ -9,7 +9,7 @@ import torch
 
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.ufmstar import UfMStar
 from ufmstar_torch.warm_up import warm_up
 
@@ -18,27 +18,11 @@ _STEP, _FRAMES = 4, 8  # the wall moves by so many pixels a frame
 
 
 def warm_up_command(
-    config: UfMStarConfig,
-    device: torch.device,
-    progress: Callable[[int, int], object],
-    *,
-    dense: bool = False,
+    config: UfMStarConfig, device: torch.device, show: Callable[[Progress], object], *, dense: bool = False
 ) -> None:
-    """Compile UfM*, the metrics and what else is asked for, or load it from disk.
-
-    Args:
-        config, device: of UfM*.
-        progress: as ``UfMStar.warm_up`` takes it.
-        dense: anchors are :class:`DenseEvidence`.
-    """
-    also = [metrics, *([dense_anchors] if dense else [])]
-    warm_up(UfMStar(config, device=device), (32, 32), 1, progress, also)
-
-
-def metrics() -> None:
-    """The metrics of single-precision maps."""
-    maps = torch.ones(1, 8, 8)
-    SequenceMetrics().update(maps, maps, maps)
+    """Compile UfM* and, if ``dense``, the search of :class:`DenseEvidence`, or load them from disk."""
+    also, ufm = [dense_anchors] if dense else [], UfMStar(config, device=device)
+    warm_up(ufm, (32, 32), 1, lambda done, total: show(Progress("kernels", done, total)), also)
 
 
 def dense_anchors() -> None:

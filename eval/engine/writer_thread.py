@@ -20,12 +20,9 @@ _WAITING = 4
 class WriterThread(FrameSink):
     """A sink that hands the results to other sinks in a thread of its own, with the stream's state after each frame.
 
-    Use it as a context: at the end of the block, whatever ended it, all results taken have gone through the sinks. The
-    error of a sink is raised in the loop, at the next frame or at the end; no later frame comes to a sink then.
-
-    Args:
-        sinks: called in their order, one frame after the other. ``FrameResult.ms`` has "cycle", the time since the
-            frame before [ms]: of the whole loop, waiting for these sinks included.
+    Use it as a context: at its end all results taken have gone through the sinks, in their order. The error of a sink
+    is raised in the loop, at the next frame or at the end; no later frame comes to a sink then.
+    ``FrameResult.ms`` gets "cycle", the time since the frame before [ms], waiting for these sinks included.
     """
 
     def __init__(self, sinks: Sequence[FrameSink]) -> None:
@@ -51,8 +48,7 @@ class WriterThread(FrameSink):
         self._last = perf_counter()
 
     def take(self, result: FrameResult) -> None:
-        """Queue a frame; waits where the sinks are too far behind. Raises BaseException: what a sink raised for an
-        earlier frame."""
+        """Queue a frame; waits where the sinks are too far behind. Raises what a sink raised for an earlier frame."""
         self._wait(_WAITING)
         rows = self._stream.state().items()
         state = {key: {name: value.clone() for name, value in own.items()} for key, own in rows}
@@ -67,7 +63,7 @@ class WriterThread(FrameSink):
             sink.end()
 
     def _wait(self, most: int) -> None:
-        """Wait until at most ``most`` frames are queued; frames that are done leave the queue and raise their error."""
+        """Wait until at most ``most`` frames are queued; those that are done raise their error."""
         while self._waiting and (len(self._waiting) > most or self._waiting[0].done()):
             self._waiting.popleft().result()
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.methods.method import UFM_STAR, Method
-from ufmstar_torch.eval.methods.setting import CORNERS, DEFAULT, Setting, configured
+from ufmstar_torch.eval.methods.setting import CORNERS, DEFAULT, Setting, configured, setting_from
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,12 @@ class Row:
         """The row as plain values, as eval.json has it."""
         named = {"label": self.title} if self.title else {}
         return {"method": self.method.name, "setting": self.setting.to_dict(), **named}
+
+
+def row_from(values: Mapping[str, Any]) -> Row:
+    """The inverse of :meth:`Row.to_dict`. Raises KeyError, TypeError, ValueError: there is no such row."""
+    setting = setting_from(values.get("setting", {}))
+    return Row(Method.parse(values["method"]), setting, str(values.get("label", "")))
 
 
 def plain_rows(rows: Iterable[Row]) -> list[Row]:

@@ -41,6 +41,7 @@ _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
 _KEYS = {
     "name": str, "title": str, "base": str, "bases": list, "include": list, "rows": list, "efficiency": bool,
 }  # fmt: skip
+_WORDS = ("bases", "include", "methods")
 _ROW_KEYS = {"methods": list, "bases": list, "setting": dict, "each": dict, "label": str}
 
 
@@ -141,8 +142,6 @@ def _read(name: str) -> dict[str, Any]:
     """The content of a suite's file, its keys and bases checked."""
     values = tomllib.loads(_file(name).read_text(encoding="utf-8"))
     _check(values, _KEYS, "the suite")
-    for key in ("bases", "include"):
-        _words(values, key)
     for base in (*values.get("bases", []), values.get("base", "ensemble")):
         _require_base(base)
     return values
@@ -163,18 +162,17 @@ def _rows_of(values: Mapping[str, Any], base: str | None, preset: str | None) ->
 
 def _expanded(part: Any, base: str | None, preset: str | None) -> Iterator[Row]:
     """The rows of one [[rows]]: every method at every point."""
-    methods = _words(part, "methods")
+    methods = part.get("methods")
     if not methods:
         raise ValueError('methods must name at least one, as ["UfM*-Ensemble"]')
     if base is not None:
         alone, behind = BASES[base]
-        methods = tuple(name.replace("{alone}", alone).replace("{behind}", behind) for name in methods)
-    ranges: dict[str, list[Any]] = {}
-    for name, points in part.get("each", {}).items():
+        methods = [name.replace("{alone}", alone).replace("{behind}", behind) for name in methods]
+    ranges = part.get("each", {})
+    for name, points in ranges.items():
         if not isinstance(points, list) or not points:
             raise ValueError(f"each.{name} must be a list of values, got {points!r}")
-        ranges[name] = points
-    if base is not None and base not in _words(part, "bases", (base,)):
+    if base is not None and base not in part.get("bases", (base,)):
         return
     label = part.get("label", "")
     if label and (ranges or (len(methods) > 1 and "{method}" not in label)):
@@ -201,10 +199,5 @@ def _check(values: Any, kinds: Mapping[str, type], where: str) -> None:
     for name, value in values.items():
         if not isinstance(value, kinds[name]):
             raise ValueError(f"{where}: {name} must be a {kinds[name].__name__}, got {value!r}")
-
-
-def _words(values: Mapping[str, Any], name: str, default: Iterable[str] = ()) -> tuple[str, ...]:
-    words = values.get(name, default)
-    if not all(isinstance(word, str) for word in words):
-        raise ValueError(f"{name} must be a list of words, got {words!r}")
-    return tuple(words)
+        if name in _WORDS and not all(isinstance(word, str) for word in values[name]):
+            raise ValueError(f"{where}: {name} must be a list of words, got {value!r}")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric, share
-from ufmstar_torch.eval.metrics.pixel_sums import add_delta1, add_errors
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric, share
 
 TOLERANCE = 0.25  # [1] of delta1, in both definitions
 
@@ -21,11 +22,18 @@ class Delta1(SumMetric):
     Without any pixel the figures are NaN.
     """
 
-    ADD = add_delta1
+    STATES = (("hits", COUNT), ("hits_ratio", COUNT), ("pixels", COUNT), ("with_truth", COUNT))
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(constants=(TOLERANCE,), **kwargs)
-        self.add_counts("hits", "hits_ratio", "pixels", "with_truth")
+    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+        d, g = pixels.depths
+        with np.errstate(divide="ignore"):
+            ratio = np.maximum(d / g, g / d)
+        return {
+            "hits": (np.abs(d - g) <= TOLERANCE * g).sum(),
+            "hits_ratio": ((d > 0) & (ratio < 1 + TOLERANCE)).sum(),
+            "pixels": len(d),
+            "with_truth": pixels.with_truth.sum(),
+        }
 
     def compute(self) -> dict[str, Tensor]:
         return {
@@ -39,12 +47,11 @@ class Delta1(SumMetric):
 class AbsRel(SumMetric):
     """Mean of |d - g| / g; ``compute()`` returns ``abs_rel``, NaN without a pixel."""
 
-    ADD = add_errors
+    STATES = (("total", SUM), ("pixels", COUNT))
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(None, (False,), **kwargs)
-        self.add_sums("total")
-        self.add_counts("pixels")
+    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+        d, g = pixels.depths
+        return {"total": (np.abs(d - g) / g).sum(), "pixels": len(d)}
 
     def compute(self) -> dict[str, Tensor]:
         return {"abs_rel": share(self.total, self.pixels)}
@@ -53,12 +60,11 @@ class AbsRel(SumMetric):
 class RMSE(SumMetric):
     """Root of the mean of (d - g)^2 over all pixels [m]; ``compute()`` returns ``rmse``, NaN without one."""
 
-    ADD = add_errors
+    STATES = (("total", SUM), ("pixels", COUNT))
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(None, (True,), **kwargs)
-        self.add_sums("total")
-        self.add_counts("pixels")
+    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+        d, g = pixels.depths
+        return {"total": np.square(d - g).sum(), "pixels": len(d)}
 
     def compute(self) -> dict[str, Tensor]:
         return {"rmse": share(self.total, self.pixels).sqrt()}

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -10,14 +14,41 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchmetrics import Metric
 
+Array = NDArray[np.float64]
+COUNT, SUM = torch.int64, torch.float64  # kinds of states
 
-class Pixels(NamedTuple):
-    """The pixels of one or more frames, flat on the CPU, as the loops in ``pixel_sums`` take them."""
 
-    depth: NDArray[np.float64]  # [P] d [m]
-    variance: NDArray[np.float64]  # [P] v [m^2]; [0] where there is none
-    target: NDArray[np.float64]  # [P] g [m]
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """The pixels of one or more frames, flat on the CPU. Ground truth counts where it is positive and finite, a depth
+    where it is finite, a variance where it is finite and not negative."""
+
+    depth: Array  # [P] d [m]
+    variance: Array  # [P] v [m^2]; [0] where there is none
+    target: Array  # [P] g [m]
     use: NDArray[np.bool_]  # [P] True = use
+
+    @cached_property
+    def with_truth(self) -> NDArray[np.bool_]:
+        """[P] True where there is ground truth."""
+        return self.use & (self.target > 0) & (self.target < np.inf)
+
+    @cached_property
+    def predicted(self) -> NDArray[np.bool_]:
+        """[P] True where there are depth and variance."""
+        return self.use & np.isfinite(self.depth) & (self.variance >= 0) & (self.variance < np.inf)
+
+    @cached_property
+    def depths(self) -> tuple[Array, Array]:
+        """d and g where there are both."""
+        both = self.with_truth & np.isfinite(self.depth)
+        return self.depth[both], self.target[both]
+
+    @cached_property
+    def judged(self) -> tuple[Array, Array, Array]:
+        """d, v and g where there are all."""
+        every = self.with_truth & self.predicted
+        return self.depth[every], self.variance[every], self.target[every]
 
 
 class SumMetric(Metric):
@@ -31,12 +62,13 @@ class SumMetric(Metric):
 
     Attributes:
         OF_VARIANCE: the name, in messages, of a metric that needs a variance; "" for one of the depth alone.
-        ADD: the loop over the pixels, of ``pixel_sums``.
-        constants: what it takes between the pixels and the states.
+        STATES: of each its name, ``COUNT`` or ``SUM``, and the sizes of its dimensions; zeros at the start.
+        settings: of the instance; sums of other settings cannot be merged.
     """
 
     OF_VARIANCE: ClassVar[str] = ""
-    ADD: ClassVar[Any]
+    STATES: tuple[tuple[Any, ...], ...] = ()
+    settings: Mapping[str, Any] = MappingProxyType({})
     is_differentiable = False
     full_state_update = False
 
@@ -45,31 +77,17 @@ class SumMetric(Metric):
         def __getattr__(self, name: str) -> Tensor:
             """The states are the only attributes that are not in ``__dict__``."""
 
-    def __init__(self, settings: dict[str, Any] | None = None, constants: tuple[Any, ...] = (), **kwargs: Any) -> None:
+    def __init__(self, **kwargs: Any) -> None:
         # torchmetrics keeps a computed value across merge_state and load_state_dict, where it is stale.
         kwargs.setdefault("compute_with_cache", False)
         super().__init__(**kwargs)
-        self.settings, self.constants = dict(settings or {}), constants
+        for name, kind, *shape in self.STATES:
+            self.add_state(name, torch.zeros(shape, dtype=kind), dist_reduce_fx="sum", persistent=True)
 
     @property
     def update_called(self) -> bool:
         """True: sums that were loaded or merged are as good as updated ones, and no frame gives NaN."""
         return True
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Their names."""
-        return tuple(self._defaults)
-
-    def add_counts(self, *names: str, shape: tuple[int, ...] = ()) -> None:
-        """Add int64 states of zeros."""
-        for name in names:
-            self.add_state(name, torch.zeros(shape, dtype=torch.int64), dist_reduce_fx="sum", persistent=True)
-
-    def add_sums(self, *names: str, shape: tuple[int, ...] = ()) -> None:
-        """Add float64 states of zeros."""
-        for name in names:
-            self.add_state(name, torch.zeros(shape, dtype=torch.float64), dist_reduce_fx="sum", persistent=True)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use. Raises ValueError: shapes or types
@@ -82,10 +100,17 @@ class SumMetric(Metric):
         if self.OF_VARIANCE and len(pixels.variance) != len(pixels.depth):
             judged = f"{self.OF_VARIANCE} judges the predicted distribution N(depth, variance)"
             raise ValueError(f"variance must be given: {judged}")
-        sums = {name: getattr(self, name).to("cpu", copy=True) for name in self.states}
-        type(self).ADD(*pixels, *self.constants, *(value.numpy() for value in sums.values()))
-        for name, value in sums.items():
-            setattr(self, name, value.to(getattr(self, name).device))
+        self.add_sums(self.sums(pixels))
+
+    def add_sums(self, sums: Mapping[str, Any]) -> None:
+        """Add to states by their names."""
+        for name, added in sums.items():
+            state = getattr(self, name)
+            setattr(self, name, state + torch.as_tensor(added, dtype=state.dtype, device=state.device))
+
+    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+        """What pixels add to each state, by its name."""
+        raise NotImplementedError
 
     def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:
         """Add another metric's sums to this one's. Raises ValueError: the other one was made with other settings, so

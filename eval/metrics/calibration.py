@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.special import erf, ndtri
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric, share
-from ufmstar_torch.eval.metrics.pixel_sums import add_ece_delta, add_ece_quantile
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric, share
 
 
 class ECEDelta(SumMetric):
@@ -31,14 +33,27 @@ class ECEDelta(SumMetric):
     """
 
     OF_VARIANCE = "ECE_delta"
-    ADD = add_ece_delta
 
     def __init__(self, delta: float = 0.25, bins: int = 10, **kwargs: Any) -> None:
         if not 0 < delta < 1 or bins < 1:
             raise ValueError(f"delta must lie in (0, 1) and bins be >= 1, got delta={delta}, bins={bins}")
-        super().__init__({"delta": delta, "bins": bins}, (delta,), **kwargs)
-        self.add_sums("confidence", shape=(bins,))
-        self.add_counts("accurate", "pixels", shape=(bins,))
+        self.settings = {"delta": delta, "bins": bins}
+        self.STATES = (("confidence", SUM, bins), ("accurate", COUNT, bins), ("pixels", COUNT, bins))
+        super().__init__(**kwargs)
+
+    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+        d, v, g = pixels.judged
+        delta, bins = self.settings["delta"], self.settings["bins"]
+        # Bin b is [b/B, (b+1)/B); a confidence of exactly 1, as of v = 0, belongs to the last.
+        sigma = np.sqrt(np.where(v > 0, v, 1.0))
+        confidence = np.where(v > 0, erf(delta * np.abs(d) / (math.sqrt(2.0) * sigma)), 1.0)
+        b = np.minimum((confidence * bins).astype(np.intp), bins - 1)
+        accurate = b[np.abs(g - d) <= delta * np.abs(d)]
+        return {
+            "confidence": np.bincount(b, confidence, bins),
+            "accurate": np.bincount(accurate, minlength=bins),
+            "pixels": np.bincount(b, minlength=bins),
+        }
 
     def compute(self) -> dict[str, Tensor]:
         total = self.pixels.sum()
@@ -70,16 +85,21 @@ class ECEQuantile(SumMetric):
     """
 
     OF_VARIANCE = "ECE_q"
-    ADD = add_ece_quantile
 
     def __init__(self, levels: Sequence[float] | None = None, **kwargs: Any) -> None:
         q = quantile_levels(10) if levels is None else torch.tensor(list(levels), dtype=torch.float64)
         if q.numel() == 0 or not bool(((q >= 0) & (q <= 1)).all() and (q.diff() > 0).all()):
             raise ValueError(f"levels must rise within [0, 1], got {levels}")
-        super().__init__({"levels": q.tolist()}, (torch.special.ndtri(q).numpy(),), **kwargs)
-        self.levels = q
-        self.add_counts("at_or_below", shape=(q.numel(),))
-        self.add_counts("pixels")
+        self.levels, self.settings = q, {"levels": q.tolist()}
+        self.STATES = (("at_or_below", COUNT, len(q)), ("pixels", COUNT))
+        super().__init__(**kwargs)
+
+    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+        d, v, g = pixels.judged
+        sigma = np.sqrt(np.where(v > 0, v, 1.0))
+        z = np.where(v > 0, (g - d) / sigma, np.where(g <= d, -np.inf, np.inf))
+        first = np.bincount(np.searchsorted(ndtri(self.levels.numpy()), z), minlength=len(self.levels) + 1)
+        return {"at_or_below": first.cumsum()[:-1], "pixels": len(z)}
 
     def compute(self) -> dict[str, Tensor]:
         levels = self.levels.to(self.pixels.device)

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric, share
-from ufmstar_torch.eval.metrics.pixel_sums import add_entropy, add_nll
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, Array, Pixels, SumMetric, share
+
+
+def gaussian_nll(d: Array, v: Array, g: Array) -> Array:
+    """(g - d)^2 / (2 v) + 0.5 ln(2 pi v), v > 0 [nats]."""
+    return np.square(g - d) / (2 * v) + 0.5 * np.log(2 * math.pi * v)
 
 
 class NLL(SumMetric):
@@ -20,12 +27,11 @@ class NLL(SumMetric):
     """
 
     OF_VARIANCE = "NLL"
-    ADD = add_nll
+    STATES = (("total", SUM), ("pixels", COUNT), ("with_truth", COUNT))
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_sums("total")
-        self.add_counts("pixels", "with_truth")
+    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+        d, v, g = (value[pixels.judged[1] > 0] for value in pixels.judged)
+        return {"total": gaussian_nll(d, v, g).sum(), "pixels": len(v), "with_truth": pixels.with_truth.sum()}
 
     def compute(self) -> dict[str, Tensor]:
         left_out = share(self.with_truth - self.pixels, self.with_truth)
@@ -40,18 +46,19 @@ class EntropyHistogram(SumMetric):
     """
 
     OF_VARIANCE = "the entropy"
-    ADD = add_entropy
+    EDGES = torch.linspace(-8.0, 8.0, 65, dtype=torch.float64)
+    STATES = (("counts", COUNT, 66), ("total", SUM), ("pixels", COUNT))
 
-    def __init__(self, **kwargs: Any) -> None:
-        self.edges = torch.linspace(-8.0, 8.0, 65, dtype=torch.float64)
-        super().__init__(constants=(self.edges.numpy(),), **kwargs)
-        self.add_counts("counts", shape=(66,))
-        self.add_sums("total")
-        self.add_counts("pixels")
+    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+        v = pixels.variance[pixels.predicted]
+        entropy = 0.5 * (math.log(2 * math.pi) + 1.0 + np.log(v[v > 0]))
+        counts = np.bincount(np.searchsorted(self.EDGES.numpy(), entropy, side="right"), minlength=66)
+        counts[0] += len(v) - len(entropy)
+        return {"counts": counts, "total": entropy.sum(), "pixels": len(entropy)}
 
     def compute(self) -> dict[str, Tensor]:
         return {
             "entropy": share(self.total, self.pixels),
             "entropy_counts": self.counts.double(),
-            "entropy_edges": self.edges.to(self.counts.device),
+            "entropy_edges": self.EDGES.to(self.counts.device),
         }

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, SumMetric, share
 from ufmstar_torch.eval.metrics.calibration import quantile_levels
 
 _BINS, _DELTA = 10, 0.25
@@ -25,13 +23,10 @@ class Mixture(SumMetric):
     """
 
     OF_VARIANCE = "the mixture"
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_sums("total")
-        self.add_sums("confidence", shape=(_BINS,))
-        self.add_counts("accurate", "pixels", "at_or_below", shape=(_BINS,))
-        self.add_counts("covered")
+    STATES = (
+        *(("total", SUM), ("confidence", SUM, _BINS), ("covered", COUNT)),
+        *((name, COUNT, _BINS) for name in ("accurate", "pixels", "at_or_below")),
+    )
 
     def add_mixture(self, depth: Tensor, variance: Tensor, target: Tensor, inlier: Tensor, outlier: Tensor) -> None:
         """Add maps of one shape: d [m], v [m^2], ground truth [m], v_1 [m^2] and p."""
@@ -47,12 +42,16 @@ class Mixture(SumMetric):
         below = (weight * torch.special.ndtr(error / sigma)).sum(0)
         bins = (confidence * _BINS).long().clamp_max(_BINS - 1)
         accurate = error.abs() <= _DELTA * d.abs()
-        self.total = self.total - torch.logsumexp(weight.log() + log_density, 0).sum()
-        self.confidence = self.confidence + torch.bincount(bins, confidence, _BINS)
-        self.pixels = self.pixels + torch.bincount(bins, minlength=_BINS)
-        self.accurate = self.accurate + torch.bincount(bins[accurate], minlength=_BINS)
-        self.at_or_below = self.at_or_below + (below[:, None] <= quantile_levels(_BINS)).sum(0)
-        self.covered = self.covered + ((below - 0.5).abs() <= _THREE_SIGMA / 2).sum()
+        self.add_sums(
+            {
+                "total": -torch.logsumexp(weight.log() + log_density, 0).sum(),
+                "confidence": torch.bincount(bins, confidence, _BINS),
+                "pixels": torch.bincount(bins, minlength=_BINS),
+                "accurate": torch.bincount(bins[accurate], minlength=_BINS),
+                "at_or_below": (below[:, None] <= quantile_levels(_BINS)).sum(0),
+                "covered": ((below - 0.5).abs() <= _THREE_SIGMA / 2).sum(),
+            }
+        )
 
     def compute(self) -> dict[str, Tensor]:
         count = self.pixels.sum()

@@ -7,16 +7,29 @@ of one bin count as ties. Each class states a bound on the error that this makes
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import SumMetric
-from ufmstar_torch.eval.metrics.pixel_sums import add_joint, add_nll_by_error, add_sparsification
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, Array, Pixels, SumMetric
+from ufmstar_torch.eval.metrics.likelihood import gaussian_nll
 
 # In the logarithm of the variance or of the error; of both together: 5.5 % in variance, 2 MB of counts.
 BINS, JOINT_BINS = 4096, 512
+# Variances and squared errors [m^2] between (0.1 mm)^2 and (100 m)^2 are distinguished; 0 and what is
+# smaller share the bin below, what is larger the bin above. Relative errors use the same bins.
+LOW, HIGH = 1e-8, 1e4
+
+
+def log_bin(value: Array, bins: int) -> NDArray[np.intp]:
+    """Bins in [0, bins + 1] of values >= 0: 0 below ``LOW``, bins + 1 from ``HIGH`` on."""
+    at = np.log(np.maximum(value, LOW) / LOW) * (bins / math.log(HIGH / LOW))
+    return np.where(value < LOW, 0, np.minimum(at, bins).astype(np.intp) + 1)
 
 
 def mean_of_share(count: Tensor, total: Tensor, shares: Tensor) -> Tensor:
@@ -48,12 +61,24 @@ class Sparsification(SumMetric):
     """
 
     OF_VARIANCE = "AUSE"
-    ADD = add_sparsification
+    STATES = (
+        *((name, COUNT, BINS + 2) for name in ("count", "count_squared", "count_relative")),
+        *((name, SUM, BINS + 2) for name in ("squared", "relative", "sum_squared", "sum_relative")),
+    )
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_counts("count", "count_squared", "count_relative", shape=(BINS + 2,))
-        self.add_sums("squared", "relative", "sum_squared", "sum_relative", shape=(BINS + 2,))
+    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+        d, v, g = pixels.judged
+        squared, relative = np.square(d - g), np.abs(d - g) / g
+        b, of_squared, of_relative = (log_bin(value, BINS) for value in (v, squared, relative))
+        return {
+            "count": np.bincount(b, minlength=BINS + 2),
+            "squared": np.bincount(b, squared, BINS + 2),
+            "relative": np.bincount(b, relative, BINS + 2),
+            "count_squared": np.bincount(of_squared, minlength=BINS + 2),
+            "sum_squared": np.bincount(of_squared, squared, BINS + 2),
+            "count_relative": np.bincount(of_relative, minlength=BINS + 2),
+            "sum_relative": np.bincount(of_relative, relative, BINS + 2),
+        }
 
     def compute(self) -> dict[str, Tensor]:
         kept = 1 - torch.arange(50, dtype=torch.float64, device=self.count.device) / 50
@@ -84,11 +109,13 @@ class SpearmanCorrelation(SumMetric):
     """
 
     OF_VARIANCE = "Spearman's correlation"
-    ADD = add_joint
+    STATES = (("joint", COUNT, JOINT_BINS + 2, JOINT_BINS + 2),)
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_counts("joint", shape=(JOINT_BINS + 2, JOINT_BINS + 2))
+    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+        d, v, g = pixels.judged
+        size = JOINT_BINS + 2
+        both = log_bin(v, JOINT_BINS) * size + log_bin(np.square(d - g), JOINT_BINS)
+        return {"joint": np.bincount(both, minlength=size * size).reshape(size, size)}
 
     def compute(self) -> dict[str, Tensor]:
         joint = self.joint.double()
@@ -112,12 +139,12 @@ class NLLByError(SumMetric):
     """
 
     OF_VARIANCE = "NLL by error"
-    ADD = add_nll_by_error
+    STATES = (("count", COUNT, BINS + 2), ("nll", SUM, BINS + 2))
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_counts("count", shape=(BINS + 2,))
-        self.add_sums("nll", shape=(BINS + 2,))
+    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+        d, v, g = (value[pixels.judged[1] > 0] for value in pixels.judged)
+        b = log_bin(np.square(d - g), BINS)
+        return {"count": np.bincount(b, minlength=BINS + 2), "nll": np.bincount(b, gaussian_nll(d, v, g), BINS + 2)}
 
     def compute(self) -> dict[str, Tensor]:
         kept = torch.arange(1, 11, dtype=torch.float64, device=self.count.device) / 10

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 
-from ufmstar_torch.eval.metrics.pixel_sums import HIGH, LOW
+from ufmstar_torch.eval.metrics.base import Array
+from ufmstar_torch.eval.metrics.ranking import HIGH, LOW
 from ufmstar_torch.recalibrate import CONFIDENCE, Recalibration
 
-Array = NDArray[np.float64]
 # Levels of |z| of a standard normal variable at which errors are compared with it. The outer tenth is left out:
 # gross errors of the depth would set the variance of all other pixels.
 LEVELS = np.arange(0.1, 0.91, 0.1)
@@ -95,15 +95,10 @@ def fit_confidence(samples: Sequence[Array], groups: int = CONFIDENCE_GROUPS) ->
 
 def figures_of_samples(samples: Array, recalibration: Recalibration | None) -> dict[str, float]:
     """As :func:`figures`, from samples as :func:`fit_confidence` takes them."""
-    import torch
-
     c, variance, error = samples.T
     if recalibration is not None:
         variance = variance * recalibration.factor(torch.from_numpy(np.ascontiguousarray(c))).numpy()
-    ratio = error / variance
-    inside = [(ratio <= z**2).mean() for z in _normal(LEVELS)]
-    nll = 0.5 * (ratio + np.log(2 * math.pi * variance))
-    return {"coverage_error": float(np.abs(np.array(inside) - LEVELS).mean()), "nll": float(nll.mean())}
+    return _figures(variance, error, np.full(len(c), 1 / len(c)))
 
 
 def figures(joint: Array, recalibration: Recalibration | None) -> dict[str, float]:
@@ -117,20 +112,23 @@ def figures(joint: Array, recalibration: Recalibration | None) -> dict[str, floa
     Raises:
         ValueError: no pixel.
     """
-    import torch
-
     joint = _weighted([joint])
     value = centres(joint.shape[0] - 2)
     variance = value if recalibration is None else recalibration(torch.from_numpy(value)).numpy()
+    return _figures(variance[:, None], value[None], joint)
+
+
+def _figures(variance: Array, error: Array, weight: Array) -> dict[str, float]:
+    """The figures of squared errors [m^2] under variances [m^2], by the share of the pixels that have both."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(value[None] == 0, 0.0, value[None] / variance[:, None])
-        nll = 0.5 * (ratio + np.log(2 * math.pi * variance)[:, None])
-    inside = [(joint[ratio <= z**2]).sum() for z in _normal(LEVELS)]
-    positive = variance > 0
-    share = joint[positive].sum()
+        ratio = np.where(error == 0, 0.0, error / variance)
+        nll = 0.5 * (ratio + np.log(2 * math.pi * variance))
+    inside = [weight[ratio <= z**2].sum() for z in _normal(LEVELS)]
+    positive = np.broadcast_to(variance > 0, weight.shape)
+    share = weight[positive].sum()
     return {
         "coverage_error": float(np.abs(np.array(inside) - LEVELS).mean()),
-        "nll": float((joint[positive] * nll[positive]).sum() / share) if share else math.nan,
+        "nll": float((weight[positive] * nll[positive]).sum() / share) if share else math.nan,
         "zero_share": float(1 - share),
     }
 

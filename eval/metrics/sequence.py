@@ -94,8 +94,8 @@ class SequenceMetrics(nn.Module):
 
     def sums(self) -> dict[str, Tensor]:
         """``state_dict`` without copies: updates exchange the sums, they change none in place."""
-        named = ((kind, metric) for kind, metric in self.metrics.items() if isinstance(metric, SumMetric))
-        return {f"metrics.{kind}.{name}": getattr(metric, name) for kind, metric in named for name in metric.states}
+        kinds = zip(self.metrics, self._all(), strict=True)
+        return {f"metrics.{kind}.{name}": getattr(metric, name) for kind, metric in kinds for name, *_ in metric.STATES}
 
     def merge_state(self, other: SequenceMetrics) -> None:
         """Add the sums of another part of the same sequence. Raises ValueError: the other one judges other things."""
@@ -115,8 +115,7 @@ class SequenceMetrics(nn.Module):
     def _results(self) -> dict[str, Tensor]:
         return {
             f"own.{name}" if kind.startswith(_OWN) else name: value
-            for kind, metric in self.metrics.items()
-            if isinstance(metric, SumMetric)
+            for kind, metric in zip(self.metrics, self._all(), strict=True)
             for name, value in metric.compute().items()
         }
 

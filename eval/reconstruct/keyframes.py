@@ -25,18 +25,9 @@ def write_keyframes(
     progress: Callable[[int], object] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[list[int], int]:
-    """Decodes a video's images once, in order, and writes its keyframes as ``folder/NAME.jpg``.
-
-    Args:
-        images: all of the video.
-        folder: an existing one.
-        always: names of images that are keyframes wherever they lie.
-        progress: called with the number of decoded images.
-        stop: called before every image; True ends the video there.
-
-    Returns:
-        The keyframes' positions in ``images``, and how many images cannot be decoded.
-    """
+    """Decode a video's images once, in order, and write its keyframes as ``folder/NAME.jpg``; their positions in
+    ``images``, and how many images cannot be decoded. Images named in ``always`` are keyframes wherever they lie.
+    ``progress`` gets the number of decoded images; ``stop`` is called before every image, and True ends the video."""
     import cv2
 
     chosen, broken, motion = [], 0, _Motion()

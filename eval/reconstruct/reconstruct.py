@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from ufmstar_torch.eval.reconstruct.scale import endpoint, similarity
 from ufmstar_torch.eval.run.folder import FolderKind
 from ufmstar_torch.eval.sequences.attach import attach
 from ufmstar_torch.eval.sequences.colmap import SCALE_FILE
@@ -58,19 +57,9 @@ def reconstruct(
     threads: int,
     say: Callable[[str], object] = lambda _: None,
 ) -> list[Any]:
-    """The models (``pycolmap.Reconstruction``) of ``out/images/NAME.jpg``, the largest first.
-
-    Args:
-        out: the folder.
-        names: of the keyframes, in the order of the video.
-        K: [3, 3] of all of them [px], kept as it is; None = one focal length and one distortion coefficient are
-            estimated.
-        threads: of the CPU.
-        say: gets a line at the start of each stage.
-
-    Raises:
-        ValueError: the images fit no model.
-    """
+    """The models (``pycolmap.Reconstruction``) of ``out/images/NAME.jpg`` for ``names`` in the order of the video, the
+    largest first. K [3, 3] of all of them [px] is kept as it is; None = one focal length and one distortion coefficient
+    are estimated. ``say`` gets a line at the start of each stage. Raises ValueError: the images fit no model."""
     if len(names) < _VIEWS:
         raise ValueError(f"{len(names)} keyframes, of which {_VIEWS} are needed: too few images, or blank or alike")
     pycolmap = require_pycolmap()
@@ -122,17 +111,14 @@ def scale_model(
     trajectory: Trajectory | None = None,
     options: Options | None = None,
 ) -> dict[str, Any]:
-    """Bring a model into metres, in place, and for a trajectory into its axes.
+    """Bring a model into metres, in place, and for a trajectory into its axes: ``scale_from``, None without either;
+    ``metres_per_unit``, and for a trajectory ``residual`` [m].
 
     Args:
         model: ``pycolmap.Reconstruction``.
         images: all of the video, in order, with their times.
         length: two places as ``endpoint`` reads them, and their distance [m].
-        trajectory: positions of the camera in metres.
-        options: how its times meet the images'.
-
-    Returns:
-        ``scale_from``, None without either; ``metres_per_unit``, and for a trajectory ``residual`` [m].
+        trajectory, options: positions of the camera in metres, and how their times meet the images'.
 
     Raises:
         ValueError: the two places are one, or see ``endpoint``, ``attach`` and ``similarity``.
@@ -193,3 +179,62 @@ def gaps(keyframes: Sequence[str], model: Any) -> list[tuple[str, str]]:
             result = [*result, (name, name)] if before else [*result[:-1], (result[-1][0], name)]
         before = name in posed
     return result
+
+
+# A known point is the nearest landmark in its image, at most this share of the image's width away.
+_NEAR = 0.02
+# Positions that lie farther from the fit than so many times the median are left out of a second one.
+_OUTLIER = 3.0
+
+
+def endpoint(model: Any, word: str) -> np.ndarray:
+    """[3] a point of a model (``pycolmap.Reconstruction``): the camera's place in an image, "NAME", or the landmark
+    next to a pixel of it, "NAME:U,V". Raises ValueError: no such image in the model, or no landmark near the pixel."""
+    name, _, pixel = word.partition(":")
+    number = int(name) if name.isdecimal() else None  # images may be named by their number
+    stems = [(Path(i.name).stem, i) for i in model.images.values()]
+    same = (i for stem, i in stems if stem == name or (stem.isdecimal() and int(stem) == number))
+    image = next(same, None)
+    if image is None:
+        names = sorted(stem for stem, _ in stems)
+        listed = f"{', '.join(names[:3])}, ... {names[-1]}" if len(names) > 4 else ", ".join(names)
+        raise ValueError(f"--length: image {name!r} has no pose; choose one of the {len(names)} that have: {listed}")
+    if not pixel:
+        return np.array(image.projection_center())
+    try:
+        u, v = (float(number) for number in pixel.split(","))
+    except ValueError:
+        raise ValueError(f"--length: {word!r} must be NAME, or NAME:U,V with a pixel [px]") from None
+    seen = [point for point in image.points2D if point.has_point3D()]
+    # COLMAP's first pixel has its centre at (0.5, 0.5)
+    apart = np.array([np.hypot(point.xy[0] - 0.5 - u, point.xy[1] - 0.5 - v) for point in seen])
+    reach = _NEAR * model.cameras[image.camera_id].width
+    if not len(apart) or apart.min() > reach:
+        nearest = f"the nearest is {apart.min():.0f} px away" if len(apart) else "it has none"
+        raise ValueError(f"--length: no landmark within {reach:.0f} px of {word}: {nearest}; choose a corner")
+    return np.array(model.points3D[seen[int(apart.argmin())].point3D_id].xyz)
+
+
+def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, float]:
+    """Scale s, rotation R [3, 3], translation t [3] that minimise sum |s R x + t - y|^2 over pairs of points x, y [N,
+    3] (Umeyama 1991), fitted again without those far off; and the root mean square of the rest's distances. Raises
+    ValueError: fewer than three points, or all at one place."""
+    kept = np.ones(len(source), bool)
+    for _ in range(2):
+        x, y = source[kept], target[kept]
+        if len(x) < 3:
+            raise ValueError(
+                f"--trajectory: {len(x)} keyframes have a pose in it and in the model, at least 3 are needed"
+            )
+        dx, dy = x - x.mean(0), y - y.mean(0)
+        variance = float(np.square(dx).sum())
+        if variance <= 0 or not np.square(dy).sum() > 0:
+            raise ValueError("--trajectory: the camera stays at one place, which shows no scale")
+        U, singular, Vt = np.linalg.svd(dy.T @ dx)
+        sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+        R = (U * sign) @ Vt
+        s = float((singular * sign).sum() / variance)
+        t = y.mean(0) - s * R @ x.mean(0)
+        distance = np.linalg.norm(s * source @ R.T + t - target, axis=1)
+        kept = distance <= max(_OUTLIER * float(np.median(distance)), 1e-9)
+    return s, R, t, float(np.sqrt(np.square(distance[kept]).mean()))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import pickle
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,17 +15,14 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.judge import CONFIDENCE, METRICS
-from ufmstar_torch.eval.methods.method import Method
-from ufmstar_torch.eval.methods.row import Row, plain_rows
-from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.methods.row import Row, plain_rows, row_from
 from ufmstar_torch.eval.metrics.packed_sums import unpack
 from ufmstar_torch.eval.suite.folder import FAILED
 from ufmstar_torch.eval.suite.record import Record
 
 FORMAT = 1
-# The keys of ``Setting.to_dict()`` that are fields of Setting; all others are overrides of the config.
-_SETTING_FIELDS = {f.name for f in fields(Setting)} - {"overrides"}
 Sums = dict[str, dict[str, Tensor]]
+Curves = Mapping[str, list[float]]
 # The paper's groups of its figure of entropy, by the beginnings of words in the names of data sets and sequences
 # (TartanAir's environments, say); other data sets are groups of their own.
 ENVIRONMENTS = {
@@ -40,21 +37,12 @@ class ResultsError(ValueError):
     """The folder is no evaluation, or its records do not belong together; the message names the file."""
 
 
-@dataclass(frozen=True)
-class Failed:
+class Failed(NamedTuple):
     """A sequence that could not be evaluated, and why."""
 
     dataset: str
     sequence: str
     reason: str
-    rows: tuple[str, ...] = ()
-
-
-class Merged(NamedTuple):
-    """Several sequences evaluated as one, every pixel with the same weight."""
-
-    figures: Mapping[str, float]  # SequenceMetrics.compute()
-    curves: Mapping[str, list[float]]  # its curves(), and "nll_by_error:REFERENCE"
 
 
 @dataclass(frozen=True)
@@ -64,8 +52,9 @@ class Results:
     out: Path
     about: Mapping[str, Any]  # eval.json
     records: tuple[Record, ...]  # by data set, sequence and row (in the suite's order), whichever process wrote them
-    # Over all pixels of a data set, by (dataset, row); only where the sums of all sequences exist.
-    merged: Mapping[tuple[str, Row], Merged] = field(default_factory=dict)
+    # ``SequenceMetrics.curves()`` and "nll_by_error:REFERENCE" over all pixels of a data set, by (dataset, row); only
+    # where the sums of all sequences exist.
+    merged: Mapping[tuple[str, Row], Curves] = field(default_factory=dict)
     failed: tuple[Failed, ...] = ()
     missing: tuple[tuple[str, str, Row], ...] = ()  # (dataset, sequence, row) not evaluated yet
     efficiency: Mapping[str, Any] | None = None  # efficiency.json
@@ -84,9 +73,8 @@ class Results:
     @cached_property
     def rows(self) -> tuple[Row, ...]:
         """Rows with a record, in the suite's order, then by name."""
-        recorded = {row_of(record) for record in self.records}
-        listed = [row for row in listed_rows(self.about) if row in recorded]
-        return (*listed, *sorted(recorded - set(listed), key=lambda row: row.slug))
+        listed = [row for row in listed_rows(self.about) if row in self._by_row]
+        return (*listed, *sorted(self._by_row.keys() - set(listed), key=lambda row: row.slug))
 
     @cached_property
     def bases(self) -> tuple[str, ...]:
@@ -113,13 +101,13 @@ class Results:
 
     def network(self, base: str) -> str | None:
         """The label of the network of a base; None without a record."""
-        return next((r.network for r in self.records if Method.parse(r.method).base == base), None)
+        return next((r.network for r in self.records if r.row.method.base == base), None)
 
     @cached_property
     def _by_row(self) -> dict[Row, list[Record]]:
         groups: dict[Row, list[Record]] = {}
         for record in self.records:
-            groups.setdefault(row_of(record), []).append(record)
+            groups.setdefault(record.row, []).append(record)
         return groups
 
 
@@ -132,19 +120,25 @@ def load_results(out: Path, *, with_sums: bool = True) -> Results:
         OSError: a file cannot be read.
     """
     about = _about(out)
-    by_path = {path: _record(path) for path in sorted((out / "records").rglob("*.json")) if path.name != FAILED}
-    order = {row: number for number, row in enumerate(listed_rows(about))}
-
-    def place(item: tuple[Path, Record]) -> tuple[str, str, int, str]:
-        record, row = item[1], row_of(item[1])
-        return record.dataset, record.sequence, order.get(row, len(order)), row.slug
-
-    by_path = dict(sorted(by_path.items(), key=place))
+    order, loaded = {row: number for number, row in enumerate(listed_rows(about))}, []
+    for path in sorted((out / "records").rglob("*.json")):
+        if path.name != FAILED:
+            try:
+                record = Record.load(path)
+                place = record.dataset, record.sequence, order.get(record.row, len(order)), record.row.slug, path
+            except ValueError as error:
+                text = str(error)
+                raise ResultsError(text if str(path) in text else f"{path}: {text}") from error
+            loaded.append((place, record))
+    by_path = {place[-1]: record for place, record in sorted(loaded, key=lambda pair: pair[0])}
     _check(out, about, by_path)
     records, failed = tuple(by_path.values()), _failed(out)
+    done = {(r.dataset, r.sequence, r.row) for r in records}
+    broken = {(f.dataset, f.sequence) for f in failed}
+    expected = sorted((s["dataset"], s["sequence"]) for s in about.get("sequences", []))
+    missing = tuple((*s, row) for s in expected if s not in broken for row in order if (*s, row) not in done)
     merged, notes = _merged(by_path) if with_sums else ({}, [])
-    missing, efficiency = _missing(about, records, failed), _read_json(out / "efficiency.json")
-    return Results(out, about, records, merged, failed, missing, efficiency, tuple(notes))
+    return Results(out, about, records, merged, failed, missing, _read_json(out / "efficiency.json"), tuple(notes))
 
 
 def environment_of(record: Record) -> str:
@@ -154,24 +148,9 @@ def environment_of(record: Record) -> str:
     return next(fitting, record.dataset)
 
 
-def row_of(record: Record) -> Row:
-    """The row of a record."""
-    return Row(Method.parse(record.method), setting_of(record.setting))
-
-
-def setting_of(values: Mapping[str, Any]) -> Setting:
-    """The inverse of ``Setting.to_dict()``."""
-    own = {name: value for name, value in values.items() if name in _SETTING_FIELDS}
-    return Setting(overrides={name: value for name, value in values.items() if name not in own}, **own)
-
-
 def listed_rows(about: Mapping[str, Any]) -> list[Row]:
     """The suite's rows, as ``eval.json`` lists them."""
-    rows = (
-        Row(Method.parse(r["method"]), setting_of(r.get("setting", {})), str(r.get("label", "")))
-        for r in about.get("rows", [])
-    )
-    return list(dict.fromkeys(rows))
+    return list(dict.fromkeys(map(row_from, about.get("rows", []))))
 
 
 def _about(out: Path) -> dict[str, Any]:
@@ -198,16 +177,6 @@ def _read_json(path: Path) -> Any:
         raise ResultsError(f"{path} is not JSON: {error}") from error
 
 
-def _record(path: Path) -> Record:
-    try:
-        record = Record.load(path)
-        row_of(record)
-    except ValueError as error:
-        text = str(error)
-        raise ResultsError(text if str(path) in text else f"{path}: {text}") from error
-    return record
-
-
 def _check(out: Path, about: Mapping[str, Any], records: Mapping[Path, Record]) -> None:
     """Raise ResultsError where there is no record, or records are not of one evaluation."""
     if not records:
@@ -217,65 +186,55 @@ def _check(out: Path, about: Mapping[str, Any], records: Mapping[Path, Record]) 
     for path, record in records.items():
         if record.suite != about["suite"]:
             raise ResultsError(f"{path} is of the suite {record.suite!r}, not of {about['suite']!r} as eval.json")
-        base = Method.parse(record.method).base
+        base = record.row.method.base
         network, first = networks.setdefault(base, (record.network, path))
         if network != record.network:
             raise ResultsError(
                 f"records of {base} are of mixed networks, which have no common mean: {network} in {first}, "
                 f"{record.network} in {path}"
             )
-        twin = seen.setdefault((record.dataset, record.sequence, row_of(record)), path)
+        twin = seen.setdefault((record.dataset, record.sequence, record.row), path)
         if twin != path:
             raise ResultsError(f"{twin} and {path} are of the same row on the same sequence")
 
 
 def _failed(out: Path) -> tuple[Failed, ...]:
     failed = []
-    for path in sorted((out / "records").rglob(FAILED)):
+    for path in (out / "records").rglob(FAILED):
         values = _read_json(path)
         if not isinstance(values, dict) or "reason" not in values:
             raise ResultsError(f"{path} does not say why a sequence failed")
-        dataset = str(values.get("dataset") or path.parent.parent.name)
-        sequence = str(values.get("sequence") or path.parent.name)
-        failed.append(Failed(dataset, sequence, str(values["reason"]), tuple(map(str, values.get("rows", ())))))
-    return tuple(sorted(failed, key=lambda f: (f.dataset, f.sequence)))
-
-
-def _missing(
-    about: Mapping[str, Any], records: Iterable[Record], failed: Iterable[Failed]
-) -> tuple[tuple[str, str, Row], ...]:
-    """Rows and sequences of ``eval.json`` without a record, except failed sequences."""
-    done = {(r.dataset, r.sequence, row_of(r)) for r in records}
-    broken = {(f.dataset, f.sequence) for f in failed}
-    expected = sorted((s["dataset"], s["sequence"]) for s in about.get("sequences", []))
-    rows = listed_rows(about)
-    return tuple((*s, row) for s in expected if s not in broken for row in rows if (*s, row) not in done)
+        dataset, sequence = values.get("dataset", path.parent.parent.name), values.get("sequence", path.parent.name)
+        failed.append(Failed(str(dataset), str(sequence), str(values["reason"])))
+    return tuple(sorted(failed))
 
 
 # ---- sums over sequences ----
 
 
-def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Merged], list[str]]:
-    """Sums of each (dataset, row), added in the order of the sequences; a note where a file is missing."""
+def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Curves], list[str]]:
+    """Curves of each (dataset, row) from sums over its sequences; a note where a file is missing."""
     groups: dict[tuple[str, Row], list[Path]] = {}
     for path, record in records.items():
-        groups.setdefault((record.dataset, row_of(record)), []).append(path.with_suffix(".pt"))
+        groups.setdefault((record.dataset, record.row), []).append(path.with_suffix(".pt"))
     merged, notes = {}, []
     for (dataset, row), files in groups.items():
-        gone = [path for path in files if not path.is_file()]
-        if gone:
+        if gone := [path for path in files if not path.is_file()]:
             notes.append(f"{dataset}, {row.label}: no curve over all sequences, {gone[0]} is not there")
             continue
         total: Sums = {}  # added in the order of the files, which decides the last bits
-        for path in files:
-            for name, states in read_sums(path).items():
-                if name == CONFIDENCE:  # samples, no sums
-                    continue
-                mine = total.setdefault(name, {key: torch.zeros_like(value) for key, value in states.items()})
-                if {key: value.shape for key, value in mine.items()} != {k: v.shape for k, v in states.items()}:
-                    raise ResultsError(f"{path} holds sums of other metrics than the sequences before it ({name})")
-                total[name] = {key: mine[key] + value for key, value in states.items()}
-        merged[dataset, row] = _compute(total, files[0])
+        try:
+            for path in files:
+                for name, states in read_sums(path).items():
+                    if name != CONFIDENCE:  # samples, no sums
+                        mine = total.setdefault(name, {key: torch.zeros_like(value) for key, value in states.items()})
+                        if {key: v.shape for key, v in mine.items()} != {key: v.shape for key, v in states.items()}:
+                            raise RuntimeError(f"{name} of other shapes than in the sequences before it")
+                        total[name] = {key: mine[key] + value for key, value in states.items()}
+            merged[dataset, row] = _curves(total)
+        except RuntimeError as error:
+            text = " ".join(str(error).split())[:200]
+            raise ResultsError(f"{path} holds sums of other metrics: {text}") from error
     return merged, notes
 
 
@@ -290,22 +249,18 @@ def read_sums(path: Path) -> Sums:
     return {name: {key: unpack(value) for key, value in states.items()} for name, states in sums.items()}
 
 
-def _compute(total: Sums, file: Path) -> Merged:
-    """Figures and curves of summed states; ``file`` is named in errors."""
+def _curves(total: Sums) -> Curves:
+    """Curves of summed states."""
     from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 
     states = total[METRICS]
-    kinds = {key.split(".")[1] for key in states if key.startswith("metrics.")}
-    many = "NLL" in kinds and states["metrics.ECEDelta.pixels"].numel() == 100
-    bins = "authors" if many else "ours"
-    metrics = SequenceMetrics(with_variance="NLL" in kinds, bins=bins)
-    by_error = {name: NLLByError() for name in total if name != METRICS}
-    try:
-        metrics.load_state_dict({key: value for key, value in states.items() if not key.startswith("metrics.own_")})
-        for name, metric in by_error.items():
-            metric.load_state_dict(dict(total[name]))
-    except RuntimeError as error:
-        text = " ".join(str(error).split())[:200]
-        raise ResultsError(f"{file} holds sums of other metrics: {text}") from error
-    curves = {name: metric.compute()["nll_by_error"].tolist() for name, metric in by_error.items()}
-    return Merged(metrics.compute(), metrics.curves() | curves)
+    judged = any(key.startswith("metrics.NLL.") for key in states)
+    many = judged and states["metrics.ECEDelta.pixels"].numel() == 100
+    metrics = SequenceMetrics(with_variance=judged, bins="authors" if many else "ours")
+    metrics.load_state_dict({key: value for key, value in states.items() if not key.startswith("metrics.own_")})
+    curves = metrics.curves()
+    for name in total.keys() - {METRICS}:
+        by_error = NLLByError()
+        by_error.load_state_dict(total[name])
+        curves[name] = by_error.compute()["nll_by_error"].tolist()
+    return curves

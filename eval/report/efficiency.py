@@ -7,12 +7,11 @@ separable" where a network predicts depth and variance in one. A difference that
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ufmstar_torch.eval.methods.method import Method
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.report.data import setting_of
+from ufmstar_torch.eval.methods.row import row_from
 from ufmstar_torch.eval.report.names import row_labels
 from ufmstar_torch.eval.report.paper import PaperTable, paper_tables
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table
@@ -26,10 +25,12 @@ _SMALLEST = 0.01  # less prints as "<0.01"
 
 
 def efficiency_tables(measured: Mapping[str, Any]) -> list[Table]:
-    """One table per architecture of ``efficiency.json``, then the paper's of those of its architectures that are among
-    them, or of all of its."""
+    """One table per architecture of ``efficiency.json``, then the paper's table 2 of those of its networks that are
+    among them, or of all of its."""
     tables = {row["network"]: run for run in architectures(measured) for row in run["rows"]}
-    return [*(_table(run, label) for label, run in tables.items()), *paper_efficiency_tables(tables)]
+    quoted = [table for table in paper_tables() if table.number == 2]
+    known = [table for table in quoted if any(table.network.lower() in label.lower() for label in tables)]
+    return [*(_table(run, label) for label, run in tables.items()), *map(_paper_table, known or quoted)]
 
 
 def architectures(measured: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -37,29 +38,16 @@ def architectures(measured: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return [measured, *measured.get("further", ())]
 
 
-def paper_efficiency_tables(networks: Iterable[str]) -> list[Table]:
-    """The paper's table 2 for each of its networks that is among ``networks`` (labels), for all if none is."""
-    labels = [label.lower() for label in networks]
-    quoted = [table for table in paper_tables() if table.number == 2]
-    known = [table for table in quoted if any(table.network.lower() in label for label in labels)]
-    return [_paper_table(table) for table in known or quoted]
-
-
 def _table(run: Mapping[str, Any], label: str) -> Table:
     rows = [row for row in run["rows"] if row["network"] == label]
     bases = list(dict.fromkeys(row["base"] for row in rows))  # a block per base, as in the paper
     units, network = run["devices"]["units"], run["networks"][bases[0]]
-    labels = {row["row"]: row["row"] for row in rows}
+    labels = [row["row"] for row in rows]
     if all("setting" in row for row in rows):
-        known = {row["row"]: Row(Method.parse(row["method"]), setting_of(row["setting"])) for row in rows}
-        shown = row_labels(known.values())
-        labels = {name: shown[row] for name, row in known.items()}
-    lines = [
-        Line(block, labels[row["row"]], _cells(row, units))
-        for block, base in enumerate(bases)
-        for row in rows
-        if row["base"] == base
-    ]
+        known = [row_from(row) for row in rows]
+        labels = [row_labels(known)[row] for row in known]
+    lines = [Line(bases.index(row["base"]), label, _cells(row, units)) for row, label in zip(rows, labels, strict=True)]
+    lines.sort(key=lambda line: line.block)
     return Table(
         f"efficiency-{''.join(c if c.isalnum() else '-' for c in label.lower())}",
         f"Efficiency of uncertainty, {label}",
@@ -97,7 +85,7 @@ def _cells(row: Mapping[str, Any], units: Mapping[str, str]) -> tuple[Cell, ...]
     cells: list[str] = []
     for unit in UNITS:
         parts = [part for part in (NETWORK, MULTIVIEW) if _counts(row, part) and units[part] == unit]
-        cells += [_latency(row, parts), *_power_and_energy(row, parts)]
+        cells += _unit_cells([row["latency"][part] for part in parts], [row["energy"][part] for part in parts])
     overhead, memory = row["energy_overhead_percent"], row["memory"]
     if overhead is not None and GROSS in overhead:
         cells.append(_percent(overhead[GROSS]))
@@ -117,32 +105,29 @@ def _counts(row: Mapping[str, Any], part: str) -> bool:
     return part in row["latency"] and "none" not in row["latency"][part]
 
 
-def _latency(row: Mapping[str, Any], parts: Sequence[str]) -> str:
-    """The sum over parts of the medians [ms]; "<" the upper quartile where the lower one is not above 0."""
-    if not parts:
-        return ""
-    times = [row["latency"][part] for part in parts]
-    if any("not_separable" in one for one in times):
-        return NOT_SEPARABLE
-    if len(times) == 1 and times[0]["q1_ms"] <= 0:
-        return f"<{_digits(max(times[0]['q3_ms'], _SMALLEST))}"
-    return _digits(sum(max(0.0, one["median_ms"]) for one in times))
+def _unit_cells(times: Sequence[Any], energies: Sequence[Any]) -> list[str]:
+    """Milliseconds, watts and millijoules per frame of the parts that run on one unit."""
+    if not times:
+        return ["", "", ""]
+    if any("not_separable" in time for time in times):
+        latency = NOT_SEPARABLE
+    else:
+        latency = _sum([(time["median_ms"], time["q1_ms"], time["q3_ms"]) for time in times])
+    for key, words in (("not_separable", NOT_SEPARABLE), ("not_measurable", NOT_MEASURABLE)):
+        if any(key in energy for energy in energies):
+            return [latency, words, words]
+    used = [energy[GROSS] for energy in energies]
+    joules = _sum([(one["millijoules"], one["q1"], one["q3"]) for one in used])
+    seconds = sum(one["seconds"] for one in used)
+    watts = 1e-3 * sum(max(0.0, one["millijoules"]) for one in used) / seconds if seconds > 0 else None
+    return [latency, "" if watts is None or joules.startswith("<") else _digits(watts), joules]
 
 
-def _power_and_energy(row: Mapping[str, Any], parts: Sequence[str]) -> tuple[str, str]:
-    """Watts while the parts on one unit run, and millijoules per frame."""
-    if not parts:
-        return "", ""
-    used = [row["energy"][part] for part in parts]
-    if any("not_separable" in one for one in used):
-        return NOT_SEPARABLE, NOT_SEPARABLE
-    if any("not_measurable" in one for one in used):
-        return NOT_MEASURABLE, NOT_MEASURABLE
-    if len(used) == 1 and used[0][GROSS]["q1"] <= 0:
-        return "", f"<{_digits(max(used[0][GROSS]['q3'], _SMALLEST))}"
-    energy = sum(max(0.0, one[GROSS]["millijoules"]) for one in used)
-    seconds = sum(one[GROSS]["seconds"] for one in used)
-    return _digits(1e-3 * energy / seconds) if seconds > 0 else "", _digits(energy)
+def _sum(parts: Sequence[tuple[float, float, float]]) -> str:
+    """The sum of medians over parts, each with its quartiles; "<" the upper one where the lower one is not above 0."""
+    if len(parts) == 1 and parts[0][1] <= 0:
+        return f"<{_digits(max(parts[0][2], _SMALLEST))}"
+    return _digits(sum(max(0.0, median) for median, _, _ in parts))
 
 
 def megabytes(count: float) -> str:
@@ -167,22 +152,16 @@ def _digits(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 10 else f"{value:.1f}"
 
 
-# ---- below the table ----
-
-
 def _about_depth(network: Mapping[str, Any], unit: str) -> str:
     """The paper's cell of the architecture."""
-    memory = network["memory"]
-    size = NOT_MEASURABLE if memory is None else f"{megabytes(memory['depth'])} MB"
-    time = f"{network['latency'][DEPTH]['median_ms']:.0f} ms on the {UNITS[unit]}, "
+    size = NOT_MEASURABLE if network["memory"] is None else f"{megabytes(network['memory']['depth'])} MB"
     whole = "" if network["whole"] is None else f" (with its uncertainty: {network['whole']})"
-    return f"Depth alone: {time}{size}{whole}."
+    return f"Depth alone: {network['latency'][DEPTH]['median_ms']:.0f} ms on the {UNITS[unit]}, {size}{whole}."
 
 
 def _notes(run: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> list[str]:
     notes = []
-    smoothing = max((row["memory"]["multiview"] or {}).get("smoothing_bytes", 0) for row in rows)
-    if smoothing:
+    if smoothing := max((row["memory"]["multiview"] or {}).get("smoothing_bytes", 0) for row in rows):
         notes.append(
             f"UfM* keeps a map for smoothing besides: {megabytes(smoothing)} MB, not counted above, as in the paper."
         )

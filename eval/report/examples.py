@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -120,15 +120,19 @@ def find_examples(folder: Path, labels: Mapping[str, str] | None = None) -> list
     without a variance and frames without any row are left out. Raises ValueError: a file cannot be read or its maps do
     not fit; the message names it.
     """
-    files = sorted((folder / "examples").glob("*.npz"))
-    stems = {file.stem: file for file in files}
+    stems = {file.stem: file for file in sorted((folder / "examples").glob("*.npz"))}
     # A frame's name may hold an "@", as a setting's does: a row's file is one whose frame has a file of its own.
-    owner = {stem: _frame_of(stem, stems) for stem in stems}
-    examples = []
-    for frame in sorted(stem for stem, of in owner.items() if of is None):
-        of_frame = {stem[len(frame) + 1 :]: stems[stem] for stem, of in owner.items() if of == frame}
-        examples += _load(folder, frame, stems[frame], of_frame, labels or {})
-    return examples
+    rows: dict[str, dict[str, Path]] = {}
+    for stem, file in stems.items():
+        cuts = [at for at, letter in enumerate(stem) if letter == "@" and stem[:at] in stems]
+        if cuts:
+            rows.setdefault(stem[: cuts[0]], {})[stem[cuts[0] + 1 :]] = file
+    about = folder.parent.name, folder.name
+    return [
+        Example(*about, frame, **scene, rows=maps, labels=labels or {})
+        for frame, row_files in sorted(rows.items())
+        for scene, maps in _cameras(stems[frame], row_files)
+    ]
 
 
 def load_arrays(file: Path, names: Sequence[str]) -> dict[str, NDArray]:
@@ -140,18 +144,8 @@ def load_arrays(file: Path, names: Sequence[str]) -> dict[str, NDArray]:
     return arrays
 
 
-def _frame_of(stem: str, stems: Mapping[str, Path]) -> str | None:
-    """The frame whose row a file holds, None if it is a frame itself."""
-    for at in (i for i, letter in enumerate(stem) if letter == "@"):
-        if stem[:at] in stems:
-            return stem[:at]
-    return None
-
-
-def _load(
-    folder: Path, frame: str, file: Path, row_files: Mapping[str, Path], labels: Mapping[str, str]
-) -> list[Example]:
-    """The examples of one frame, one for each camera that its rows have."""
+def _cameras(file: Path, row_files: Mapping[str, Path]) -> Iterable[tuple[dict[str, Any], dict[str, RowMaps]]]:
+    """Image, truth and K of each camera that the rows of a frame have, and their maps."""
     common = load_arrays(file, _SCENE)
     cameras: dict[bytes, tuple[dict[str, Any], dict[str, RowMaps]]] = {}
     for row, row_file in row_files.items():
@@ -164,5 +158,4 @@ def _load(
         if "variance" in maps:
             camera = scene["K"].astype(np.float64).tobytes() + repr(scene["truth"].shape).encode()
             cameras.setdefault(camera, (scene, {}))[1][row] = RowMaps(**maps)
-    about = (folder.parent.name, folder.name, frame)
-    return [Example(*about, **scene, rows=rows, labels=labels) for scene, rows in cameras.values()]
+    return cameras.values()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 from ufmstar_torch.eval.report import style
@@ -19,7 +18,8 @@ STAGES = {
 
 
 def draw_stages(results: Results) -> Any | None:
-    """Shares of the stages in a step of UfM*, the paper's figure; None unless ``efficiency.json`` has it."""
+    """Shares of the stages in a step of UfM*, the paper's figure, with their numbers where there is room and the sum
+    behind; None unless ``efficiency.json`` has it."""
     measured = [] if results.efficiency is None else architectures(results.efficiency)
     staged = [row for run in measured for row in run["rows"] if row.get("stages")]
     if not staged:
@@ -28,7 +28,16 @@ def draw_stages(results: Results) -> Any | None:
     axes = figure.subplots()
     for y, row in enumerate(staged):
         times = {name: row["stages"]["stages"][name]["median_ms"] for name in STAGES if name in row["stages"]["stages"]}
-        _draw_stages(axes, y, times)
+        total, left = math.fsum(times.values()), 0.0
+        for name, ms in times.items():
+            share = 100 * ms / total
+            axes.barh(y, share, left=left, color=STAGES[name], height=0.62, edgecolor="white", linewidth=0.5)
+            if share >= 6:
+                letters = INK if name in ("regress", "average") else "white"  # dark on the light colours
+                words = {"size": style.TICK, "color": letters, "ha": "center", "va": "center"}
+                axes.text(left + share / 2, y, f"{share:.0f} %", **words)
+            left += share
+        axes.text(101, y, f"{total:.1f} ms", size=style.TICK, color=INK, va="center")
     axes.set_yticks(range(len(staged)), [plain(f"{row['row']}\n{row['network']}") for row in staged])
     style.finish(axes, x="share of the step [%], medians of its stages")
     axes.grid(visible=False)
@@ -38,17 +47,3 @@ def draw_stages(results: Results) -> Any | None:
     handles = [Patch(color=colour, label=name) for name, colour in STAGES.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=style.TICK)
     return figure
-
-
-def _draw_stages(axes: Any, y: int, times: Mapping[str, float]) -> None:
-    """One bar of shares, with their numbers where there is room, and the sum behind."""
-    total, left = math.fsum(times.values()), 0.0
-    for name, ms in times.items():
-        share = 100 * ms / total
-        axes.barh(y, share, left=left, color=STAGES[name], height=0.62, edgecolor="white", linewidth=0.5)
-        if share >= 6:
-            letters = INK if name in ("regress", "average") else "white"  # dark on the light colours
-            words = {"size": style.TICK, "color": letters, "ha": "center", "va": "center"}
-            axes.text(left + share / 2, y, f"{share:.0f} %", **words)
-        left += share
-    axes.text(101, y, f"{total:.1f} ms", size=style.TICK, color=INK, va="center")

@@ -31,28 +31,31 @@ _BY_ORDER = (("#6b6b6b", "^"), ("#E69F00", "s"), ("#0072B2", "o"), ("#009E73", "
 
 def draw_calibration(results: Results, dataset: str) -> Any | None:
     """Both curves over all pixels of a data set, a column per network; None where no row has a variance."""
-    merged = {row: results.merged.get((dataset, row)) for row in results.default_rows()}
-    curves = {row: sums.curves for row, sums in merged.items() if sums is not None and _has_curves(sums.curves)}
-    panels = {
-        base: ((BASES[base][0], ""), {row: values for row, values in curves.items() if row.method.base == base})
-        for base in dict.fromkeys(row.method.base for row in curves)
-    }
+    panels: dict[str, dict[Row, Curves]] = {}
+    for row in results.default_rows():
+        if _has_curves(values := results.merged.get((dataset, row), {})):
+            panels.setdefault(row.method.base, {})[row] = values
     if not panels:
         return None
     title = f"Calibration on {dataset}, {count(len(results.sequences(dataset)), 'sequence')}"
-    return _draw_columns(title, list(panels.values()), PER_LINE, (0.9, 4.1, 0.4, 6.0), ends=True)
+    named = [((BASES[base][0], ""), curves) for base, curves in panels.items()]
+    return _draw_columns(title, named, PER_LINE, (0.9, 4.1, 0.4, 6.0), ends=True)
 
 
 def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any | None:
-    """Both curves of single sequences, from the one on which UfM* is best to that on which it is worst."""
+    """Both curves of at most ``MOST_SEQUENCES`` sequences, evenly from the one on which UfM* (or the last row) has the
+    smallest ECE_delta to that on which it has the largest."""
+    of = {row: [r for r in results.of(row, dataset) if _has_curves(r.curves)] for row in results.default_rows(base)}
+    rows = [row for row, records in of.items() if records]
+    if not rows:
+        return None
+    ordered = sorted(of[_ours(rows)], key=lambda r: (value_of(r, "ece_delta"), r.sequence))
+    chosen = np.linspace(0, len(ordered) - 1, min(len(ordered), MOST_SEQUENCES)).round().astype(int)
     panels = []
-    for name in chosen_sequences(results, dataset, base):
-        of = {row: results.of(row, dataset, name) for row in results.default_rows(base)}
-        shown = {row: records[0] for row, records in of.items() if records and _has_curves(records[0].curves)}
+    for name in (ordered[i].sequence for i in chosen):
+        shown = {row: record for row in rows for record in of[row] if record.sequence == name}
         titles = (f"{name}\n{_errors(shown, 'ece_delta', 'δ')}", _errors(shown, "ece_q", "q"))
         panels.append((titles, {row: record.curves for row, record in shown.items()}))
-    if not panels:
-        return None
     title = f"Calibration on single sequences of {dataset}, {BASES[base][0]}; errors alone → UfM*, from best to worst"
     figure = _draw_columns(title, panels, 4, (0.4, 2.45, 0.7, 4.9), ends=False)
     from matplotlib.lines import Line2D
@@ -63,17 +66,9 @@ def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any 
     return figure
 
 
-def chosen_sequences(results: Results, dataset: str, base: str) -> list[str]:
-    """At most ``MOST_SEQUENCES``, evenly over the order of the ECE_delta of a base's UfM* (or last row)."""
-    of = {row: [r for r in results.of(row, dataset) if _has_curves(r.curves)] for row in results.default_rows(base)}
-    rows = [row for row, records in of.items() if records]
-    if not rows:
-        return []
-    judge = next((row for row in rows if row.method.fusion == UFM_STAR and not row.method.full), rows[-1])
-    names = [r.sequence for r in sorted(of[judge], key=lambda r: (value_of(r, "ece_delta"), r.sequence))]
-    if len(names) <= MOST_SEQUENCES:
-        return names
-    return [names[i] for i in np.linspace(0, len(names) - 1, MOST_SEQUENCES).round().astype(int)]
+def _ours(rows: Sequence[Row]) -> Row:
+    """UfM*, or the last row."""
+    return next((row for row in rows if row.method.fusion == UFM_STAR and not row.method.full), rows[-1])
 
 
 def _draw_columns(
@@ -98,36 +93,33 @@ def _draw_columns(
     axes = style.hidden_panels(figure, 2 * lines, columns)
     for number, (titles, curves) in enumerate(panels):
         line, column = divmod(number, columns)
-        ordered = sorted(curves.items(), key=lambda item: (item[0].method.fusion == UFM_STAR, item[0].method.full))
-        drawn = {style.look_of(row.method): values for row, values in ordered}
-        named = ends or column == 0
+        ordered = sorted(curves, key=lambda row: (row.method.fusion == UFM_STAR, row.method.full))
+        drawn = {style.look_of(row.method): curves[row] for row in ordered}
         for below, (words, own) in enumerate(zip((DELTA, QUANTILE), titles, strict=True)):
-            _draw_shares(axes[2 * line + below, column], words, drawn, own, named, ends)
+            panel = axes[2 * line + below, column]
+            _draw_shares(panel, words, drawn, own, named=ends or column == 0)
+            if ends:
+                style.name_lines(panel)
     return figure
 
 
 def _draw_shares(
-    axes: Any, words: tuple[str, str], lines: Mapping[Look, Curves], title: str, named: bool, ends: bool
+    axes: Any, words: tuple[str, str], lines: Mapping[Look, Curves], title: str, *, named: bool = True
 ) -> None:
     """Confidence that the depth is within 25 %, and how often it is (``DELTA``), or predicted quantiles and the share
     of the truth below them (``QUANTILE``), in the unit square with its diagonal."""
     axes.set_visible(True)
     axes.plot([0, 1], [0, 1], linestyle="--", linewidth=1.0, color=FAINT, label="exactly right")
     for look, values in lines.items():
-        x, y = _confidence(values) if words is DELTA else (values["ece_q_levels"], values["ece_q_observed"])
+        x, y = (np.array(values[f"ece_q_{name}"], float) for name in ("levels", "observed"))
+        if words is DELTA:
+            names = ("confidence", "accuracy", "pixels")
+            x, y, pixels = (np.array(values[f"ece_delta_{name}"], float) for name in names)
+            kept = pixels > 0.001 * pixels.sum()  # bins that have more than hardly a pixel
+            x, y = x[kept], y[kept]
         axes.plot(x, y, clip_on=False, **look.line)
     axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", xticks=[0, 0.5, 1], yticks=[0, 0.5, 1])
     style.finish(axes, title=title, x=words[0], y=words[1] if named else "")
-    if ends:
-        style.name_lines(axes)
-
-
-def _confidence(values: Curves) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Confidence and accuracy of the bins that have more than hardly a pixel."""
-    named = ("ece_delta_confidence", "ece_delta_accuracy", "ece_delta_pixels")
-    confidence, accuracy, pixels = (np.array(values[name], float) for name in named)
-    kept = pixels > 0.001 * pixels.sum()
-    return confidence[kept], accuracy[kept]
 
 
 def _has_curves(curves: Mapping[str, Any]) -> bool:
@@ -139,8 +131,7 @@ def _has_curves(curves: Mapping[str, Any]) -> bool:
 def _errors(records: Mapping[Row, Record], key: str, letter: str) -> str:
     """The calibration errors of the base alone and of UfM*, or of the first and the last row."""
     rows = list(records)
-    ours = next((row for row in rows if row.method.fusion == UFM_STAR and not row.method.full), rows[-1])
-    values = (f"{value_of(records[row], key):.3f}" for row in dict.fromkeys((rows[0], ours)))
+    values = (f"{value_of(records[row], key):.3f}" for row in dict.fromkeys((rows[0], _ours(rows))))
     return f"ECE_{letter} {' → '.join(values)}"
 
 
@@ -153,16 +144,16 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
     figure = style.new_figure(12.6, 4.6, title)
     delta, quantiles, sparse = figure.subplots(1, 3)
     lines = {Look(name, *look): curves[name] for name, look in zip(curves, _BY_ORDER, strict=False)}
-    _draw_shares(delta, DELTA, lines, "δ calibration", named=True, ends=False)
-    _draw_shares(quantiles, QUANTILE, lines, "quantile calibration", named=True, ends=False)
+    _draw_shares(delta, DELTA, lines, "δ calibration")
+    _draw_shares(quantiles, QUANTILE, lines, "quantile calibration")
     for look, values in lines.items():
         x = np.arange(len(values["sparsification_rmse"])) / len(values["sparsification_rmse"])
         sparse.plot(x, values["sparsification_rmse"], markevery=10, **look.line)
         sparse.plot(x, values["sparsification_oracle_rmse"], linewidth=1.0, linestyle=":", color=look.colour)
     sparse.set_xlim(0, 1)
     sparse.set_ylim(bottom=0)
-    words = ("sparsification (dotted: best possible)", "share of pixels left out, largest σ first", "RMSE [m]")
-    style.finish(sparse, title=words[0], x=words[1], y=words[2])
+    title, x_words = "sparsification (dotted: best possible)", "share of pixels left out, largest σ first"
+    style.finish(sparse, title=title, x=x_words, y="RMSE [m]")
     figure.legend(*delta.get_legend_handles_labels(), loc="outside lower center", ncols=len(curves) + 1, frameon=False)
     style.save_figure(figure, path)
 
@@ -199,8 +190,7 @@ def _error_curves(results: Results, dataset: str, base: str) -> dict[str, dict[R
     """Curves by row, by reference: the base alone first, then UfM."""
     curves: dict[str, dict[Row, Sequence[float]]] = {}
     for row in results.default_rows(base):
-        merged = results.merged.get((dataset, row))
-        for name, values in (merged.curves if merged else {}).items():
+        for name, values in results.merged.get((dataset, row), {}).items():
             kind, _, reference = name.partition(":")
             if kind == BY_ERROR and np.isfinite(values).any() and Method.parse(reference).base == base:
                 curves.setdefault(reference, {})[row] = values
@@ -243,45 +233,37 @@ def _histogram(records: Sequence[Record]) -> Histogram:
 
 
 def draw_entropy(results: Results, base: str) -> Any | None:
-    """Environments (indoor, forest, driving, city) below each other on one axis; None where no row of the base has a
-    variance."""
+    """Environments (indoor, forest, driving, city) below each other on one axis, the mean of each row as a dashed line
+    with its name beside; None where no row of the base has a variance."""
     panels = entropies(results, base)
     if not panels:
         return None
     figure = style.new_figure(7.6, 1.0 + 2.1 * len(panels), f"Predictive entropy by environment, {BASES[base][0]}")
     axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True)[:, 0]
-    low, high = entropy_range([histogram for rows in panels.values() for histogram in rows.values()])
+    low, high = _entropy_range([histogram for rows in panels.values() for histogram in rows.values()])
     for panel, (environment, rows) in zip(axes, panels.items(), strict=True):
         panel.set_xlim(low, high)
-        _draw_histograms(panel, rows)
+        for number, (row, histogram) in enumerate(rows.items()):
+            look, density, edges = style.look_of(row.method), histogram.density, histogram.edges
+            panel.stairs(density, edges, color=look.colour, linewidth=1.5, label=look.name)
+            if row.method.fusion == UFM_STAR and not row.method.full:
+                panel.stairs(density, edges, color=look.colour, alpha=0.15, fill=True)
+            panel.axvline(histogram.mean, color=look.colour, linestyle="--", linewidth=1.1)
+            below = histogram.counts[0] / histogram.counts.sum()  # of V = 0 above all
+            remark = "" if below < 0.005 else f"\n({100 * below:.0f} % with hardly any V)"
+            how = {"color": look.colour, "size": style.TICK, "va": "top", "transform": panel.transAxes}
+            panel.text(1.02, 0.95 - 0.13 * number, f"{look.name}: mean {histogram.mean:.2f}{remark}", **how)
+        panel.set_ylim(bottom=0)
         style.finish(panel, title=environment, y="share of pixels per nat")
     axes[-1].set_xlabel("entropy ½ ln(2πeV) [nats]", size=style.LABEL, color=INK)
     return figure
 
 
-def entropy_range(histograms: Sequence[Histogram]) -> tuple[float, float]:
-    """The range from the first to the last bin with more than 0.1 % of some row's pixels, and half a nat around."""
+def _entropy_range(histograms: Sequence[Histogram]) -> tuple[float, float]:
+    """From the first to the last bin with more than 0.1 % of some row's pixels, and half a nat around."""
     edges = histograms[0].edges
     shares = np.array([histogram.counts / histogram.counts.sum() for histogram in histograms])
     filled = np.flatnonzero(shares[:, 1:-1].max(0) > 0.001)
     if not len(filled):
         return float(edges[0]), float(edges[-1])
     return max(edges[filled[0]] - 0.5, float(edges[0])), min(edges[filled[-1] + 1] + 0.5, float(edges[-1]))
-
-
-def _draw_histograms(axes: Any, rows: Mapping[Row, Histogram]) -> None:
-    """Histograms, and the mean of each as a dashed line with its name beside."""
-    for number, (row, histogram) in enumerate(rows.items()):
-        look = style.look_of(row.method)
-        axes.stairs(histogram.density, histogram.edges, color=look.colour, linewidth=1.5, label=look.name)
-        if row.method.fusion == UFM_STAR and not row.method.full:
-            axes.stairs(histogram.density, histogram.edges, color=look.colour, alpha=0.15, fill=True)
-        axes.axvline(histogram.mean, color=look.colour, linestyle="--", linewidth=1.1)
-        # Pixels below the histogram: V = 0 above all.
-        below = histogram.counts[0] / histogram.counts.sum()
-        remark = "" if below < 0.005 else f"\n({100 * below:.0f} % with hardly any V)"
-        words = f"{look.name}: mean {histogram.mean:.2f}{remark}"
-        axes.text(
-            1.02, 0.95 - 0.13 * number, words, color=look.colour, size=style.TICK, va="top", transform=axes.transAxes
-        )
-    axes.set_ylim(bottom=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from typing import Any, NamedTuple
@@ -17,9 +17,9 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import CORNERS, DEFAULTS, DENSE, TRUTH, default_of
 from ufmstar_torch.eval.report import names, style
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.means import Mean, mean_of
+from ufmstar_torch.eval.report.means import mean_of
 from ufmstar_torch.eval.report.style import Look
-from ufmstar_torch.eval.run.colours import FAINT, INK, plain
+from ufmstar_torch.eval.run.colours import FAINT
 from ufmstar_torch.eval.suite.record import Record
 
 COUNT = "anchor_count"
@@ -58,9 +58,7 @@ class SweepLine:
 def sweeps(results: Results) -> list[tuple[str, str]]:
     """(base, setting) of every setting of which some line has at least three numbers."""
     varied = dict.fromkeys((row.method.base, name) for row in results.rows for name in _changed(row))
-    return [
-        (base, name) for base, name in varied if any(len(line.points) >= 3 for line in sweep_lines(results, base, name))
-    ]
+    return [key for key in varied if any(len(line.points) >= 3 for line in sweep_lines(results, *key))]
 
 
 def sweep_lines(results: Results, base: str, name: str) -> list[SweepLine]:
@@ -85,7 +83,7 @@ def sweep_lines(results: Results, base: str, name: str) -> list[SweepLine]:
         return Point(value, tuple(rows), tuple(record for row in rows for record in results.of(row)))
 
     return [
-        SweepLine(method, rest, tuple(point(value, by_value[value]) for value in sorted(by_value)))
+        SweepLine(method, rest, tuple(point(value, rows) for value, rows in sorted(by_value.items())))
         for (method, rest), by_value in groups.items()
     ]
 
@@ -139,60 +137,51 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
         if line.rest:
             looks[line] = Look(line.words or looks[line].name, *(_FIXED.get(line.rest) or next(others)))
     shown = (*SHOWN, names.SPEARMAN) if any("anchors" in dict(line.rest) for line in drawn) else SHOWN
+    values = sorted({point.value for line in drawn if len(line.points) > 1 for point in line.points})
     word, unit = names.SETTINGS.get(name, (names.setting_name(name), ""))
     title = f"{word[:1].upper()}{word[1:]}: {BASES[base][0]}, {names.count(len(results.sequences()), 'sequence')}"
     figure = style.new_figure(4.0 * len(shown), 3.4, title)
     for panel, quantity in zip(figure.subplots(1, len(shown)), shown, strict=True):
-        means = {line: {p.value: mean_of(p.records, quantity) for p in line.points} for line in looks}
-        reached = _draw(panel, means, looks)
-        style.finish(panel, title=f"{quantity.heading}, mean over sequences")
-        _scale(panel, [point.value for line in drawn if len(line.points) > 1 for point in line.points])
-        _tame(panel, name, reached)
-        panel.set_xlabel(plain(f"{word} [{unit}]" if unit else word), size=style.LABEL, color=INK)
+        reached = [y for line, look in looks.items() for y in _draw_line(panel, line, look, quantity)]
+        x_words = f"{word} [{unit}]" if unit else word
+        style.finish(panel, title=f"{quantity.heading}, mean over sequences", x=x_words)
+        _scale(panel, values)
+        # Values so high that the others would lie on one line; intervals of such means reach as far beyond 0.
+        if max(map(abs, reached), default=0.0) > _HIGH:
+            panel.set_yscale("symlog", linthresh=1.0)
+            panel.set_ylim(3 * min(-0.1, *reached), 3 * max(0.1, *reached))
+        if not math.isnan(default := default_value(name)):
+            panel.axvline(default, color=FAINT, linewidth=0.8, linestyle=":", zorder=0)
+        style.name_lines(panel)
     return figure
 
 
-def _draw(axes: Any, curves: Mapping[SweepLine, Mapping[float, Mean]], looks: Mapping[SweepLine, Look]) -> list[float]:
-    """Means over the values of a setting with their bands, by line; dashed without a band for reference. Returns the
-    values reached."""
-    reached: list[float] = []
-    for line, means in curves.items():
-        kept = [(x, mean.value, mean.half) for x, mean in means.items() if not math.isnan(mean.value)]
-        if not kept:
-            continue
-        x, y, half = np.array(kept).T
-        look = looks[line]
-        dashed: dict[str, Any] = {"color": look.colour, "linestyle": "--", "linewidth": 1.4, "label": look.name}
-        if line.method.fusion != ALONE and len(line.points) > 1:
-            axes.plot(x, y, **look.line)
-            axes.fill_between(x, y - half, y + half, color=look.colour, alpha=0.15, linewidth=0)
-        elif len(means) == 1:
-            axes.axhline(y[0], **dashed)
-        else:
-            axes.plot(x, y, **dashed)
-        reached += [value for value in y.tolist() if math.isfinite(value)]
-    return reached
-
-
-def _tame(axes: Any, name: str, reached: Sequence[float]) -> None:
-    """Mark the default, and name the lines.
-
-    Logarithmic beyond 1 where values are so high that the others would lie on one line, and cut to the values:
-    intervals of such means reach as far to the other side of 0.
-    """
-    if max(map(abs, reached), default=0.0) > _HIGH:
-        axes.set_yscale("symlog", linthresh=1.0)
-        axes.set_ylim(3 * min(-0.1, *reached), 3 * max(0.1, *reached))
-    value = default_value(name)
-    if not math.isnan(value):
-        axes.axvline(value, color=FAINT, linewidth=0.8, linestyle=":", zorder=0)
-    style.name_lines(axes)
+def _draw_line(axes: Any, line: SweepLine, look: Look, quantity: names.Quantity) -> list[float]:
+    """Means over the values of a setting with their band; dashed without a band for reference. Returns the finite
+    values."""
+    means = [(point.value, mean_of(point.records, quantity)) for point in line.points]
+    known = [(x, mean.value, mean.half) for x, mean in means if not math.isnan(mean.value)]
+    if not known:
+        return []
+    x, y, half = np.array(known).T
+    dashed: dict[str, Any] = {"color": look.colour, "linestyle": "--", "linewidth": 1.4, "label": look.name}
+    if line.method.fusion != ALONE and len(means) > 1:
+        axes.plot(x, y, **look.line)
+        axes.fill_between(x, y - half, y + half, color=look.colour, alpha=0.15, linewidth=0)
+    elif len(means) == 1:
+        axes.axhline(y[0], **dashed)
+    else:
+        axes.plot(x, y, **dashed)
+    return [value for value in y.tolist() if math.isfinite(value)]
 
 
 def _scale(axes: Any, values: Sequence[float]) -> None:
-    """Logarithmic where values span a factor of 20 or more, with a tick for every value of a few."""
-    style.stretch(axes, values, 20, linthresh=1.0, linscale=0.5)
-    ticks = sorted(set(values))
-    if len(ticks) <= 9:
-        axes.set_xticks(ticks, [f"{value:g}" for value in ticks])
+    """Logarithmic where values span a factor of 20 or more, with a linear piece about 0 where 0 is among them; a tick
+    for every value of a few."""
+    positive = [value for value in values if value > 0]
+    if positive and max(positive) >= 20 * min(positive):
+        about_zero = {} if values[0] > 0 else {"linthresh": min(positive), "linscale": 0.5}
+        axes.set_xscale("symlog" if about_zero else "log", **about_zero)
+    if len(values) <= 9:
+        axes.set_xticks(values, [f"{value:g}" for value in values])
         axes.minorticks_off()

@@ -7,7 +7,7 @@ import io
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -42,20 +42,23 @@ def write_page(
     main, *further = overview(results).values()
     cost = [] if results.efficiency is None else efficiency_tables(results.efficiency)
     folder = results.out / "figures"
+    made = {name: results.about.get(name) for name in ("networks", "settings", "versions", "machine")}
+    digests = {f"{r.dataset}, {r.sequence}": r.provenance.get("sequence") for r in results.records}
+    made["sequences (SHA-256)"] = {name: digest for name, digest in digests.items() if digest}
     text = _template().render(
         results=results,
         networks=", ".join(dict.fromkeys(record.network for record in results.records)),
         main=main,
-        curves=[_figure(path) for kind in CURVES for path in figures if path.stem.startswith(kind)],
+        curves=_figures(figures, CURVES),
         pictures=[(picture, _embedded(folder / picture.file)) for picture in pictures],
-        cost_figures=[_figure(path) for kind in COST for path in figures if path.stem.startswith(kind)],
+        cost_figures=_figures(figures, COST),
         cost=[table for table in cost if not table.is_empty],
         further=[table for tables in further for table in tables.values()],
         sequences=[table for dataset in results.datasets for table in sequence_tables(results, dataset)],
         limits=limits(results, undrawn or {}),
         min_sequences=MIN_SEQUENCES,
         command=command(results.about),
-        made=json.dumps(_made(results), indent=1, ensure_ascii=False, default=str),
+        made=json.dumps(made, indent=1, ensure_ascii=False, default=str),
     )
     path = results.out / PAGE
     write_atomic(path, lambda file: file.write(text.encode()))
@@ -67,13 +70,8 @@ def _template() -> Any:
     from markupsafe import Markup
 
     # Every template is HTML whatever its file is called: select_autoescape would leave out ".j2".
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    how: dict[str, Any] = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=FileSystemLoader(TEMPLATES), **how)
     environment.filters["typeset"] = lambda text: Markup(typeset(text))
     for name in ("css", "js"):
         environment.globals[name] = Markup((TEMPLATES / f"report.{name}").read_text(encoding="utf-8"))
@@ -86,9 +84,10 @@ def typeset(text: str) -> str:
     return text.replace(" ± ", "\u202f±\u202f").replace(" %", "\u202f%")
 
 
-def _figure(path: Path) -> tuple[str, str, bool]:
-    """Words, a data URI, and whether it is of single sequences, which are folded."""
-    return path.stem.replace("_", " ").replace("-", " "), _embedded(path), "-sequences-" in path.stem
+def _figures(paths: Sequence[Path], kinds: Sequence[str]) -> list[tuple[str, str, bool]]:
+    """Words, a data URI, and whether it is of single sequences, which are folded, of the figures of some kinds."""
+    chosen = (path for kind in kinds for path in paths if path.stem.startswith(kind))
+    return [(re.sub("[_-]", " ", path.stem), _embedded(path), "-sequences-" in path.stem) for path in chosen]
 
 
 def _embedded(path: Path) -> str:
@@ -115,10 +114,17 @@ def limits(results: Results, undrawn: Mapping[str, str]) -> list[tuple[str, tupl
             why = "; ".join(f"{n} × {reason}" for reason, n in reasons.items())
             counts = (str(frames.get("selected", "")), str(frames.get("done", "")))
             skipped[record.dataset, record.sequence, *counts, why] = None
+    idle = []
+    for row, label in row_labels(results.rows).items():
+        for dataset in results.datasets:
+            of = [record.frames for record in results.of(row, dataset)]
+            counted = [sum(f.get(key, 0) for f in of) for key in ("done", "without_segment", "without_match")]
+            if any(counted[1:]):
+                idle.append((dataset, label, *map(str, counted)))
     where = ("data set", "sequence")
     tables: list[tuple[str, tuple[str, ...], list[tuple[str, ...]]]] = [
-        ("Sequences that failed", (*where, "reason"), [(f.dataset, f.sequence, f.reason) for f in results.failed]),
-        ("Frames in which UfM* compared no views", _IDLE, list(_idle(results))),
+        ("Sequences that failed", (*where, "reason"), [*results.failed]),
+        ("Frames in which UfM* compared no views", _IDLE, idle),
         ("Frames that were skipped", (*where, "frames", "used", "reasons"), list(skipped)),
         ("Rows not evaluated yet", (*where, "rows"), [(*key, str(n)) for key, n in missing.items()]),
         ("Rows without a network", ("kind of network",), [(b,) for b in results.about.get("missing_bases") or ()]),
@@ -126,23 +132,6 @@ def limits(results: Results, undrawn: Mapping[str, str]) -> list[tuple[str, tupl
         ("Further problems", ("problem",), [(note,) for note in results.notes]),
     ]
     return [table for table in tables if table[2]]
-
-
-def _idle(results: Results) -> Iterator[tuple[str, ...]]:
-    """Rows of UfM* with frames without a segment or match, with their numbers over a data set."""
-    for row, label in row_labels(results.rows).items():
-        for dataset in results.datasets:
-            frames = [record.frames for record in results.of(row, dataset)]
-            counts = [sum(f.get(key, 0) for f in frames) for key in ("done", "without_segment", "without_match")]
-            if any(counts[1:]):
-                yield dataset, label, *map(str, counts)
-
-
-def _made(results: Results) -> dict[str, Any]:
-    """Description of the evaluation: networks, settings, versions, machine, digests of what was read."""
-    named = {name: results.about.get(name) for name in ("networks", "settings", "versions", "machine")}
-    digests = {f"{r.dataset}, {r.sequence}": r.provenance.get("sequence") for r in results.records}
-    return {**named, "sequences (SHA-256)": {name: digest for name, digest in digests.items() if digest}}
 
 
 def command(about: Mapping[str, Any]) -> str:

@@ -47,9 +47,8 @@ def pictures_of(results: Results, folder: Path) -> Iterator[tuple[str, Callable[
     """Name and function of strips, breakdowns, comparisons and rooms of the example frames; the function writes the
     picture into ``folder``. Raises ValueError: an example cannot be read; the message names the file.
     """
-    rows = {row.slug: row for row in results.rows}
-    yield from _of_frames(results, folder, rows)
-    yield from _of_rooms(results, folder, rows)
+    yield from _of_frames(results, folder)
+    yield from _of_rooms(results, folder)
 
 
 def file_name(*parts: str) -> str:
@@ -65,9 +64,11 @@ Drawing = tuple[str, Callable[[], Picture]]
 
 def choose(examples: Sequence[Example], most: int) -> list[Example]:
     """Frames of as many sequences as possible: the last of each first, since by then most has been seen twice."""
-    turns: list[tuple[int, int, Example]] = []
-    for number, (_, group) in enumerate(groupby(examples, key=lambda e: (e.dataset, e.sequence))):
-        turns += [(turn, number, example) for turn, example in enumerate(reversed(list(group)))]
+    turns = [
+        (turn, number, example)
+        for number, (_, group) in enumerate(groupby(examples, key=lambda e: (e.dataset, e.sequence)))
+        for turn, example in enumerate(reversed(list(group)))
+    ]
     first = sorted(turns, key=lambda entry: entry[:2])[:most]
     return [example for _, _, example in sorted(first, key=lambda entry: (entry[1], entry[0]))]
 
@@ -81,45 +82,44 @@ def strip_rows(rows: Sequence[Row], base: str) -> list[Row]:
     return [*by_fusion[ALONE], *(pruned or by_fusion[UFM])[:1], *by_fusion[UFM_STAR]]
 
 
-def _of_frames(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Drawing]:
-    labels = {row.slug: label for row, label in row_labels(rows.values()).items()}
+def _of_frames(results: Results, folder: Path) -> Iterator[Drawing]:
+    labels = {row.slug: label for row, label in row_labels(results.rows).items()}
     examples = [
         replace(example, dataset=dataset, sequence=sequence)
         for dataset, sequence in results.sequences()
         for example in find_examples(_folder_of(results, dataset, sequence), labels)
     ]
     for e in choose(examples, MOST_FRAMES):
-        shown = [row for slug, row in rows.items() if slug in e.rows]
+        shown = [row for row in results.rows if row.slug in e.rows]
         bases = dict.fromkeys(row.method.base for row in shown)
+        strips = {base: strip_rows(shown, base) for base in bases}
         frame = f"{e.sequence}, frame {e.frame}"
-        for base in bases:
+        for base, strip in strips.items():
             corrected = [row for row in shown if row.method.base == base and row.setting.posterior]
-            of_base = [row.slug for row in (*strip_rows(shown, base), *corrected)]
-            if of_base:
+            if of_base := [row.slug for row in (*strip, *corrected)]:
                 yield f"{frame}: strip of {base}", partial(draw_strip, folder, e, of_base, base)
-        parts = [row for base in _BREAKDOWN_BASES for row in strip_rows(shown, base) if row.method.fusion != UFM]
+        parts = [row for base in _BREAKDOWN_BASES for row in strips.get(base, ()) if row.method.fusion != UFM]
         if any(row.method.fusion == UFM_STAR for row in parts):
             yield f"{frame}: breakdown", partial(draw_breakdown, folder, e, [row.slug for row in parts])
-        for base in bases:
-            pair = [row.slug for row in strip_rows(shown, base) if row.method.fusion != ALONE]
+        for base, strip in strips.items():
+            pair = [row.slug for row in strip if row.method.fusion != ALONE]
             if len(pair) == 2:
                 yield f"{frame}: comparison of {base}", partial(draw_comparison, folder, e, pair, base)
 
 
-def _of_rooms(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Drawing]:
+def _of_rooms(results: Results, folder: Path) -> Iterator[Drawing]:
     drawn = 0
     for dataset, sequence in results.sequences():
         rooms = find_rooms(_folder_of(results, dataset, sequence))
         # One row of each room is enough: the suite's first UfM* with its default settings.
-        slug = next((s for s, row in rows.items() if s in rooms and row.setting.plain), None)
-        if slug is None or drawn == MOST_ROOMS:
+        row = next((row for row in results.rows if row.slug in rooms and row.setting.plain), None)
+        if row is None or drawn == MOST_ROOMS:
             continue
-        snapshots = choose_times(rooms[slug])
+        snapshots = choose_times(rooms[row.slug])
         if any(len(snapshot.mean) for snapshot in snapshots):
             drawn += 1
-            name = file_name(ROOM, dataset, sequence, slug)
-            label = row_labels([rows[slug]])[rows[slug]]
-            yield f"{sequence}: room", partial(_room, folder, name, label, sequence, snapshots)
+            path = folder / file_name(ROOM, dataset, sequence, row.slug)
+            yield f"{sequence}: room", partial(_room, path, row_labels([row])[row], sequence, snapshots)
 
 
 def _folder_of(results: Results, dataset: str, sequence: str) -> Path:
@@ -130,17 +130,28 @@ def _folder_of(results: Results, dataset: str, sequence: str) -> Path:
 # ---- drawing: each writes its PNG into the folder and returns its words ----
 
 
-def _picture(example: Example, rows: Sequence[str], kind: str, base: str, title: str, caption: str) -> Picture:
-    """The name and the words of a picture; rows are listed with their mean NLL for those who cannot see it."""
+def _picture(
+    folder: Path,
+    example: Example,
+    rows: Sequence[str],
+    kind: str,
+    base: str,
+    words: tuple[str, str],
+    grid: Sequence[GridRow],
+    bars: Sequence[Bar],
+) -> Picture:
+    """Draw a grid; its ``words`` are title and caption. Rows are listed with their mean NLL for those who cannot see
+    it."""
     means = ((example.label(row), mean_nll(example, row)) for row in rows)
     listed = ", ".join(f"{label} ({'no NLL' if nll is None else f'mean NLL {nll:.2f}'})" for label, nll in means)
     name = file_name(kind, example.dataset, example.sequence, example.frame, *filter(None, (base,)))
-    title = f"{example.sequence}, frame {example.frame}: {title}"
-    return Picture(name, title, caption, f"{title}; {listed}")
+    draw_grid(folder / name, grid, bars, aspect=example.aspect)
+    title = f"{example.sequence}, frame {example.frame}: {words[0]}"
+    return Picture(name, title, words[1], f"{title}; {listed}")
 
 
-def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequence[Snapshot]) -> Picture:
-    scale = draw_room(folder / name, snapshots, f"{label}, {sequence}")
+def _room(path: Path, label: str, sequence: str, snapshots: Sequence[Snapshot]) -> Picture:
+    scale = draw_room(path, snapshots, f"{label}, {sequence}")
     counts = " then ".join(str(len(snapshot.mean)) for snapshot in snapshots)
     caption = (
         "Each Gaussian is an ellipse as large as the patch it stands for. What lies above the camera (the ceiling) is "
@@ -148,7 +159,7 @@ def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequenc
     )
     title = f"{sequence}: the Gaussians of {label}"
     alt = f"{title}: {counts} Gaussians, coloured by disagreement from 0 to {scale.high:.2g} m"
-    return Picture(name, title, caption, alt)
+    return Picture(path.name, title, caption, alt)
 
 
 class PanelScales(NamedTuple):
@@ -185,9 +196,7 @@ def draw_strip(folder: Path, example: Example, rows: Sequence[str], base: str) -
         "A good standard deviation σ looks like the error beside it. NLL is bright where a row is overconfident; its "
         "colours are the same in all strips. Lengths share one scale."
     )
-    picture = _picture(example, rows, STRIP, base, Method(base).name, caption)
-    draw_grid(folder / picture.file, [head, *body], bars, aspect=example.aspect)
-    return picture
+    return _picture(folder, example, rows, STRIP, base, (Method(base).name, caption), [head, *body], bars)
 
 
 def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Picture:
@@ -208,9 +217,7 @@ def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Pictu
         "The parts add up as variances, V = A + E + M; shown are their square roots, in metres, on one scale with the "
         "error. A and E are the network's own, M is the disagreement between the views."
     )
-    picture = _picture(example, rows, BREAKDOWN, "", "parts of the variance", caption)
-    draw_grid(folder / picture.file, body, bars, aspect=example.aspect)
-    return picture
+    return _picture(folder, example, rows, BREAKDOWN, "", ("parts of the variance", caption), body, bars)
 
 
 def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: str) -> Picture:
@@ -233,9 +240,7 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
     bars = [Bar("|error| and σ [m]", scales.length, 1, span=3), Bar("UfM* minus UfM [m]", signed, 4)]
     title = f"{example.label(ufm_star)} against {example.label(ufm)}"
     caption = "Red: UfM* has the larger standard deviation; blue: the smaller."
-    picture = _picture(example, pair, COMPARE, base, title, caption)
-    draw_grid(folder / picture.file, grid, bars, aspect=example.aspect)
-    return picture
+    return _picture(folder, example, pair, COMPARE, base, (title, caption), grid, bars)
 
 
 def _judged(example: Example, row: str, scales: PanelScales) -> tuple[Panel, Panel, Panel]:

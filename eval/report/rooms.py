@@ -60,9 +60,8 @@ def find_rooms(folder: Path) -> dict[str, list[Snapshot]]:
         row, _, frame = file.stem.partition("_")
         if row and frame:
             stored = load_arrays(file, _STORED)
-            arrays = {name: stored[name].astype(np.float64) for name in (*_STORED, "path") if name in stored}
-            mean, covariance, disagreement, count, T = (arrays[name] for name in _STORED)
-            path = arrays.get("path", T[None, :3, 3])
+            mean, covariance, disagreement, count, T = (stored[name].astype(np.float64) for name in _STORED)
+            path = stored.get("path", T[None, :3, 3]).astype(np.float64)
             rooms.setdefault(row, []).append(Snapshot(frame, mean, covariance, disagreement, count, T, path))
     return rooms
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -84,18 +83,6 @@ def name_lines(axes: Any) -> None:
     """The names of the lines, right of a panel."""
     if axes.get_legend_handles_labels()[0]:
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=TICK)
-
-
-def stretch(axes: Any, values: Sequence[float], factor: float, **about_zero: float) -> None:
-    """A logarithmic x axis where values span ``factor`` or more, with a linear piece about 0 where 0 is among them:
-    ``linthresh`` in units of the least positive value, and ``linscale``."""
-    positive = [value for value in values if value > 0]
-    if not positive or max(positive) < factor * min(positive):
-        return
-    if min(values) > 0:
-        axes.set_xscale("log")
-    else:
-        axes.set_xscale("symlog", **about_zero | {"linthresh": about_zero["linthresh"] * min(positive)})
 
 
 def save_figure(figure: Any, path: Path) -> None:

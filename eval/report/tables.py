@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -62,22 +62,23 @@ def sequence_tables(results: Results, dataset: str) -> list[Table]:
         counts = (value_of(listed[0], "frames.done") for listed in records.values())
         frames = max((int(count) for count in counts if count == count), default=0)
         title = f"{name}, {sequence}" + (f": {frames} frames" if frames else "")
-        tables.append(_table(f"{name}-{sequence}", title, records, _figures(records, MAIN, "")))
+        tables.append(_table(f"{name}-{sequence}", title, records, _figures(records, MAIN)))
     return tables
 
 
 def difference_table(results: Results, dataset: str | None = None) -> Table:
     """Row less reference, in pairs on the same sequences; a remark where the interval leaves out 0."""
-    blocks: dict[str, int] = {}
     lines, labels = [], row_labels(results.rows)
-    for row in results.rows:
+    for row in sorted(results.rows, key=lambda row: results.bases.index(row.method.base)):
         listed = results.of(row, dataset)
         for reference in references(results, row) if has_variance(listed) else ():
             means = [difference(listed, results.of(reference, dataset), q) for q in DIFFERENCES]
-            count = max(mean.sequences for mean in means)
-            if count:
-                figures = map(_difference_cell, means, DIFFERENCES)
-                block = blocks.setdefault(row.method.base, len(blocks))
+            if count := max(mean.sequences for mean in means):
+                figures = [
+                    Cell.of(mean, q.decimals, signed=True, remark=_REMARKS[mean.better(q)])
+                    for mean, q in zip(means, DIFFERENCES, strict=True)
+                ]
+                block = results.bases.index(row.method.base)
                 lines.append(Line(block, f"{labels[row]} – {labels[reference]}", (Cell(str(count)), *figures)))
     columns = [Column("", "sequences"), *(Column("", f"Δ {q.heading}") for q in DIFFERENCES)]
     note = (
@@ -85,12 +86,7 @@ def difference_table(results: Results, dataset: str | None = None) -> Table:
         f"{MIN_SEQUENCES} sequences on); better and worse: beyond the interval."
     )
     title = f"{results.title}, paired differences, {_where(results, dataset)}"
-    ordered = sorted(lines, key=lambda line: line.block)
-    return Table("differences", title, "Row – reference", columns, ordered, (note,))
-
-
-def _difference_cell(mean: Mean, quantity: Quantity) -> Cell:
-    return Cell.of(mean, quantity.decimals, signed=True, remark=_REMARKS[mean.better(quantity)])
+    return Table("differences", title, "Row – reference", columns, lines, (note,))
 
 
 class _Figures(NamedTuple):
@@ -106,30 +102,38 @@ def _means(
 ) -> Table:
     """A table of means over the sequences of one data set, or of all; the paper's columns last."""
     records = {row: listed for row in results.rows if (listed := results.of(row, dataset))}
-    alike = len({frozenset((r.dataset, r.sequence) for r in listed) for listed in records.values()}) == 1
     group = "Ours" if quoted else ""
     own = own_quantities(key for r in results.records for key in r.figures) if name == "main" else []
     columns = _figures(records, [*quantities, *own], group)
-    notes = [_network_note(results), _prepared_note(records), _interval_note(records)]
+    networks: dict[str, list[str]] = {}
+    for base in results.bases:
+        networks.setdefault(results.network(base) or "", []).append(base)
+    several = ", ".join(f"{label} ({', '.join(bases)})" for label, bases in networks.items())
+    notes = [f"Network: {next(iter(networks))}." if len(networks) == 1 else f"Networks: {several}."]
+    if words := shared_words(records):
+        notes.append(f"Images of all rows: {words}, resized to the networks' input.")
+    notes.append(_interval_note(max(map(len, records.values()))))
     costs = _costs(results.efficiency, records, group) if name == "main" and results.efficiency else []
     if any(cell.value for column in costs for cell in column.cells.values()):
         columns += costs
         notes.append(_cost_note(results.efficiency or {}))
-    if not alike:
+    if len({frozenset((r.dataset, r.sequence) for r in listed) for listed in records.values()}) > 1:
         counts = {row: Cell(str(len(listed))) for row, listed in records.items()}
-        unmarked = (column._replace(quantity=None) for column in columns)
-        columns = [_Figures(Column(group, "sequences"), counts), *unmarked]
+        columns = [_Figures(Column(group, "sequences"), counts), *(c._replace(quantity=None) for c in columns)]
         notes.append("The rows are means over different sequences, so none is marked as the best.")
     if quoted:
-        columns += _quoted(quoted, records)
+        theirs = {row: quoted.rows.get(row.method.name, {}) for row in plain_rows(records)}
+        for key in quoted.columns:
+            cells = {row: cells[key] for row, cells in theirs.items() if key in cells}
+            columns.append(_Figures(Column("Paper", _PAPER_COLUMNS[key].label), cells))
         notes.append(f"The paper's own figures are of {quoted.network} on {quoted.measured_on}.")
-    title = f"{results.title}, {_where(results, dataset)}"
-    return _table(name, title, records, columns, tuple(filter(None, notes)))
+    return _table(name, f"{results.title}, {_where(results, dataset)}", records, columns, notes)
 
 
-def _figures(records: Mapping[Row, Sequence[Record]], quantities: Sequence[Quantity], group: str) -> list[_Figures]:
-    means = [(q, {row: mean_of(listed, q) for row, listed in records.items()}) for q in quantities]
-    return [_column(quantity, group, of_rows) for quantity, of_rows in means]
+def _figures(
+    records: Mapping[Row, Sequence[Record]], quantities: Sequence[Quantity], group: str = ""
+) -> list[_Figures]:
+    return [_column(q, group, {row: mean_of(listed, q) for row, listed in records.items()}) for q in quantities]
 
 
 def _column(quantity: Quantity, group: str, means: Mapping[Row, Mean]) -> _Figures:
@@ -151,16 +155,6 @@ def _costs(efficiency: Mapping[str, Any], records: Mapping[Row, Sequence[Record]
             sizes = () if network is None else (network + (r.state.get("bytes_mean") or 0.0) for r in listed)
             memory[row] = mean_over(1e-6 * size for size in sizes)
     return [_column(ENERGY, group, energy), _column(MEMORY, group, memory)]
-
-
-def _quoted(quoted: PaperTable, rows: Iterable[Row]) -> list[_Figures]:
-    """The paper's columns, for rows of its own settings."""
-    theirs = {row: quoted.rows.get(row.method.name, {}) for row in plain_rows(rows)}
-    columns = []
-    for key in quoted.columns:
-        head = Column("Paper", _PAPER_COLUMNS[key].label)
-        columns.append(_Figures(head, {row: cells[key] for row, cells in theirs.items() if key in cells}))
-    return columns
 
 
 def _table(name: str, title: str, rows: Iterable[Row], columns: Sequence[_Figures], notes: Sequence[str] = ()) -> Table:
@@ -185,25 +179,7 @@ def _where(results: Results, dataset: str | None) -> str:
     return f"{sequences} of {len(results.datasets)} data sets ({', '.join(results.datasets)})"
 
 
-# ---- notes ----
-
-
-def _network_note(results: Results) -> str:
-    networks: dict[str, list[str]] = {}
-    for base in results.bases:
-        networks.setdefault(results.network(base) or "", []).append(base)
-    if len(networks) == 1:
-        return f"Network: {next(iter(networks))}."
-    return "Networks: " + ", ".join(f"{name} ({', '.join(bases)})" for name, bases in networks.items()) + "."
-
-
-def _prepared_note(rows: Iterable[Row]) -> str:
-    words = shared_words(rows)
-    return f"Images of all rows: {words}, resized to the networks' input." if words else ""
-
-
-def _interval_note(records: Mapping[Row, Sequence[Record]]) -> str:
-    most = max(len(listed) for listed in records.values())
+def _interval_note(most: int) -> str:
     if most < MIN_SEQUENCES:
         number = "One sequence" if most == 1 else f"{most} sequences, fewer than {MIN_SEQUENCES}"
         return f"{number}: no confidence intervals."
@@ -226,12 +202,19 @@ def _cost_note(efficiency: Mapping[str, Any]) -> str:
 def write_tables(results: Results) -> list[Path]:
     """Write ``tables/NAME.md``, ``.tex`` and ``.csv``: those of :func:`overview`, ``sequences-DATASET`` for single
     sequences, and ``efficiency`` with the paper's table 2 below ours where it was measured; their paths."""
+    files: dict[str, list[Table]] = {}
+    for tables in overview(results).values():
+        for dataset, table in tables.items():
+            files[table.name if dataset is None else f"{table.name}-{dataset}"] = [table]
+    for dataset in results.datasets:
+        files[f"sequences-{dataset}"] = sequence_tables(results, dataset)
+    if results.efficiency is not None:
+        files["efficiency"] = efficiency_tables(results.efficiency)
     folder = results.out / "tables"
     folder.mkdir(exist_ok=True)
     written = []
-    for name, tables in _table_files(results):
-        shown = [table for table in tables if not table.is_empty]
-        if shown:
+    for name, listed in files.items():
+        if shown := [table for table in listed if not table.is_empty]:
             forms = {
                 "md": "\n".join(map(markdown, shown)),
                 "tex": "\n".join(map(latex, shown)),
@@ -250,42 +233,21 @@ def overview(results: Results) -> dict[str, dict[str | None, Table]]:
     return {title: {k: table for k, table in tables.items() if not table.is_empty} for title, tables in made.items()}
 
 
-def _table_files(results: Results) -> Iterator[tuple[str, list[Table]]]:
-    for tables in overview(results).values():
-        for dataset, table in tables.items():
-            yield table.name if dataset is None else f"{table.name}-{dataset}", [table]
-    for dataset in results.datasets:
-        yield f"sequences-{dataset}", sequence_tables(results, dataset)
-    if results.efficiency is not None:
-        yield "efficiency", efficiency_tables(results.efficiency)
-
-
 def write_tidy(results: Results) -> Path:
-    """Write ``results.csv``, a line per row, sequence and figure; its path."""
-    lines = [
-        {
-            "suite": record.suite, "dataset": record.dataset, "sequence": record.sequence, "network": record.network,
-            "method": record.method, "setting": dict(record.setting), "figure": key, "value": value,
-        }
-        for record in results.records
-        for key, value in _values(record)
-    ]  # fmt: skip
-    return _write_text(results.out / "results.csv", _tidy_csv(lines))
-
-
-def _values(record: Record) -> Iterator[tuple[str, float | None]]:
-    """(figure, value) of all numbers of a record: figures, then counts of frames, state and times."""
-    yield from record.figures.items()
-    for name in ("frames", "state", "ms"):
-        group: Mapping[str, Any] = getattr(record, name)
-        yield from ((f"{name}.{key}", value) for key, value in group.items() if isinstance(value, int | float))
-
-
-def _tidy_csv(lines: Sequence[Mapping[str, Any]]) -> str:
-    """Lines with a column for each setting; numbers in full, nothing for a missing value."""
-    flat = ({**line, **line["setting"]} for line in lines)
-    rows = [{name: csv_text(v) if isinstance(v, str) else v for name, v in line.items()} for line in flat]
-    return pd.DataFrame(rows, dtype=object).drop(columns="setting").to_csv(index=False, lineterminator="\n")
+    """Write ``results.csv``, a line per row, sequence and figure, with a column for each setting; numbers in full,
+    nothing for a missing value; its path."""
+    lines = []
+    for record in results.records:
+        names = ("suite", "dataset", "sequence", "network", "method")
+        about = {name: getattr(record, name) for name in names} | {"figure": "", "value": None} | dict(record.setting)
+        plain = {name: csv_text(value) if isinstance(value, str) else value for name, value in about.items()}
+        groups = {f"{name}.": getattr(record, name) for name in ("frames", "state", "ms")}
+        figures = dict(record.figures)
+        for group, values in groups.items():
+            figures |= {f"{group}{key}": value for key, value in values.items() if isinstance(value, int | float)}
+        lines += [{**plain, "figure": csv_text(key), "value": value} for key, value in figures.items()]
+    table = pd.DataFrame(lines, dtype=object).to_csv(index=False, lineterminator="\n")
+    return _write_text(results.out / "results.csv", table)
 
 
 def _write_text(path: Path, text: str) -> Path:

@@ -56,40 +56,17 @@ def written(out: Path, report: Report) -> str:
 
 def run_table(summary: Mapping[str, Any]) -> str:
     """The end of ``ufmstar run``: methods by metrics, and the figures of the run."""
-    lines = []
-    uncertainty = summary["uncertainty"]
-    if summary["metrics"] is not None:
-        name = "UfM*" if summary["anchors"] is None else "UfM*, anchored"
-        rows = [(name, summary["metrics"], uncertainty["mean_sigma"])]
-        if summary["network_alone"] is not None:
-            rows.append(("network alone", summary["network_alone"], uncertainty["mean_network_sigma"]))
-        if "posterior" in summary:
-            rows.append(("posterior", summary["posterior"]["metrics"], summary["posterior"]["mean_sigma"]))
-        head = ["", *_RUN_COLUMNS.values(), "sigma [m]"]
-        body = [
-            [name, *(number(figures.get(key)) for key in _RUN_COLUMNS), number(sigma)] for name, figures, sigma in rows
-        ]
-        lines += aligned([head, *body])
-        if summary["network_alone"] is None:
-            lines.append(f"network alone: no row, {summary['network_alone_reason']}")
-        if (summary["metrics"]["nll"] or 0) > NLL_OF_FEW:
-            lines.append(
-                f"NLL: dominated by the {uncertainty['near_zero_share']:.2%} of the pixels with a sigma between "
-                f"0 and {1000 * NEAR_ZERO:g} mm; --ufm.variance_floor 1e-4 bounds what they cost"
-            )
-    else:
-        sigma = f"mean sigma {number(uncertainty['mean_sigma'])} m" if supported(summary) else _UNSUPPORTED
-        lines.append(f"no metrics: {summary['metrics_reason']}; {sigma}")
+    uncertainty, mixture, time = summary["uncertainty"], summary["mixture"], summary["time"]
+    lines = _metric_lines(summary)
     if uncertainty["unmeasured_share"]:
         lines.append(
             f"not compared: {uncertainty['unmeasured_share']:.0%} of the pixels show what one view alone has seen; "
             "there M is that of --ufm.unmeasured, and sigma is striped in the pictures"
         )
-    mixture, time = summary["mixture"], summary["time"]
-    stages = ", ".join(f"{s} {ms:.1f}" for s, ms in time["median_ms"].items() if ms is not None)
-    rate = time["frames_per_second"]
     if summary["anchors"] is not None:
         lines += _anchor_lines(summary)
+    stages = ", ".join(f"{s} {ms:.1f}" for s, ms in time["median_ms"].items() if ms is not None)
+    rate = time["frames_per_second"]
     lines += [
         f"K = {mixture['components']} components in {mixture['bytes_in_use'] / 1000:.1f} kB "
         f"({mixture['bytes_allocated'] / 1000:.1f} kB allocated), mean disagreement "
@@ -101,6 +78,29 @@ def run_table(summary: Mapping[str, Any]) -> str:
     if (fit := summary["image_fit"]) is not None and not fit["problem"]:
         lines.append(f"poses disagree with the images by {fit['error']:.1f} px (fine: below 1)")
     return "\n".join([*lines, *(f"warning: {text}" for text in summary["warnings"])])
+
+
+def _metric_lines(summary: Mapping[str, Any]) -> list[str]:
+    """Methods by metrics, or why there are none."""
+    uncertainty, metrics, alone = summary["uncertainty"], summary["metrics"], summary["network_alone"]
+    if metrics is None:
+        sigma = f"mean sigma {number(uncertainty['mean_sigma'])} m" if supported(summary) else _UNSUPPORTED
+        return [f"no metrics: {summary['metrics_reason']}; {sigma}"]
+    rows = [("UfM*" if summary["anchors"] is None else "UfM*, anchored", metrics, uncertainty["mean_sigma"])]
+    if alone is not None:
+        rows.append(("network alone", alone, uncertainty["mean_network_sigma"]))
+    if "posterior" in summary:
+        rows.append(("posterior", summary["posterior"]["metrics"], summary["posterior"]["mean_sigma"]))
+    body = [[name, *(number(figures.get(key)) for key in _RUN_COLUMNS), number(sigma)] for name, figures, sigma in rows]
+    lines = aligned([["", *_RUN_COLUMNS.values(), "sigma [m]"], *body])
+    if alone is None:
+        lines.append(f"network alone: no row, {summary['network_alone_reason']}")
+    if (metrics["nll"] or 0) > NLL_OF_FEW:
+        lines.append(
+            f"NLL: dominated by the {uncertainty['near_zero_share']:.2%} of the pixels with a sigma between "
+            f"0 and {1000 * NEAR_ZERO:g} mm; --ufm.variance_floor 1e-4 bounds what they cost"
+        )
+    return lines
 
 
 def supported(summary: Mapping[str, Any]) -> bool:

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.run.colours import known_where
-from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
 from ufmstar_torch.eval.run.gaussians import vertex_table, write_ply
-from ufmstar_torch.eval.run.length_png import encode_length_png, fitting_unit
-from ufmstar_torch.eval.run.writers import frame_file, read_frame
+from ufmstar_torch.eval.run.writers import encode_length_png, fitting_unit, frame_file, read_frame
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
@@ -46,16 +45,9 @@ class Gated:
 
 
 def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
-    """The finished frames of a run.
-
-    Args:
-        out: its folder.
-        max_sigma: largest sigma of a pixel [m].
-        max_relative_sigma: largest sigma as a share of the depth.
-
-    Raises:
-        ValueError: no run's folder, one without a finished frame, or one of an earlier version, without poses.
-    """
+    """The finished frames of a run. Pixels of a larger sigma [m], or a larger one as a share of the depth, are left
+    out. Raises ValueError: no run's folder, one without a finished frame, or one of an earlier version, without
+    poses."""
     if not (out / RECORDS).is_file():
         raise ValueError(f"{out} is no output of `ufmstar run`: it has no {RECORDS}")
     records = read_records((out / RECORDS).read_bytes(), out / RECORDS)
@@ -90,7 +82,7 @@ def export_depth(frames: Iterator[Gated], out: Path) -> str:
         count += 1
         unit = unit or fitting_unit(frame.depth)
         for folder, values, metres in zip(folders, (frame.depth, frame.sigma), (unit, unit / 10), strict=True):
-            _write(folder / f"{frame.name}.png", encode_length_png(values, metres, folder.name))
+            write_bytes_atomic(folder / f"{frame.name}.png", encode_length_png(values, metres, folder.name))
     return f"{folders[0]}, {folders[1]}: {count} maps each"
 
 
@@ -104,20 +96,15 @@ def export_trajectory(frames: Iterator[Gated], out: Path) -> str:
         quaternion = Rotation.from_matrix(frame.T_world_cam[:3, :3]).as_quat()
         lines.append(" ".join([f"{time:.9f}", *(f"{x:.9g}" for x in (*frame.T_world_cam[:3, 3], *quaternion))]))
     file = export_folder(out) / "trajectory.txt"
-    write_atomic(file, lambda opened: opened.write("\n".join([*lines, ""]).encode()))
+    write_bytes_atomic(file, "\n".join([*lines, ""]).encode())
     return f"{file}: {len(lines) - 1} poses"
 
 
 def export_cloud(frames: Iterator[Gated], out: Path, voxel: float, sequence: FrameSequence | None) -> str:
     """cloud.ply: x y z and sigma [m], and red green blue where the images can be read.
 
-    A point is the mean of a voxel's pixels, weighted by 1/sigma^2. Its sigma is sqrt(n / sum 1/sigma^2): a network's
-    views err alike, so that it does not shrink with their number n.
-
-    Args:
-        frames, out: of the run.
-        voxel: side [m].
-        sequence: the run's own, for the colours.
+    A point is the mean of the pixels in a voxel of that side [m], weighted by 1/sigma^2. Its sigma is
+    sqrt(n / sum 1/sigma^2): a network's views err alike, so that it does not shrink with their number n.
     """
     keys, sums = np.zeros(0, np.int64), np.zeros((0, 8))
     waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
@@ -140,6 +127,8 @@ def export_cloud(frames: Iterator[Gated], out: Path, voxel: float, sequence: Fra
 
 def export_transforms(frames: Iterator[Gated], out: Path, sequence: FrameSequence) -> str:
     """transforms.json with images as they are, and depth and sigma at their pixels (16 bits, 0 = left out)."""
+    import cv2
+
     folder, unit, listed = export_folder(out, "transforms"), None, []
     for name in ("images", "depth", "sigma"):
         export_folder(out, "transforms", name)
@@ -154,9 +143,10 @@ def export_transforms(frames: Iterator[Gated], out: Path, sequence: FrameSequenc
         unit = unit or fitting_unit(depth)
         entry: dict[str, Any] = {"file_path": f"images/{frame.name}.png"}
         for kind, values in (("depth", depth), ("sigma", sigma)):
-            _write(folder / kind / f"{frame.name}.png", encode_length_png(values, unit, kind))
+            write_bytes_atomic(folder / kind / f"{frame.name}.png", encode_length_png(values, unit, kind))
             entry[f"{kind}_file_path"] = f"{kind}/{frame.name}.png"
-        _write(folder / entry["file_path"], _png(image.image))
+        png = cv2.imencode(".png", image.image[..., ::-1])[1].tobytes()
+        write_bytes_atomic(folder / entry["file_path"], png)
         camera = {
             "fl_x": K[0, 0],
             "fl_y": K[1, 1],
@@ -229,13 +219,3 @@ def export_folder(out: Path, *names: str) -> Path:
     folder = out.joinpath("export", *names)
     folder.mkdir(parents=True, exist_ok=True)
     return folder
-
-
-def _png(image: NDArray[np.uint8]) -> bytes:
-    import cv2
-
-    return bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
-
-
-def _write(path: Path, content: bytes) -> None:
-    write_atomic(path, lambda file: file.write(content))

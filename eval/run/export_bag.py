@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ufmstar_torch.eval.run.colours import known_where
 from ufmstar_torch.eval.run.export import Gated, export_folder, image_of, points_in_camera
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
@@ -32,12 +33,8 @@ _FLOAT32 = 7  # of sensor_msgs/PointField
 def export_bag(frames: Iterator[Gated], out: Path, sequence: FrameSequence | None) -> str:
     """OUT/export/bag: of each frame the image (where the recording can be read), camera info, depth and sigma (32FC1,
     [m]), its points in the camera's axes with their variance [m^2], and the camera's pose in tf. An earlier bag is
-    replaced when the new one is whole.
-
-    Raises:
-        ModuleNotFoundError: rosbags is not installed.
-        ValueError: a frame's time is not within ROS's 0 to 2^31 s, or the bag's place is not a folder.
-    """
+    replaced when the new one is whole. Raises ModuleNotFoundError: rosbags is not installed; ValueError: a frame's time
+    is not within ROS's 0 to 2^31 s, or the bag's place is not a folder."""
     how = ("ROS bags need rosbags", "'ufmstar-torch[recordings]'")
     rosbag2, stores = optional("rosbags.rosbag2", *how), optional("rosbags.typesys", *how)
     folder = export_folder(out) / "bag"
@@ -79,10 +76,8 @@ def _of_frame(ros: _Messages, stamp: int, frame: Gated, sequence: FrameSequence 
     messages = {TF: ros.tf(stamp, frame.T_world_cam)}
     if image is not None and image.image is not None:
         K, size = image.intrinsics, (image.image.shape[0], image.image.shape[1])
-        depth, sigma = (
-            np.where(values > 0, values, np.float32(np.nan))
-            for values in (resample_nearest(values, frame.intrinsics, K, size) for values in (depth, sigma))
-        )
+        maps = (resample_nearest(values, frame.intrinsics, K, size) for values in (depth, sigma))
+        depth, sigma = (known_where(values > 0, values) for values in maps)
         messages[IMAGE] = ros.image(stamp, image.image, "rgb8")
     messages[INFO] = ros.info(stamp, K, depth.shape)
     messages[DEPTH], messages[SIGMA] = (ros.image(stamp, values, "32FC1") for values in (depth, sigma))
@@ -121,10 +116,8 @@ class _Messages:
     def cloud(self, stamp: int, points: NDArray[Any]) -> Any:
         data = np.ascontiguousarray(points, dtype="<f4")
         field, width = "sensor_msgs/msg/PointField", data.itemsize * len(_FIELDS)
-        fields = [
-            self._make(field, name=name, offset=data.itemsize * i, datatype=_FLOAT32, count=1)
-            for i, name in enumerate(_FIELDS)
-        ]
+        how = {"datatype": _FLOAT32, "count": 1}
+        fields = [self._make(field, name=n, offset=data.itemsize * i, **how) for i, n in enumerate(_FIELDS)]
         how = {"height": 1, "width": len(data), "fields": fields, "is_bigendian": False, "is_dense": True}
         how |= {"point_step": width, "row_step": width * len(data), "data": data.view(np.uint8).ravel()}
         return self._make("sensor_msgs/msg/PointCloud2", header=self._header(stamp), **how)

@@ -16,14 +16,14 @@ from ufmstar_torch.atomic import remove_temporaries as remove_temporaries
 from ufmstar_torch.atomic import write_atomic as write_atomic
 
 
-def write_json_atomic(path: Path, data: Mapping[str, Any]) -> None:
-    """Write strict JSON (NaN and infinities become null) atomically and durably: mappings, sequences, dataclasses,
-    NumPy arrays, tensors, paths, and plain values.
+def write_bytes_atomic(path: Path, content: bytes) -> None:
+    """Write a file; see ``write_atomic``."""
+    write_atomic(path, lambda file: file.write(content))
 
-    Raises:
-        TypeError: a value has no JSON form; the message names its place.
-        OSError: see ``write_atomic``.
-    """
+
+def write_json_atomic(path: Path, data: Mapping[str, Any]) -> None:
+    """Write strict JSON (NaN and infinities become null) atomically and durably. Raises TypeError: a value has no JSON
+    form; OSError: see ``write_atomic``."""
     text = json.dumps(to_json(data), indent=2, allow_nan=False) + "\n"
     write_atomic(path, lambda file: file.write(text.encode()), durable=True)
 

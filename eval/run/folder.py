@@ -77,11 +77,8 @@ class FolderKind:
             raise FolderError(text) from error
 
     def earlier(self, out: Path, *, resume: bool, overwrite: bool) -> bool:
-        """Return whether the folder contains earlier work of the program.
-
-        Raises FolderError: it is a file, contains files of other programs, or contains earlier work and neither option
-        is set.
-        """
+        """Return whether the folder contains earlier work of the program. Raises FolderError: it is a file, contains
+        files of other programs, or contains earlier work and neither option is set."""
         if out.exists() and not out.is_dir():
             raise FolderError(f"--out {out} is a file, expected a folder")
         known, state = (out / self.manifest).is_file(), ""
@@ -111,12 +108,8 @@ class FolderKind:
 
 
 class OutputFolder:
-    """An output folder of a program. Use ``with OutputFolder.open(...)``, or close it.
-
-    Attributes:
-        path: the folder.
-        resumed: whether it contained earlier work that continues.
-    """
+    """An output folder of a program, at ``path``; ``resumed`` if it contained earlier work that continues. Use ``with
+    OutputFolder.open(...)``, or close it."""
 
     def __init__(self, path: Path, *, resumed: bool, held: ExitStack) -> None:
         self.path, self.resumed, self._held = path, resumed, held
@@ -125,14 +118,12 @@ class OutputFolder:
     def open(
         cls, out: Path, kind: FolderKind, content: Manifest, *, resume: bool = False, overwrite: bool = False
     ) -> OutputFolder:
-        """Prepare a folder for new work, or to continue earlier work.
+        """Prepare a folder for new work, or to ``resume`` or ``overwrite`` earlier work.
 
         Args:
             out: created if missing.
             kind: of the folder.
             content: of the manifest, beside program and format.
-            resume: continue earlier work in the folder; without any, start.
-            overwrite: remove earlier work, and start.
 
         Raises:
             FolderError: as :meth:`FolderKind.earlier`; or the earlier work was started with other values (the message
@@ -190,8 +181,7 @@ def remover(*patterns: str) -> Callable[[Path], None]:
 
 def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
     """Hold a lock file until it is released or the process ends, however that happens; None where another process, or
-    an earlier call, holds it for more than ``wait`` [s]. On a network file system the lock holds between computers if
-    it passes on ``flock``. Raises OSError: the file cannot be opened, or the file system does not support locks."""
+    an earlier call, holds it for more than ``wait`` [s]. Raises OSError: the file cannot be opened or locked."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(path, thread_local=False, fallback_to_soft=False)

@@ -35,20 +35,12 @@ _TYPES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
 def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> int:
     """Write the occupied components of the first stream as Gaussian splats, atomically; their number.
 
-    Attributes in the order and with the meaning that 3D Gaussian splatting viewers expect: x y z [m],
-    nx ny nz (the shortest axis), f_dc_0..2 (colour, see below), opacity (logit), scale_0..2 = ln sigma
-    [ln m], rot_0..3 = unit quaternion w x y z, so that Sigma = R diag(exp(scale))^2 R^T. Behind them our
-    own: weight [px], disagreement [m^2], count.
-    The colour is sqrt(disagreement) in magma from 0 to its 99th percentile, which the header states; grey where it was
-    seen from one view alone, so that its disagreement of 0 compares nothing.
-
-    Args:
-        path: the file; its folder must exist.
-        mixture: B streams of K slots.
-        T_world_first: [4, 4] or [1, 4, 4] rigid, from the mixture's frame to the world; None = stay there.
-
-    Raises:
-        ValueError: ``T_world_first`` has another shape.
+    Attributes are in the order and with the meaning that 3D Gaussian splatting viewers expect: x y z [m], nx ny nz (the
+    shortest axis), f_dc_0..2 (colour), opacity (logit), scale_0..2 = ln sigma [ln m], rot_0..3 = unit quaternion w x y
+    z, so that Sigma = R diag(exp(scale))^2 R^T. Behind them our own: weight [px], disagreement [m^2], count. The colour
+    is sqrt(disagreement) in magma from 0 to its 99th percentile, which the header states; grey where one view alone saw
+    it. ``T_world_first`` [4, 4] or [1, 4, 4] leads from the mixture's frame to the world; None = stay there. Raises
+    ValueError: it has another shape.
     """
     parts = Components(mixture, T_world_first)
     quaternion = Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True)
@@ -63,8 +55,7 @@ def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_fir
 
 def write_mixture_npz(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> None:
     """Write all streams exactly, atomically: the fields of ``GaussianMixture``, and ``T_world_first`` ([B, 4, 4] or
-    [4, 4]) in float64. Slots behind the last occupied one of all streams are left out.
-    """
+    [4, 4]) in float64. Slots behind the last occupied one are left out."""
     used = int(mixture.valid.any(0).nonzero().max()) + 1 if bool(mixture.valid.any()) else 0
     fields = {name: value[:, :used].detach().cpu().numpy() for name, value in mixture.tensors().items()}
     if T_world_first is not None:
@@ -73,13 +64,9 @@ def write_mixture_npz(path: str | Path, mixture: GaussianMixture, *, T_world_fir
 
 
 class Components:
-    """The occupied components of the first stream in float64, in the frame asked for.
-
-    Attributes:
-        mean: [K, 3] [m]; axes: [K, 3, 3] rotations, columns = principal axes, shortest first;
-        sigma: [K, 3] standard deviations along them [m]; weight, disagreement, count: [K];
-        colour: [K, 3] uint8; legend: what the colour means.
-    """
+    """The occupied components of the first stream in float64, in the frame asked for: mean [K, 3] [m]; axes [K, 3, 3],
+    rotations whose columns are the principal axes, shortest first; sigma [K, 3], standard deviations along them [m];
+    weight, disagreement, count [K]; colour [K, 3] uint8, and the legend that explains it."""
 
     def __init__(self, mixture: GaussianMixture, T_world_first: Tensor | None) -> None:
         used = mixture.valid[0]
@@ -89,7 +76,11 @@ class Components:
         )
         variance, axes = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
         axes[np.linalg.det(axes) < 0, :, 2] *= -1
-        R, t = _rotation_translation(T_world_first)
+        T = torch.eye(4) if T_world_first is None else T_world_first.detach().cpu()
+        if tuple(T.shape) not in ((4, 4), (1, 4, 4)):
+            raise ValueError(f"T_world_first must have shape (4, 4) or (1, 4, 4), got {tuple(T.shape)}")
+        matrix = T.double().numpy().reshape(4, 4)
+        R, t = matrix[:3, :3], matrix[:3, 3]
         self.mean: NDArray[np.float64] = mean @ R.T + t
         self.axes: NDArray[np.float64] = R @ axes
         self.sigma: NDArray[np.float64] = np.sqrt(np.maximum(variance, SIGMA_FLOOR**2))
@@ -98,15 +89,6 @@ class Components:
         scale = ColourScale(*robust_range([root], from_zero=True), ERROR_MAP)
         self.colour = scale.rgb(root)
         self.legend = f"colour: sqrt(disagreement), {ERROR_MAP} from 0 to {scale.high:.4g} m; grey: seen from one view"
-
-
-def _rotation_translation(T: Tensor | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    if T is None:
-        return np.eye(3), np.zeros(3)
-    if tuple(T.shape) not in ((4, 4), (1, 4, 4)):
-        raise ValueError(f"T_world_first must have shape (4, 4) or (1, 4, 4), got {tuple(T.shape)}")
-    matrix = T.detach().cpu().to(torch.float64).numpy().reshape(4, 4)
-    return matrix[:3, :3], matrix[:3, 3]
 
 
 def vertex_table(kinds: Mapping[str, str], *columns: NDArray[Any]) -> NDArray[Any]:

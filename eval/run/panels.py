@@ -59,11 +59,8 @@ def draw_grid(
     cell: float = 1.95,
     words: float = 1.5,
 ) -> None:
-    """Draw the rows below each other and write the picture (PNG), atomically.
-
-    ``aspect`` is height by width of a picture, ``cell`` and ``words`` the widths of a picture and of the words at the
-    left [in].
-    """
+    """Draw the rows below each other and write the picture (PNG), atomically. ``aspect`` is height by width of a
+    picture, ``cell`` and ``words`` the widths of a picture and of the words at the left [in]."""
     names = [break_name(row.title, max(8, int(12 * words))) for row in rows]
     named = [0.16 * (name.count("\n") + 1) + 0.05 for name in names]
     heads = [_CAPTION if any(panel.caption for panel in row.panels) else 0.0 for row in rows]
@@ -180,10 +177,8 @@ DECADES = 2  # range of the logarithmic scale of errors: a linear one would show
 class FramePanel:
     """One frame to be shown: its image [H, W, 3] uint8 RGB of any size, and its maps [h, w] [m], NaN where unknown.
 
-    ``maps`` has names of ``MAPS``: "depth" and "sigma" always, "error" with ground truth, "anchored" (the part of
-    sigma that is due to anchors) and those of the posterior of a run with them. "measured", the share of the
-    disagreement that rests on two views or more, has no column: it stripes sigma. ``note`` ("K = 31") stands beside the
-    name.
+    ``maps`` has names of ``MAPS``, "depth" and "sigma" always, and "measured", the share of the disagreement that rests
+    on two views or more, which stripes sigma. ``note`` ("K = 31") stands beside the name.
 
     Raises:
         ValueError: shapes or types disagree.
@@ -246,12 +241,7 @@ def contact_sheet(
     panels: Sequence[FramePanel], path: str | Path, *, title: str = "", columns: Sequence[MapColumn] | None = None
 ) -> None:
     """Draw the frames below each other and write the picture (PNG), atomically; neighbouring ``columns`` (None: of all
-    maps) of one scale share a colour bar.
-
-    Raises:
-        ValueError: there is no panel.
-        ImportError: matplotlib is missing.
-    """
+    maps) of one scale share a colour bar. Raises ValueError: there is no panel; ImportError: matplotlib is missing."""
     if not panels:
         raise ValueError("panels must hold at least one frame")
     colours.require_matplotlib()

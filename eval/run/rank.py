@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import insort
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from ufmstar_torch.choose import choose
 from ufmstar_torch.eval.engine.judge import UFM
 from ufmstar_torch.eval.engine.predictions import FramePredictions
-from ufmstar_torch.eval.engine.rows import RowResult
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.panels import FramePanel
@@ -45,39 +44,32 @@ class RankedImage:
     depth: float
 
 
-@dataclass(order=True)
-class _Shown:
-    score: float
-    number: int
-    panel: FramePanel = field(compare=False)
-
-
 class ImageScores(FrameSink):
-    """Scores the images of sequences, one after the other.
+    """Scores the ``images`` of sequences, one after the other, in the order in which they came.
 
     Args:
-        by: a name of ``PARTS``, whose mean over the pixels is the score. It is that of the measured pixels for V and M
-            where the config has ``unmeasured="nan"``.
+        by: a name of ``PARTS``, whose mean over the pixels is the score: over the measured ones for V and M where the
+            config has ``unmeasured="nan"``.
         measured: least share of pixels that two views compared, for an image to be ranked by V or M.
-
-    Attributes:
-        images: in the order in which they came.
-        sequence: the present one, as scores.csv names it.
     """
 
-    sequence = ""
+    sequence = ""  # the present one, as scores.csv names it
 
     def __init__(self, by: str, measured: float) -> None:
         self._by, self._measured = by, measured if by in _COMPARED else 0.0
         self.images: list[RankedImage] = []
-        self._shown: list[_Shown] = []
+        self._shown: list[tuple[float, int, FramePanel]] = []  # score, number of the image, picture
 
     def take(self, result: FrameResult) -> None:
         """Score an image."""
         row = result.rows.get(UFM)
         if row is None or result.frame is None:
             return
-        parts = {name: _statistics(getattr(row, of), row) for name, of in PARTS.items() if getattr(row, of) is not None}
+        parts = {}
+        for name, of in PARTS.items():
+            if (values := getattr(row, of)) is not None:
+                known = torch.where(row.valid, values, torch.nan).flatten()[None]
+                parts[name] = {key: float(value) for key, value in asdict(sample_statistics(known)).items()}
         assert row.measured is not None
         share = float((row.measured >= 0.5)[row.valid].float().mean())
         score = parts[self._by]["mean"] if share >= self._measured else float("nan")
@@ -89,7 +81,7 @@ class ImageScores(FrameSink):
             name = Path(self.sequence).name
             name = name if len(name) <= _LETTERS else f"…{name[1 - _LETTERS :]}"
             note = f"{name}, {self._by}, {score**0.5:.3g} m"
-            insort(self._shown, _Shown(score, len(self.images), panel_of(result.name, note, result.frame, row)))
+            insort(self._shown, (score, len(self.images), panel_of(result.name, note, result.frame, row)))
             if len(self._shown) > 2 * _PICTURES:
                 del self._shown[_PICTURES]
 
@@ -106,7 +98,7 @@ class ImageScores(FrameSink):
 
     def panels(self) -> Sequence[FramePanel]:
         """The most certain images and the least certain ones, the latter first."""
-        return [one.panel for one in reversed(self._shown)]
+        return [panel for _, _, panel in reversed(self._shown)]
 
 
 def require_part(job: RunJob, by: str) -> None:
@@ -122,9 +114,3 @@ def require_part(job: RunJob, by: str) -> None:
             source = "the network states" if job.source.networks else "the depth comes with"
             raise ValueError(f"--by {by}: {source} no {by} variance")
         return
-
-
-def _statistics(values: torch.Tensor, row: RowResult) -> dict[str, float]:
-    """Mean, variance, median and maximum over the valid pixels."""
-    statistics = sample_statistics(torch.where(row.valid, values, torch.nan).flatten()[None])
-    return {name: float(value) for name, value in asdict(statistics).items()}

@@ -26,8 +26,7 @@ _SUMMARY_EVERY = 30.0  # [s] between two summaries of an unfinished run
 
 
 class FrameRecorder(FrameSink):
-    """Writes every frame's maps, adds its record to the run's folder, and hands the folder a checkpoint: position,
-    state after the frame (``FrameResult.state``) and the metrics' sums."""
+    """Writes every frame's maps, adds its record to the run's folder, and hands the folder a checkpoint."""
 
     def __init__(self, job: RunJob, folder: RunFolder, metrics: RunMetrics) -> None:
         self._job, self._folder, self._metrics = job, folder, metrics
@@ -40,16 +39,11 @@ class FrameRecorder(FrameSink):
         self._summarised = self._started
 
     def take(self, result: FrameResult) -> None:
-        """Write and record a frame; raises OSError as ``write_frame`` and ``RunFolder.add``."""
+        """Write and record a frame. Raises OSError."""
         record, frames = self._record(result), result.number + 1 - self._first
         session = {"first": self._first, "frames": frames, "seconds": perf_counter() - self._started}
-        checkpoint = Checkpoint(
-            position=result.number + 1,
-            unit=self._unit,
-            state=dict(result.state[UFM]),
-            metrics=self._metrics.sums(),
-            sessions=[*self._earlier, session],
-        )
+        sessions, state = [*self._earlier, session], dict(result.state[UFM])
+        checkpoint = Checkpoint(result.number + 1, self._unit, state, self._metrics.sums(), sessions)
         before = perf_counter()
         self._folder.add(record, checkpoint)
         after = perf_counter()
@@ -71,11 +65,8 @@ class FrameRecorder(FrameSink):
             return {**about, "state": "skipped", "reason": result.skipped[UFM]}
         row, before = result.rows[UFM], perf_counter()
         maps = {name: getattr(row, name) for name in _MAPS}
-        camera: dict[str, NDArray[Any]] = {
-            "T_world_cam": row.T_world_cam,
-            "intrinsics": row.intrinsics,
-            **_anchor_array(result.frame, row),
-        }
+        camera: dict[str, NDArray[Any]] = {"T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
+        camera |= _anchor_array(result.frame, row)
         written = write_frame(frame_file(self._folder.path, result.name), row.valid, camera, **maps)
         self._unit = write_pngs(self._folder.path, result.name, written, self._unit)
         times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
@@ -105,11 +96,8 @@ def _figures(row: RowResult) -> dict[str, Any]:
 
 
 def _times(result: FrameResult, row: RowResult, writing: float, saving: float) -> dict[str, float]:
-    """The times by stage [ms].
-
-    "prepare" is the rest of the prediction beside the network. "save" is that of the previous frame, since this frame's
-    is not known yet. "cycle" is the time since the previous frame; stages overlap.
-    """
+    """The times by stage [ms], which overlap. "prepare" is the rest of the prediction beside the network, "save" that
+    of the previous frame, "cycle" the time since then."""
     ms = result.ms
     return {
         "read": ms["read"],
@@ -126,23 +114,24 @@ def _times(result: FrameResult, row: RowResult, writing: float, saving: float) -
 def _anchor_figures(row: RowResult) -> dict[str, Any]:
     """The frame's counts of anchors, and the means of B [m^2] and of r; {} without anchors.
 
-    ``tracked`` corners were followed from the frame before, ``found`` of them triangulated; ``usable`` lie on a pixel
-    with a depth, and ``used`` agree with others. ``without`` is the reason where none is used.
-    ``confidence``: whether the network's one was used. Of a map of landmarks,
-    ``tracked`` counts all, and ``found`` those in view.
+    ``tracked`` corners were followed from the frame before (of a map of landmarks: all), ``found`` of them triangulated
+    (in view); ``usable`` lie on a pixel with a depth, and ``used`` agree with others. ``without`` is the reason where
+    none is used, ``confidence`` whether the network's was used.
     """
     landmarks, statistics = row.landmarks, row.statistics
     if landmarks is None or statistics is None or row.anchored is None or row.bias is None:
         return {}
     assert statistics.anchors is not None
     assert statistics.anchors_used is not None
-    used, usable = int(statistics.anchors_used[0]), int(statistics.anchors[0])
-    found = len(landmarks.depth)
+    used, usable, found = int(statistics.anchors_used[0]), int(statistics.anchors[0]), len(landmarks.depth)
+    why = landmarks.none
+    if found:
+        why = "they contradict each other" if usable else "none lies on a pixel with a depth"
     counts: dict[str, Any] = {"tracked": landmarks.tracked, "found": found, "usable": usable, "used": used}
     if statistics.confidence is not None:
         counts["confidence"] = bool(statistics.confidence[0] > 0)
     return {
-        "anchors": {**counts, "without": None if used else why_none(found, usable, landmarks.none)},
+        "anchors": {**counts, "without": None if used else why},
         "mean_anchored": _mean(row.anchored, row.valid),
         "mean_bias": _mean(row.bias, row.valid),
         **_posterior_figures(row),
@@ -170,13 +159,6 @@ def _posterior_figures(row: RowResult) -> dict[str, Any]:
         "unseen": float(statistics.unseen[0]),
     }
     return {"posterior": figures}
-
-
-def why_none(triangulated: int, usable: int, none: str) -> str:
-    """Why a frame has no anchors, from how many were left at each stage, and the source's reason where it has none."""
-    if not triangulated:
-        return none
-    return "none lies on a pixel with a depth" if not usable else "they contradict each other"
 
 
 def _mean(values: Tensor, valid: Tensor) -> float:

@@ -10,16 +10,25 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
-from ufmstar_torch.eval.run.export import Gated, points_in_camera, points_of
-from ufmstar_torch.eval.run.length_png import fitting_unit
+from ufmstar_torch.eval.run.export import Gated, export_folder, image_of, points_in_camera, points_of
+from ufmstar_torch.eval.run.gaussians import RADIUS, Components
+from ufmstar_torch.eval.run.writers import fitting_unit
+from ufmstar_torch.eval.sequences.frame import FrameSequence
+from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
+from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.optional import optional
 
 WORLD, CAMERA = "world", "world/camera"
@@ -35,11 +44,7 @@ def rerun() -> Any:
 
 
 class RerunLog:
-    """Logs frames to a ``rerun.RecordingStream``; the first one chooses the scales of colours and depth.
-
-    Attributes:
-        scale: colours of sigma; None before the first frame.
-    """
+    """Logs frames to a ``rerun.RecordingStream``; the first one chooses the scales of depth and sigma (``scale``)."""
 
     def __init__(self, stream: Any) -> None:
         self._rr, self._stream = rerun(), stream
@@ -54,14 +59,7 @@ class RerunLog:
         K_image: NDArray[np.float64] | None,
         plots: Mapping[str, float],
     ) -> None:
-        """Log a frame.
-
-        Args:
-            frame: its maps, camera and anchors.
-            image: [H, W, 3] RGB, or None.
-            K_image: [3, 3] of the image [px]; None = not known.
-            plots: numbers by name.
-        """
+        """Log a frame with its image [H, W, 3] RGB and that one's K_image [3, 3] [px], and numbers by name."""
         rr, log, T = self._rr, self._stream.log, frame.T_world_cam
         if self.scale is None:
             self.scale = ColourScale(*robust_range([frame.sigma], from_zero=True), ERROR_MAP)
@@ -121,12 +119,8 @@ def blueprint() -> Any:
 
 def open_viewer() -> tuple[Any, subprocess.Popen[bytes]]:
     """A stream to a new viewer that listens on this computer alone (rerun's own ``spawn`` listens on every network),
-    and the viewer's process, which stays when this one ends.
-
-    Raises:
-        ModuleNotFoundError: rerun-sdk is not installed.
-        ConnectionError: the viewer does not start, as without a display.
-    """
+    and the viewer's process, which stays when this one ends. Raises ModuleNotFoundError: rerun-sdk is not installed;
+    ConnectionError: the viewer does not start, as without a display."""
     rr = rerun()
     with socket.socket() as free:
         free.bind((_LOCAL, 0))
@@ -153,3 +147,40 @@ def _listens(port: int) -> bool:
     except OSError:
         return False
     return True
+
+
+_PLOTS = ("mean_sigma", "mean_disagreement", "mean_network_sigma", "mean_anchored", "mean_bias", "components")
+
+
+def export_rerun(frames: Iterator[Gated], out: Path, sequence: FrameSequence | None) -> str:
+    """OUT/export/run.rrd; an earlier one is replaced when the new one is whole. Raises ModuleNotFoundError: rerun-sdk
+    is not installed."""
+    rr, count = rerun(), 0
+    file = export_folder(out) / "run.rrd"
+    records = {record["name"]: record for record in read_records((out / RECORDS).read_bytes(), out / RECORDS)}
+    with TemporaryDirectory(dir=file.parent, prefix=".rrd") as new:
+        with rr.RecordingStream("ufmstar") as stream:
+            stream.save(Path(new) / file.name, default_blueprint=blueprint())
+            log = RerunLog(stream)
+            _log_gaussians(rr, stream, out / "mixture.npz")
+            for frame in frames:
+                count += 1
+                image, record = image_of(frame, sequence), records[frame.name]
+                pixels, K = (None, None) if image is None else (image.image, image.intrinsics)
+                plots = {name: value for name in _PLOTS if isinstance(value := record.get(name), int | float)}
+                log.add(frame, pixels, K, plots)
+            stream.flush()
+        (Path(new) / file.name).replace(file)
+    return f"{file}: {count} frames; sigma is coloured from 0 to {log.scale.high if log.scale else 0:.3g} m"
+
+
+def _log_gaussians(rr: Any, stream: Any, file: Path) -> None:
+    if not file.is_file():
+        return
+    stored = {name: torch.from_numpy(values) for name, values in read_npz_whole(file).items()}
+    T = stored.pop("T_world_first")[:1]
+    parts = Components(GaussianMixture(**stored), T)
+    quaternions = Rotation.from_matrix(parts.axes).as_quat()
+    shape = {"centers": parts.mean, "half_sizes": RADIUS * parts.sigma, "quaternions": quaternions}
+    solid = rr.components.FillMode.Solid
+    stream.log(f"{WORLD}/gaussians", rr.Ellipsoids3D(**shape, colors=parts.colour, fill_mode=solid), static=True)

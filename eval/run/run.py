@@ -33,24 +33,16 @@ def run(
     progress: Callable[[Progress], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
-    """Run a job and leave its frames, pictures, mixture and summary in a folder.
+    """Run a job and leave its frames, pictures, mixture and summary in a folder; the content of summary.json.
 
     KeyboardInterrupt and OSError (a full disk) end the run in order: finished frames stay, and the summary
     states the reason. A frame that cannot be read, or whose pose or intrinsics are unusable, is skipped and counted.
 
-    Args:
-        job: what to run.
-        out: the folder; see ``RunFolder.open`` for whose it may be.
-        resume: continue an earlier run from its checkpoint.
-        overwrite: replace an earlier run.
-        progress: called at the start of each stage and after every frame.
-        stop: called before every frame; True ends the run as KeyboardInterrupt does.
-
-    Returns:
-        The content of summary.json; ``state`` is "finished", "interrupted" or "failed", ``reason`` says why.
+    ``progress`` is called at the start of each stage and after every frame, ``stop`` before every frame: True ends the
+    run as KeyboardInterrupt does.
 
     Raises:
-        FolderError: the folder cannot be used.
+        FolderError: the folder cannot be used (``OutputFolder.open``).
         OSError: the summary cannot be written.
         Exception: whatever else the network or UfM* raise, after the summary was written.
     """
@@ -85,12 +77,8 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
 
 def warm_up_job(job: RunJob, progress: Callable[[Progress], None]) -> None:
     """Compile what a job needs before its first frame."""
-
-    def compiling(done: int, total: int) -> None:
-        progress(Progress("kernels", done, total))
-
     dense = job.config.anchors is not None and isinstance(job.landmarks(), DenseEvidence)
-    warm_up_command(job.config, job.device, compiling, dense=dense)
+    warm_up_command(job.config, job.device, progress, dense=dense)
 
 
 def _ending(job: RunJob, folder: RunFolder) -> tuple[str, str]:

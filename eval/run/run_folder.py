@@ -63,13 +63,8 @@ class Checkpoint:
 
 
 class RunFolder:
-    """The output folder of a new or continued run. Use ``with RunFolder.open(...)``.
-
-    Attributes:
-        path: the folder.
-        checkpoint: after the last finished frame; on disk it may be some seconds older.
-        records: the lines of frames.jsonl up to there.
-    """
+    """The output folder of a new or continued run. Use ``with RunFolder.open(...)``. ``checkpoint`` is that after the
+    last finished frame (on disk it may be some seconds older), ``records`` the lines of frames.jsonl up to there."""
 
     def __init__(self, folder: OutputFolder) -> None:
         self.path, self._folder = folder.path, folder
@@ -82,7 +77,7 @@ class RunFolder:
     @classmethod
     def open(cls, path: str | Path, identity: Mapping[str, Any], *, resume: bool, overwrite: bool) -> RunFolder:
         """Prepare the folder; see ``OutputFolder.open``. ``identity`` holds plain values that must be those of the run
-        that is to be continued. Raises FolderError also where the checkpoint in the folder cannot be read."""
+        that is to be continued. Raises FolderError also where its checkpoint cannot be read."""
         folder = OutputFolder.open(Path(path), RUN, {"identity": identity}, resume=resume, overwrite=overwrite)
         try:
             return cls(folder)
@@ -99,8 +94,7 @@ class RunFolder:
         self._folder.close()
 
     def add(self, record: Mapping[str, Any], checkpoint: Checkpoint) -> None:
-        """Record a frame whose files are written, and store the checkpoint after it if the last one is old. Raises
-        OSError: the disk is full, say."""
+        """Record a frame whose files are written, and store the checkpoint if the last one is old. Raises OSError."""
         line = _line(record)
         with (self.path / RECORDS).open("ab") as file:
             file.write(line)

@@ -21,14 +21,9 @@ _NO_SCALE = (
 
 @dataclass(frozen=True)
 class NetworkScale:
-    """A scale that makes landmarks as far away as a network predicts.
-
-    Attributes:
-        metres: per unit of the poses: the median over frames of their median d / z, d [m] the predicted depth and z
-            that of a landmark.
-        spread: half the range of the middle 68 % of the frames' medians, as a share of ``metres``.
-        frames: number of frames.
-    """
+    """``metres`` per unit of the poses, as far as a network predicts landmarks to be: the median over ``frames`` of
+    their median d / z, d [m] the predicted depth and z a landmark's. ``spread`` is half the range of the middle 68 % of
+    the frames' medians, as a share of ``metres``."""
 
     metres: float
     spread: float
@@ -42,11 +37,8 @@ def require_metric(sequence: FrameSequence) -> None:
 
 
 def network_scale(sequence: FrameSequence, source: DepthSource, indices: range) -> NetworkScale:
-    """The scale of a COLMAP model's poses by the depths of a source, on at most 24 of the frames ``indices``.
-
-    Raises:
-        ValueError: the poses are metric, or are no COLMAP model's; or fewer than three frames see ten landmarks each.
-    """
+    """The scale of a COLMAP model's poses by the depths of a source, on at most 24 of the frames ``indices``. Raises
+    ValueError: the poses are metric, or are no COLMAP model's; or fewer than three frames see ten landmarks each."""
     if sequence.metric or sequence.folder is None or sequence.layout != "colmap":
         raise ValueError(
             "--scale-from network is for COLMAP models whose scale is not known, which have landmarks to compare with"

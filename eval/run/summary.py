@@ -34,19 +34,14 @@ GOING_ON = INTERRUPTED, "no orderly end: the program was killed, or is still run
 def write_summary(
     job: RunJob, folder: RunFolder, state: str, reason: str, outputs: Mapping[str, str | None] | None = None
 ) -> dict[str, Any]:
-    """Write summary.json from the run's records and sums, and return its content as plain values.
-
-    Args:
-        job, folder: of the run.
-        state, reason: how the run ended.
-        outputs: for each file None if it exists, or why it does not.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write summary.json from the run's records and sums, and return its content as plain values. ``outputs`` has for
+    each file None if it exists, or why it does not. Raises OSError: the file cannot be written."""
     checkpoint, records = folder.checkpoint, folder.records
     done = [record for record in records if record["state"] == "done"]
     figures = job.metrics(checkpoint).figures()
+    alone_reason = "the depth comes without a variance of its own"
+    if any(record["mean_network_sigma"] is not None for record in done):
+        alone_reason = "no variance where there is ground truth" if UFM in figures else "no ground truth"
     summary = {
         "program": RUN.program,
         "state": state,
@@ -60,7 +55,7 @@ def write_summary(
         "metrics": figures.get(UFM),
         "metrics_reason": None if UFM in figures else "no ground truth",
         "network_alone": figures.get(ALONE),
-        "network_alone_reason": None if ALONE in figures else _why_not_alone(done, UFM in figures),
+        "network_alone_reason": None if ALONE in figures else alone_reason,
         **_posterior(done, figures.get(POSTERIOR)),
         "uncertainty": _uncertainty(done),
         "anchors": _anchors(done),
@@ -110,7 +105,7 @@ def _warnings(job: RunJob, depth: DepthFit | None, done: Sequence[Mapping[str, A
 
 
 def _posterior(done: Sequence[Mapping[str, Any]], figures: Mapping[str, float] | None) -> dict[str, Any]:
-    """The posterior's metrics, and the last frame's figures of held-out anchors; {} without a posterior."""
+    """The posterior's metrics, and the last frame's figures of held-out anchors."""
     records = [record["posterior"] for record in done if "posterior" in record]
     if not records:
         return {}
@@ -132,8 +127,8 @@ def _sequence(sequence: FrameSequence) -> dict[str, Any]:
 
 
 def _scale(job: RunJob) -> dict[str, Any]:
-    """The origin of the poses' unit, if it is not the recording: a network's error of scale is then in the
-    poses and in the anchors too, which show the shape of its error alone."""
+    """The origin of the poses' unit, if it is not the recording. A network's error of scale is then in the anchors
+    too."""
     if job.scale is None:
         return {} if job.sequence.pose_scale == 1 else {"scale_from": "--pose-scale"}
     scale = {"metres_per_unit": job.scale.metres, "spread": job.scale.spread, "frames": job.scale.frames}
@@ -149,12 +144,6 @@ def _frames(records: Sequence[Mapping[str, Any]], selected: int) -> dict[str, An
         "skipped_frames": [{"name": record["name"], "reason": record["reason"]} for record in skipped],
         "with_ground_truth": sum(record.get("ground_truth", False) for record in records),
     }
-
-
-def _why_not_alone(done: Sequence[Mapping[str, Any]], judged: bool) -> str:
-    if any(record["mean_network_sigma"] is not None for record in done):
-        return "no ground truth" if not judged else "no variance where there is ground truth"
-    return "the depth comes without a variance of its own"
 
 
 def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -213,11 +202,9 @@ def _mixture(done: Sequence[Mapping[str, Any]], mixture: GaussianMixture) -> dic
 
 
 def _time(done: Sequence[Mapping[str, Any]], sessions: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Medians by stage; "prepare" is preprocessing, or reading the predicted map, and "frame" the time from a frame to
-    the next, which is shorter than the sum of the stages: frames are read ahead and written behind in threads.
-
-    The rate is that of the median frame: the first one also loads libraries and compiled kernels.
-    """
+    """Medians by stage; "frame" is the time from a frame to the next, which is shorter than the sum of the stages:
+    frames are read ahead and written behind in threads. The rate is that of the median frame: the first one also loads
+    libraries and compiled kernels."""
     seconds = sum(session["seconds"] for session in sessions)
     stages = {stage: [record["ms"][stage] for record in done if stage in record["ms"]] for stage in STAGES}
     total = median(record["ms"]["cycle"] for record in done) if done else None

@@ -64,8 +64,9 @@ def evaluate_item(
     except (*BROKEN, OSError) as error:
         return folder.fail(item, error, missing)
     folder.require_same_sequence(item, made_of["sequence"], landmarks)
-    posed = [row for row in job.suite.rows if sequence.posed or row.method.fusion == ALONE]
-    possible = [row for row in posed if not _fitted_to(row, item)]
+    files = {row: row.setting.recalibration for row in job.suite.rows}
+    fitted = {row for row, file in files.items() if file and item.label in Recalibration.from_json(file).sequences}
+    possible = [row for row in files if row not in fitted and (sequence.posed or row.method.fusion == ALONE)]
     todo = [row for row in missing if row in possible]
     left_out = [row for row in missing if row not in possible]
     lines = []
@@ -115,9 +116,3 @@ def _record(job: EvalJob, item: WorkItem, judge: Judge, result: RowFigures, made
         provenance={**computed_with, "network": network.digest, "runtime": network.runtime, **made_of},
         **{name: getattr(result, name) for name in ("frames", "figures", "curves", "state", "ms")},
     )
-
-
-def _fitted_to(row: Row, item: WorkItem) -> bool:
-    """Return whether the row's recalibration was fitted to a sequence of this name."""
-    file = row.setting.recalibration
-    return bool(file) and item.label in Recalibration.from_json(file).sequences

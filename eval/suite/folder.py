@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,10 +89,8 @@ class EvalFolder:
         records = {}
         for path in sorted(self.sequence_folder(item).glob("*.json")):
             if path.name != FAILED and path.with_suffix(".pt").is_file():
-                try:
+                with suppress(ValueError):
                     records[path.stem] = Record.load(path)
-                except ValueError:
-                    continue
         return records
 
     def require_same_sequence(self, item: WorkItem, digest: str, landmarks: Mapping[str, str]) -> None:
@@ -126,21 +124,17 @@ class EvalFolder:
         write_json_atomic(self.sequence_folder(item) / FAILED, {**about, "rows": [row.slug for row in rows]})
         return f"{item.label}: failed: {reason}"
 
-    def failure(self, item: WorkItem) -> dict[str, Any] | None:
-        """The failure that :meth:`fail` has stored for a sequence; None if nothing."""
-        path = self.sequence_folder(item) / FAILED
-        try:
-            failure = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            return None
-        except (ValueError, RecursionError):
-            return {"reason": f"{path} cannot be read", "rows": []}
-        return failure if isinstance(failure, dict) else None
-
     def failures(self, items: Iterable[WorkItem]) -> dict[str, str]:
-        """Why a sequence cannot be judged, by its label."""
-        stored = {item.label: self.failure(item) for item in items}
-        return {label: str(failure.get("reason")) for label, failure in stored.items() if failure is not None}
+        """Why a sequence cannot be judged, as :meth:`fail` has stored it, by its label."""
+        failures = {}
+        for item in items:
+            path = self.sequence_folder(item) / FAILED
+            if path.is_file():
+                try:
+                    failures[item.label] = str(json.loads(path.read_text(encoding="utf-8"))["reason"])
+                except (KeyError, TypeError, ValueError, RecursionError):
+                    failures[item.label] = f"{path} cannot be read"
+        return failures
 
     def succeeded(self, item: WorkItem) -> None:
         """Forget an earlier failure."""
@@ -160,12 +154,11 @@ def _merged(then: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
         **now,
         "networks": networks,
         "missing_bases": [base for base in now["missing_bases"] if base not in networks],
-        **{name: _union(then[name], now[name]) for name in ("rows", "sequences", "datasets")},
+        **{
+            name: [*then[name], *(value for value in now[name] if value not in then[name])]
+            for name in ("rows", "sequences", "datasets")
+        },
     }
-
-
-def _union(first: list[Any], second: list[Any]) -> list[Any]:
-    return [*first, *(value for value in second if value not in first)]
 
 
 def _clear(out: Path) -> None:

@@ -11,12 +11,11 @@ import torch
 
 from ufmstar_torch.eval.engine.evaluate import Judge
 from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionCache
 from ufmstar_torch.eval.methods.method import FUSIONS
 from ufmstar_torch.eval.methods.suite import Suite
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.eval.sequences.plugins import load_plugins
-from ufmstar_torch.eval.suite.cache import PredictionCache
 from ufmstar_torch.eval.suite.folder import CACHE
 from ufmstar_torch.eval.suite.work_items import WorkItem
 from ufmstar_torch.models.inference import Inference

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from ufmstar_torch.eval.methods.row import Row, row_from
 from ufmstar_torch.eval.run.files import write_json_atomic
 
 FORMAT = 1
@@ -37,6 +39,11 @@ class Record:
     ms: Mapping[str, float] = field(default_factory=dict)
     # "versions", "machine", "device", "runtime" of the networks, digests of networks and sequence.
     provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def row(self) -> Row:
+        """Its row of the table. Raises ValueError: there is no such row."""
+        return row_from({"method": self.method, "setting": self.setting})
 
     def save(self, path: Path) -> None:
         """Write it as JSON, whole or not at all."""

@@ -17,7 +17,6 @@ from ufmstar_torch.eval.sequences.frame import FrameSequence
 TOUR = "tour"
 _ROOT = re.compile(r"(?P<dataset>[A-Za-z0-9][A-Za-z0-9._-]*)=(?P<path>.+)")
 _UNSAFE = re.compile(r"[^A-Za-z0-9._+-]+")
-_SHARD = re.compile(r"(\d+)/(\d+)")
 
 
 @dataclass(frozen=True, order=True)
@@ -69,8 +68,7 @@ class Shard:
     @classmethod
     def parse(cls, text: str) -> Shard:
         """Parse "i/n", i from 1 to n. Raises ValueError: another form."""
-        match = _SHARD.fullmatch(text)
-        if match is None:
+        if not (match := re.fullmatch(r"(\d+)/(\d+)", text)):
             raise ValueError(f"--shard must be i/n, 1/4 to 4/4 for four parts, got {text!r}")
         return cls(int(match[1]), int(match[2]))
 
@@ -145,10 +143,9 @@ def read_names(file: Path) -> list[str]:
 
 def content_digest(sequence: FrameSequence) -> str:
     """Hex digest of what is known of a sequence before it is decoded: frames, cameras and poses."""
+    K = sequence.depth_intrinsics
     digest = hashlib.sha256(sequence_digest(sequence).encode())
-    digest.update(
-        repr((None if (K := sequence.depth_intrinsics) is None else K.tolist(), sequence.depth_size)).encode()
-    )
+    digest.update(repr((None if K is None else K.tolist(), sequence.depth_size)).encode())
     for entry in sequence.entries:
         digest.update(entry.T_world_cam.tobytes() + bytes([entry.load_depth is not None]))
     return digest.hexdigest()

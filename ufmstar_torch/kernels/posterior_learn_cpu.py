@@ -53,11 +53,12 @@ def _of_discs(scene: Scene, weight: Floats, claimed: Floats, running: Running) -
     share, spread = away / config.reach, spread_around(scene, rest, b[0])[node]
     p, own = wrong(running, share), variance + noise + away * running.ratios["unseen"]
     wide = noise + np.minimum(config.spread * spread, config.widest)
-    with np.errstate(over="ignore"):  # certainly another surface
-        odds = p / (1 - p) * np.sqrt(own / wide) * np.exp((error**2 / own - (error + offset) ** 2 / wide) / 2)
+    z2 = error**2 / own - (error + offset) ** 2 / wide
+    with np.errstate(over="ignore", divide="ignore"):  # certainly on its own surface, or never on another
+        elsewhere = 1 / (1 + np.exp(-np.log(p / (1 - p)) - (np.log(own / wide) + z2) / 2))
     stated = second_moments(scene, own, p, offset, spread)[0] + share * claimed[held]
     sums = {
-        "wrong": (area * (1 - 1 / (1 + odds)), area * (1 + config.other * share)),
+        "wrong": (area * elsewhere, area * (1 + config.other * share)),
         "calibration": (area * error**2 / stated, area),
     }
     added = {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}

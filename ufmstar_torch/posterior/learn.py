@@ -65,10 +65,11 @@ def _of_discs(scene: Scene, weight: Tensor, claimed: Tensor, running: Running) -
     spread, p = torch.gather(spread_around(scene, rest, b[:, 0]), 1, scene.observed.node), wrong(running, share)
     own = variance + scene.noise + away * running.ratio("unseen")[:, None]
     wide = scene.noise + (scene.config.spread * spread).clamp_max(scene.config.widest)
-    odds = p / (1 - p) * (own / wide).sqrt() * ((error.square() / own - (error + offset).square() / wide) / 2).exp()
+    z2 = error.square() / own - (error + offset).square() / wide
+    elsewhere = torch.sigmoid(p.logit() + ((own / wide).log() + z2) / 2)
     stated = second_moments(scene, own, p, offset, spread)[0] + share * claimed
     return _of_pairs(scene, held, torch.stack([error, variance, away, scene.noise]), running) | {
-        "wrong": (total(area * (1 - 1 / (1 + odds)), 1), total(area * (1 + scene.config.other * share), 1)),
+        "wrong": (total(area * elsewhere, 1), total(area * (1 + scene.config.other * share), 1)),
         "calibration": (total(area * error.square() / stated, 1), total(area, 1)),
     }
 
