@@ -196,12 +196,19 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         if first is None:
             raise FrameError(bag.path, f"{name} should have messages, but has none: the bag is damaged")
         (depths if ros.is_depth(first) else images)[name] = ros.frame_name(first.header.frame_id)
-    image = _one("the image", bag, named, images)
+
+    def one(kind: str, candidates: Iterable[str]) -> str:
+        chosen = [name for name in candidates if name in named] or list(candidates)
+        if len(chosen) > 1:
+            raise ValueError(f"{bag.path}: {kind} may be {', '.join(sorted(chosen))}: name one with --topics")
+        return chosen[0] if chosen else ""
+
+    image = one("the image", images)
     if not image:
         raise ValueError(f"{bag.path} has no topic of colour images, but {_listing(types)}")
     infos = [name for name, kind in types.items() if kind == _INFO]
     beside = [name for name in infos if name.rsplit("/", 1)[0] in (image.rsplit("/", 1)[0], image.rsplit("/", 2)[0])]
-    info = "" if options.intrinsics is not None else _one("the camera info", bag, named, beside or infos)
+    info = "" if options.intrinsics is not None else one("the camera info", beside or infos)
     if not info and options.intrinsics is None:
         raise ValueError(f"{bag.path} has no camera info: pass intrinsics")
     same_view = [name for name, frame in depths.items() if frame == images[image]]
@@ -212,7 +219,7 @@ def _choose(bag: Bag, options: Options) -> _Topics:
         same_view = [name for name in same_view if name in named]
         depths = {name: depths[name] for name in same_view}
         so_called = [name for name in so_called if name not in predicted]
-    depth = _one("the depth", bag, named, so_called or same_view)
+    depth = one("the depth", so_called or same_view)
     other = [name for name in named if name in depths and name not in same_view]
     if other:
         raise ValueError(
@@ -225,18 +232,11 @@ def _choose(bag: Bag, options: Options) -> _Topics:
     if options.trajectory is None:
         by_tf = [name for name in named if types[name] == _TF]
         poses = [name for name, kind in types.items() if kind in _POSES]
-        pose = by_tf[0] if by_tf else _one("the pose", bag, named, poses)
+        pose = by_tf[0] if by_tf else one("the pose", poses)
         pose = pose or next((name for name, kind in types.items() if kind == _TF and "static" not in name), "")
         if not pose:
             raise ValueError(f"{bag.path} has no poses: pass trajectory")
     return _Topics(image, info, depth, pose, ros.frame_name(named.get(pose, "")))
-
-
-def _one(kind: str, bag: Bag, named: dict[str, str], topics: Iterable[str]) -> str:
-    candidates = [name for name in topics if name in named] or list(topics)
-    if len(candidates) > 1:
-        raise ValueError(f"{bag.path}: {kind} may be {', '.join(sorted(candidates))}: name one with --topics")
-    return candidates[0] if candidates else ""
 
 
 def _listing(types: dict[str, str]) -> str:

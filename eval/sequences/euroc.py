@@ -20,7 +20,7 @@ from ufmstar_torch.eval.sequences.frame import FrameSequence, Size
 from ufmstar_torch.eval.sequences.images import first_image_size
 from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens, sequence_of_lenses
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import csv_numbers, csv_rows, trajectory_of
+from ufmstar_torch.eval.sequences.poses import csv_numbers, csv_rows, read_matrix, trajectory_of
 from ufmstar_torch.trajectory import Trajectory
 
 LOOKED_FOR = "mav0/cam0/data.csv and sensor.yaml (also in mav0, or in a camera's folder itself)"
@@ -63,13 +63,11 @@ def _trajectory(camera: Path) -> Trajectory:
     truth = next((camera.parent / name for name in _TRUTHS if (camera.parent / name / "data.csv").is_file()), None)
     if truth is None:
         raise ValueError(f"{camera.parent}: none of {', '.join(_TRUTHS)} holds poses; pass trajectory")
-    rows = [(csv_numbers(words[:8], where), where) for words, where in csv_rows(truth / "data.csv")]
-    for values, where in rows:
-        if len(values) < 8:
-            raise ValueError(f"{where}: expected a time [ns], x y z [m] and qw qx qy qz; pass trajectory")
-    table = np.array([values for values, _ in rows]).reshape(-1, 8)
-    table = table[np.isfinite(table).all(axis=1) & (np.linalg.norm(table[:, 4:], axis=1) > 0.5)]
-    quaternions = np.roll(table[:, 4:], -1, axis=1)
+    table = read_matrix(truth / "data.csv", commas=True)
+    if table.ndim != 2 or table.shape[1] < 8:
+        raise ValueError(f"{truth / 'data.csv'}: expected a time [ns], x y z [m] and qw qx qy qz; pass trajectory")
+    table = table[np.isfinite(table[:, :8]).all(axis=1) & (np.linalg.norm(table[:, 4:8], axis=1) > 0.5)]
+    quaternions = np.roll(table[:, 4:8], -1, axis=1)
     of_sensor = trajectory_of(table[:, 0] * _NANOSECOND, table[:, 1:4], quaternions, truth / "data.csv")
     to_camera = _extrinsics(camera / "sensor.yaml")
     if (truth / "sensor.yaml").is_file():

@@ -26,7 +26,6 @@ from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS, in_metres, par
 _FPS = 30.0  # of a recording without timestamps
 _POLL = 0.01  # [s] between two looks at a folder
 _UNREADABLE = 1.0  # [s] an image that is still being written may take so long
-_NUMBERS = {7: "x y z qx qy qz qw", 12: "3x4", 16: "4x4"}  # of a pose, by their count
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,9 +168,8 @@ def json_lines(
 
 def _pose(values: Any, convert: Callable[[np.ndarray], np.ndarray], scale: float) -> NDArray[np.float64]:
     numbers = np.array(values, dtype=np.float64).ravel()
-    if len(numbers) not in _NUMBERS:
-        forms = " or ".join(f"{count} ({form})" for count, form in _NUMBERS.items())
-        raise ValueError(f"a pose has {forms} numbers, got {values}")
+    if len(numbers) not in (7, 12, 16):
+        raise ValueError(f"a pose has 7 (x y z qx qy qz qw) or 12 (3x4) or 16 (4x4) numbers, got {values}")
     return in_metres(convert(poses_from_columns(numbers[None], ["pose"])[0]), scale)
 
 

@@ -124,10 +124,10 @@ def associate(first: np.ndarray, second: np.ndarray, max_difference: float) -> d
     return pairs
 
 
-def read_matrix(path: str | Path) -> np.ndarray:
+def read_matrix(path: str | Path, *, commas: bool = False) -> np.ndarray:
     """The numbers of a small text file, one row per line, [R, C] float64; non-finite ones are kept. Raises ValueError:
-    a line holds something else than numbers, or lines differ in length."""
-    rows, lines = _numbers(path)
+    a line holds something else than numbers (between ``commas``), or lines differ in length."""
+    rows, lines = _numbers(path, commas)
     for row, where in zip(rows, lines, strict=True):
         if len(row) != len(rows[0]):
             raise ValueError(f"{where}: expected {len(rows[0])} numbers as in the first line, got {len(row)}")
@@ -231,12 +231,12 @@ def _require_consistent(T_world_cam: np.ndarray, first: np.ndarray, same: np.nda
         )
 
 
-def _numbers(path: str | Path) -> tuple[list[list[float]], list[str]]:
+def _numbers(path: str | Path, commas: bool = False) -> tuple[list[list[float]], list[str]]:
     """The numbers of each line that has any, and FILE:LINE of each; a ``#`` inside a token (Windows' 1.#IND) starts no
     comment."""
     rows, lines = [], []
     for number, text in numbered_lines(path):
-        tokens, where = _tokens(text), f"{path}:{number}"
+        tokens, where = _tokens(re.sub("[,;]", " ", text) if commas else text), f"{path}:{number}"
         if tokens:
             rows.append([_number(token, where) for token in tokens])
             lines.append(where)

@@ -14,10 +14,10 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Skipped
 from ufmstar_torch.eval.sequences.images import read_color, read_depth
-from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
+from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
 from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import csv_numbers, csv_rows, poses_from_columns
+from ufmstar_torch.eval.sequences.poses import csv_numbers, csv_rows, poses_from_columns, read_matrix
 from ufmstar_torch.eval.sequences.video import Video
 
 _VIDEO, _ODOMETRY, _CAMERA = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
@@ -47,7 +47,9 @@ def read(path: Path, options: Options) -> FrameSequence:
     table = np.array([csv_numbers(*row) for row in rows[1:]], dtype=np.float64).reshape(-1, len(names))
     column = {name: table[:, names.index(name)] for name in names}
     poses = poses_from_columns(np.stack([column[name] for name in _COLUMNS[2:]], axis=-1), lines)
-    video, K = Video(path / _VIDEO), _camera_matrix(path / _CAMERA)
+    video, K = Video(path / _VIDEO), read_matrix(path / _CAMERA, commas=True)
+    if K.shape != (3, 3):
+        raise ValueError(f"{path / _CAMERA}: expected 3 lines of 3 numbers")
     own = np.stack([column[name] for name in _FOCAL], axis=-1) if set(_FOCAL) <= set(names) else None
     frames: list[Entry | Skipped] = []
     lenses = {}
@@ -61,21 +63,13 @@ def read(path: Path, options: Options) -> FrameSequence:
         if number >= len(video):
             frames.append(Skipped(name, "beyond the end of the video"))
             continue
-        fx, fy, cx, cy = (K[0, 0], K[1, 1], K[0, 2], K[1, 2]) if own is None else own[row]
-        lenses[name] = Lens((float(fx), float(fy), float(cx), float(cy)), video.size)
+        fx, fy, cx, cy = pinhole_values(K) if own is None else own[row].tolist()
+        lenses[name] = Lens((fx, fy, cx, cy), video.size)
         file = path / "depth" / f"{name}.png"
         load = partial(_depth, file, path / "confidence" / file.name, options.depth_scale) if file.is_file() else None
         time = float(column["timestamp"][row])
         frames.append(Entry(name, T, partial(video.read, int(number)), load, time))
     return sequence_of_lenses(path.resolve().name, "stray", frames, lenses, path, options)
-
-
-def _camera_matrix(file: Path) -> np.ndarray:
-    """[3, 3] of the video [px]. Raises ValueError: the file holds something else."""
-    rows = [csv_numbers(*row) for row in csv_rows(file)]
-    if [len(row) for row in rows] != [3, 3, 3]:
-        raise ValueError(f"{file}: expected 3 lines of 3 numbers")
-    return read_intrinsics(np.array(rows))
 
 
 def _depth(file: Path, confidence: Path, scale: float | None) -> np.ndarray:

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.tour.style import TEXTURES
-
 _CELLS, _FINE = 64, 8  # noise repeats after so many cells, of so many table entries a side
 _SIDE = _CELLS * _FINE
 _POSITIVE = 4096.0  # cells added so that truncation rounds down; a multiple of _CELLS
@@ -62,7 +60,7 @@ def noise_table() -> Tensor:
 
 def albedo(texture: int, patch: Patch) -> Tensor:
     """[3, P] linear RGB in [0, 1] of a texture, given as an index into ``TEXTURES``."""
-    return _PATTERNS[TEXTURES[texture]](patch).clamp(0, 1)
+    return _PATTERNS[texture](patch).clamp(0, 1)
 
 
 def _soft(edge: Tensor, pixel: Tensor) -> Tensor:
@@ -196,8 +194,7 @@ def _rings(p: Patch) -> Tensor:
     return p.mixed(_square(4 * (u * u + v * v).sqrt(), p.pixel))
 
 
-_FUNCTIONS: tuple[Callable[[Patch], Tensor], ...] = (
+_PATTERNS: tuple[Callable[[Patch], Tensor], ...] = (  # in the order of ``TEXTURES``
     _plain, _plaster, _wood, _checks, _stripes, _tiles, _bricks, _fabric, _books, _painting, _window,
     _dots, _zigzag, _marble, _terrazzo, _hexagons, _rings,
 )  # fmt: skip
-_PATTERNS = {function.__name__.removeprefix("_"): function for function in _FUNCTIONS}
