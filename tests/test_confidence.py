@@ -33,7 +33,7 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.recalibration import figures_of_samples, fit_confidence
 from ufmstar_torch.eval.tour import tour_sequence
 from ufmstar_torch.models import Ensemble, OutputSpec, Preprocess, wrap_network
-from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
+from ufmstar_torch.models.onnx_network import OnnxNetwork
 from ufmstar_torch.networks_in_turn import NetworksInTurn
 
 PLAIN = UfMStarConfig(anchors=AnchorConfig())
@@ -195,8 +195,8 @@ def test_a_network_states_it():
     assert network.states_confidence
     assert Ensemble([network, network]).states_confidence
     assert not wrap_network(Stated(), "depth").states_confidence
-    spec = OnnxSpec(OutputSpec("metric", "depth", confidence="conf"))
-    assert OnnxNetwork.states_confidence.fget(SimpleNamespace(spec=spec))
+    outputs = OutputSpec("metric", "depth", confidence="conf")
+    assert OnnxNetwork.states_confidence.fget(SimpleNamespace(outputs=outputs))
     image = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(0))
     assert torch.equal(network(image).confidence, image[:, 0])
     torch.testing.assert_close(Ensemble([network, network])(image).confidence, image[:, 0])
