@@ -43,7 +43,6 @@ from ufmstar_torch.models.inference import Inference
 INF, NAN = float("inf"), float("nan")
 METRIC = {"kind": "metric"}
 MAPS, IMAGE = torch.ones(2, 6, 8), torch.zeros(1, 3, 64, 64)
-CAMERA = torch.tensor([[60.0, 0, 31.5], [0, 60, 31.5], [0, 0, 1]])
 GLPN = transformers.GLPNConfig(depths=[1] * 4, hidden_sizes=[8] * 4, num_attention_heads=[1] * 4, decoder_hidden_size=8)
 glpn = transformers.GLPNForDepthEstimation
 spec, onnx, preprocess = NetworkSpec.from_dict, OnnxSpec.from_dict, Preprocess.from_dict

@@ -6,12 +6,10 @@ import math
 from dataclasses import replace
 from functools import cache
 
-import lightning.pytorch as pl
 import numpy as np
 import pytest
 import torch
 from scipy.stats import spearmanr
-from torch import nn
 from training_data import PLAIN
 from trainings import SPEC, tiny_job
 
@@ -28,7 +26,6 @@ from ufmstar_torch.train import (
     NyuFrames,
     Recipe,
     SequenceFrames,
-    TrainingModule,
 )
 from ufmstar_torch.train import data as training_data_module
 from ufmstar_torch.train.distil import Teacher, distillation_sums
@@ -64,24 +61,10 @@ def coded(seed=0):
     return replace(rendered, entries=tuple(entries))
 
 
-class Erring(nn.Module):
-    """Its depth errs where the image is red, otherwise in every frame; it learns a log-variance from the colours."""
-
-    takes_intrinsics = False
-
-    def __init__(self):
-        super().__init__()
-        self.head = nn.Conv2d(3, 1, 1)
-        nn.init.zeros_(self.head.weight)  # a constant, which is correlated with nothing
-        nn.init.constant_(self.head.bias, -3.0)
-
-    def distribution(self, image):
-        red, green, blue = image.unbind(1)
-        depth = FULL * green * (1 + 0.6 * red * (blue - 0.5))
-        return GaussianDepth(depth, self.head(image)[:, 0])
-
-    def forward(self, image):
-        return self.distribution(image).prediction()
+def erring(image):
+    """Predicted depth [B, H, W] of coded images: it errs where the image is red."""
+    red, green, blue = image.unbind(1)
+    return FULL * green * (1 + 0.6 * red * (blue - 0.5))
 
 
 @pytest.fixture(scope="module")
@@ -106,28 +89,13 @@ def correlation(network, batch):
     return spearmanr(d.log_variance[measured], variance[measured]).statistic
 
 
-def trained(source, monkeypatch, seed, steps=40):
-    """The network after some steps of the training itself."""
-    monkeypatch.setattr(training_data_module, "sources", lambda config: (source, source))
-    recipe = Recipe(SPEC, clip_frames=CLIP, max_steps=steps, batch_size=2 * CLIP, learning_rate=0.1)
-    data = DepthDataModule(DataConfig(batch_size=2 * CLIP, seed=seed, augmentation=None), PLAIN, CLIP)
-    network = Erring()
-    trainer = pl.Trainer(
-        max_steps=steps, max_epochs=-1, accelerator="cpu", logger=False, enable_checkpointing=False,
-        enable_progress_bar=False, enable_model_summary=False, limit_val_batches=0, use_distributed_sampler=False,
-    )  # fmt: skip
-    trainer.fit(TrainingModule(network, recipe, steps, seed), data)
-    return network
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_fastdepth_comes_to_state_it_too(tmp_path, seed):
+def test_a_fastdepth_comes_to_state_it_too(tmp_path):
     size, lengths = (64, 96), {"tours": 2, "validation_tours": 1, "tour_frames": 8}
     spec = replace(SPEC, widths=0.1, size=size)
-    recipe = Recipe(spec, clip_frames=CLIP, max_steps=200, batch_size=2 * CLIP, learning_rate=0.01, clip=10.0)
+    recipe = Recipe(spec, clip_frames=CLIP, max_steps=100, batch_size=2 * CLIP, learning_rate=0.01, clip=10.0)
     data = DataConfig(**lengths, tour_stride=1, tour_size=size, cache=str(tmp_path), augmentation=None)
-    settings = tiny_job(tmp_path, tmp_path / "out", recipe, seed=seed).settings
+    settings = tiny_job(tmp_path, tmp_path / "out", recipe).settings
     job = Job(recipe, data, settings)
     opened = make_data(job, 0, 1)
     samples = [opened.train_set[frame] for clip in opened.clips for frame in clip]
@@ -135,14 +103,14 @@ def test_a_fastdepth_comes_to_state_it_too(tmp_path, seed):
     before = correlation(new_network(job, 0), batch)
     assert train_member(job, 0) is None
     after = correlation(load_for_training(job.folder(0) / WEIGHTS)[0], batch)
-    print(f"seed {seed}: Spearman {before:.2f} before, {after:.2f} after 200 steps")
-    # Measured over four seeds: -.14 to .01 before, .32 to .50 after.
+    print(f"Spearman {before:.2f} before, {after:.2f} after")
+    # Measured over four seeds: -.14 to .01 before, .32 to .50 after 200 steps.
     assert after > before + 0.1
 
 
 def test_the_target_is_ufmstars_of_every_clip_alone(room):
     batch = batch_of(room)
-    depth = Erring().distribution(batch["image"]).depth
+    depth = erring(batch["image"])
     T, K = batch["T_world_cam"].clone(), batch["intrinsics"]
     T[CLIP + 1] = torch.nan
     variance, measured = Teacher(CLIP)(depth, T, K)

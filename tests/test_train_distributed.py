@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import textwrap
-import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -77,16 +76,20 @@ def free_port():
         return s.getsockname()[1]
 
 
-def start(frames, out, here, settings, environment):
-    """A process that trains as PLAIN says, over what is in ``out``; it leaves the file ``here`` when it begins."""
+def start(frames, out, here, settings, environment, after=()):
+    """A process that trains as PLAIN says, over what is in ``out``; a second after the files ``after`` are there it
+    leaves the file ``here`` and begins."""
     code = f"""
-        import sys
+        import sys, time
         from pathlib import Path
         sys.path.insert(0, {str(Path(__file__).parent)!r})
         from trainings import tiny_job
         from ufmstar_torch.train.fit import fit
         from test_train_distributed import PLAIN
         job = tiny_job({str(frames)!r}, Path({str(out)!r}), PLAIN, strategy="ddp", **{settings!r})
+        while not all(Path(file).exists() for file in {[str(file) for file in after]}):
+            time.sleep(0.1)
+        time.sleep({len(after)})
         Path({str(here)!r}).touch()
         fit(job, overwrite=True)
     """
@@ -112,15 +115,10 @@ def test_the_second_process_may_come_first(frames, alone, tmp_path, launch, sett
     """It must not see what an earlier training left."""
     out = tmp_path / "out"
     fit(tiny_job(frames, out, replace(PLAIN, max_steps=2, learning_rate=0.1)))
-    port = {"MASTER_PORT": str(free_port())}
-    processes = []
+    port, here = {"MASTER_PORT": str(free_port())}, tmp_path / "here"
+    processes = [start(frames, out, here, settings, launch(1) | port)]
     try:
-        processes.append(start(frames, out, tmp_path / "here", settings, {**launch(1), **port}))
-        end = time.monotonic() + 250
-        while not (tmp_path / "here").exists() and time.monotonic() < end:
-            time.sleep(0.1)
-        time.sleep(2)
-        processes.append(start(frames, out, tmp_path / "there", settings, {**launch(0), **port}))
+        processes.append(start(frames, out, tmp_path / "there", settings, launch(0) | port, after=[here]))
         message = [process.communicate(timeout=250)[1] for process in reversed(processes)]
     finally:
         for process in processes:
