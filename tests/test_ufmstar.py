@@ -109,6 +109,19 @@ def test_kilometres_from_the_origin_float32_loses_nothing():
         torch.testing.assert_close(a.std, b.std, rtol=0, atol=1e-4, equal_nan=True)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_identical_views_do_not_disagree(backend):
+    depths, poses, K = scenes.sequence(1, HEIGHT, WIDTH, 0.0)
+    ufm, outputs = run(CONFIG.replace(backend=backend), depths * 5, poses * 5, K, torch.float32)
+    assert outputs[-1].statistics.new.item() == 0
+    assert outputs[-1].statistics.matched.item() == outputs[-1].statistics.segments.item()
+    same = ufm.mixture.count == 5  # matched with themselves only; others met a neighbour that overlaps them
+    assert same.sum() >= 3
+    assert ufm.mixture.disagreement[same].max() < 1e-12
+    valid = outputs[-1].valid
+    assert outputs[-1].disagreement[valid].min() == 0 or outputs[-1].disagreement[valid].min() < 1e-12
+
+
 def test_more_depth_noise_more_disagreement():
     """Seen from one place, where segments do not slide: M and the mixture's m both rise with the noise."""
     K, T = scenes.intrinsics(HEIGHT, WIDTH), scenes.tour(30)[0]
