@@ -98,6 +98,7 @@ class DeclaredNetwork(DepthNetwork):
 
     outputs: OutputSpec
     path: str = ""
+    _has_predicted: bool = False  # a depth at some pixel
 
     @property
     def takes_intrinsics(self) -> bool:
@@ -116,13 +117,15 @@ class DeclaredNetwork(DepthNetwork):
 
     def declared(self, result: Any, image: Tensor, intrinsics: Tensor | None) -> DepthPrediction:
         """The prediction in what the network returned; arguments and errors as :meth:`OutputSpec.prediction`, with the
-        file's name."""
+        file's name. The first one must have a depth; a later one without any is a frame without a valid pixel."""
         try:
-            return self.outputs.prediction(result, image, intrinsics)
+            prediction = self.outputs.prediction(result, image, intrinsics, require_depth=not self._has_predicted)
         except (TypeError, ValueError) as error:
             if not self.path:
                 raise
             raise ValueError(f"{self.path}: {error}") from error
+        self._has_predicted = True
+        return prediction
 
 
 @contextmanager

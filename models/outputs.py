@@ -87,7 +87,9 @@ class OutputSpec(Checked):
         """The outputs that are declared by name."""
         return [name for name in (self.depth, self.aleatoric, self.epistemic, self.confidence) if name is not None]
 
-    def prediction(self, result: Any, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
+    def prediction(
+        self, result: Any, image: Tensor, intrinsics: Tensor | None = None, *, require_depth: bool = False
+    ) -> DepthPrediction:
         """The declared outputs in metres.
 
         Args:
@@ -95,10 +97,12 @@ class OutputSpec(Checked):
                 a tuple or an object.
             image: [B, 3, H, W] the network's input, whose size and intrinsics the prediction has to share.
             intrinsics: [B, 3, 3] of that input [px], for ``focal``.
+            require_depth: refuse an output that is a depth at no pixel; on the CPU only, since the test would wait for
+                an accelerator.
 
         Raises:
-            ValueError: a declared output is missing or has another shape, depth is possible at no pixel (tested on the
-                CPU only, since an accelerator would have to be waited for), or ``focal`` lacks the intrinsics.
+            ValueError: a declared output is missing or has another shape, ``focal`` lacks the intrinsics, or as
+                ``require_depth`` says.
         """
         outputs = _named(result)
         if self.depth is None and len(outputs) != 1:
@@ -106,7 +110,8 @@ class OutputSpec(Checked):
         depth_name = next(iter(outputs)) if self.depth is None else self.depth
         size = (len(image), image.shape[-2], image.shape[-1])
         depth = self._map(outputs, depth_name, size)
-        if depth.device.type == "cpu" and depth.numel() and not ((depth >= 0) & (depth < torch.inf)).any():
+        tested = require_depth and depth.device.type == "cpu" and depth.numel()
+        if tested and not ((depth >= 0) & (depth < torch.inf)).any():
             raise ValueError(f"output {depth_name!r} is NaN, infinite or negative at every pixel, expected depth")
         unit = self._unit(intrinsics, depth)
         depth = depth * unit

@@ -217,6 +217,16 @@ DEFECTS: dict[str, tuple[Any, str]] = {
 }
 
 
+def test_only_the_first_prediction_must_have_a_depth(image: Tensor) -> None:
+    """A network without any is refused; a later frame without any has no valid pixel, and the next one goes on."""
+    network = wrap_network(lambda x: x[:, 0].log())
+    with pytest.raises(ValueError, match="NaN, infinite or negative at every pixel"):
+        network(0 * image)
+    depth = network(2 + image).depth
+    assert network(0 * image).depth.isinf().all()
+    assert torch.equal(network(2 + image).depth, depth)
+
+
 class Program(nn.Module):
     """A function as a module."""
 

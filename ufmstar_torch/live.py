@@ -107,7 +107,6 @@ class LiveDepth:
     Images of another size or camera than those before start the evidence of ``model``'s anchors afresh. An error of the
     model, of ``on_result`` or of saving ends the worker; every later ``push_*``, ``reset``, ``wait_idle`` and ``close``
     raises it.
-
     """
 
     def __init__(
