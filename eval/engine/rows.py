@@ -42,8 +42,8 @@ class RowResult:
     bias: Tensor | None = None  # r of UfM* with anchors, or None
     posterior_depth: Tensor | None = None  # of UfM* with anchors and a posterior [m], or None
     posterior_variance: Tensor | None = None  # likewise [m^2]
-    posterior_inlier_variance: Tensor | None = None  # likewise, of pixels on the surface of their evidence [m^2]
-    posterior_outlier: Tensor | None = None  # likewise, the probability that they are not
+    posterior_inlier_variance: Tensor | None = None  # variance of pixels on the surface of their evidence [m^2]
+    posterior_outlier: Tensor | None = None  # probability that a pixel is not
     statistics: FrameStatistics | None = None  # of UfM*, [1] per count, or None
     confidence: Tensor | None = None  # of the prediction, in its own unit, where UfM* had it; or None
     network_variance: Tensor | None  # A + E of the prediction, whatever the row uses [m^2]; None if it states neither
@@ -56,7 +56,7 @@ class RowResult:
 
     @property
     def mixture(self) -> tuple[Tensor, Tensor] | None:
-        """What the posterior states beside its variance: the inliers' [m^2], and the probability of an outlier."""
+        """The posterior's variance of inliers [m^2] and probability of an outlier."""
         if self.posterior_inlier_variance is None or self.posterior_outlier is None:
             return None
         return self.posterior_inlier_variance, self.posterior_outlier

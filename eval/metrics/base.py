@@ -109,7 +109,7 @@ class SumMetric(Metric):
             setattr(self, name, state + torch.as_tensor(added, dtype=state.dtype, device=state.device))
 
     def sums(self, pixels: Pixels) -> Mapping[str, Any]:
-        """What pixels add to each state, by its name."""
+        """The pixels' contribution to each state, by its name."""
         raise NotImplementedError
 
     def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:

@@ -69,7 +69,7 @@ EXTRA = (
     NETWORK_MS,
     UNCERTAINTY_MS,
 )
-# Of rows with a posterior, judged as the mixture that it states; in the table where a row has them.
+# The posterior as the mixture that it states; in the table where a row has one.
 MIXTURE = (
     Quantity("mixture_nll", "mixture: NLL", 2, LOWER),
     Quantity("mixture_ece_delta", "mixture: ECE_δ", 3, LOWER),

@@ -62,7 +62,7 @@ def colour(message: Any, path: Path) -> np.ndarray:
 
 
 def is_depth(message: Any) -> bool:
-    """Whether an Image or CompressedImage is a depth map."""
+    """True for an Image or CompressedImage that is a depth map."""
     return getattr(message, "encoding", "") in _DEPTHS or "compressedDepth" in getattr(message, "format", "")
 
 

@@ -1,4 +1,4 @@
-"""What a frame's anchors teach, on the CPU (``ufmstar_torch.posterior.learn``): one stream."""
+"""Learning from a frame's anchors, on the CPU (``ufmstar_torch.posterior.learn``): one stream."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a frame's anchors teach (``running``): each is predicted from the others, alone or without its whole region.
+"""Learns ``running`` from a frame's anchors: each is predicted from the others, alone or without its whole region.
 
 Anchors of discs that move over the image are left out of the field, which then predicts them: they count by area and
 not by number, since corners cluster on what is well textured. ``unseen`` fits what their errors are beyond the field's
