@@ -88,7 +88,7 @@ class NetworksInTurn(nn.Module):
         return self.as_prediction(result, x)
 
     def as_prediction(self, result: Any, x: Tensor) -> DepthPrediction:
-        """The prediction in a network's result for ``x`` [B, 3, H, W]; a class that knows more networks can accept more.
+        """The prediction in a network's result for ``x`` [B, 3, H, W]; a class may accept more networks.
 
         Raises:
             TypeError: it is no :class:`DepthPrediction`.

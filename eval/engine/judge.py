@@ -1,7 +1,7 @@
 """Figures against ground truth, as sinks of a stream: of a run, and of the rows of an evaluation.
 
 For the figure of NLL by error, the paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is
-confident. It does not define them; here, they are the half of the reference's pixels with the smallest variance in every
+confident. It does not define them; here, the half of the reference's pixels with the smallest variance in every
 frame (``RowResult.confident``). All rows on the same frames are judged on the same pixels.
 """
 
