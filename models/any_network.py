@@ -73,6 +73,16 @@ class WrappedNetwork(DeclaredNetwork):
         return result if isinstance(result, DepthPrediction) else self.declared(result, image, intrinsics)
 
 
+def refuse_relative(network: object) -> None:
+    """Raises ValueError: a network of a package whose networks all predict relative depth (MiDaS, from ``torch.hub``);
+    what it returns looks like metric depth."""
+    if type(network).__module__.partition(".")[0] == "midas":
+        raise ValueError(
+            f"network is MiDaS ({type(network).__name__}), which predicts inverse depth up to scale and shift, not "
+            "metres: give a metric network, or align it to measured depth (ufmstar_torch.models.AlignedNetwork)"
+        )
+
+
 def wrap_network(
     network: Callable[..., Any],
     output: str | int | None = None,
@@ -107,11 +117,12 @@ def wrap_network(
             its image processor; None: the pipeline's.
 
     Raises:
-        ValueError: ``inverse``, a value out of range, or a relative model of ``transformers``.
+        ValueError: ``inverse``, a value out of range, MiDaS, or a relative model of ``transformers``.
         TypeError: ``network`` cannot be called, or does not estimate depth; ``preprocess`` is something else.
     """
     if isinstance(network, type) or not callable(network):
         raise TypeError(f"network must be an nn.Module or a function, got {_described(network)}")
+    refuse_relative(network)
     if of_transformers(network):
         if (
             inverse

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from torch import Tensor, nn
 
 from ufmstar_torch import networks_in_turn, pipeline
-from ufmstar_torch.models.any_network import wrap_network
+from ufmstar_torch.models.any_network import refuse_relative, wrap_network
 from ufmstar_torch.models.hugging_face import of_transformers
 from ufmstar_torch.models.outputs import METRIC, OutputSpec
 from ufmstar_torch.prediction import DepthPrediction
@@ -25,6 +25,8 @@ class UncertainDepth(pipeline.UncertainDepth):
         members: list[Any] = [networks]
         if isinstance(networks, Iterable) and not isinstance(networks, nn.Module | str | Mapping):
             members = list(networks)
+        for member in members:
+            refuse_relative(member)
         foreign = [not isinstance(member, nn.Module) or of_transformers(member) for member in members]
         declared = preprocess if hasattr(preprocess, "to_dict") else None
         modules = [

@@ -18,6 +18,7 @@ import torch
 from onnx_files import small_network
 from torch import Tensor, nn
 
+from ufmstar_torch import UncertainDepth
 from ufmstar_torch.models import (
     AlignedNetwork,
     Alignment,
@@ -379,3 +380,15 @@ def test_fastdepth_from_a_checkpoint(tmp_path: Path, suffix: str, folded: bool) 
     save_checkpoint(path, {"a": torch.zeros(1)})
     with pytest.raises(ValueError, match=rf"w.{suffix}: not the weights of a FastDepth"):
         load_network("fastdepth", path)
+
+
+def test_midas_is_refused_and_can_be_aligned():
+    """From ``torch.hub`` it returns a map [B, H, W] as a metric network does, which is inverse depth."""
+    kind = type(
+        "DPTDepthModel", (nn.Module,), {"__module__": "midas.dpt_depth", "forward": lambda self, x: 1 + x[:, 0]}
+    )
+    for wrap in (wrap_network, UncertainDepth, lambda network: UncertainDepth([network])):
+        with pytest.raises(ValueError, match=r"MiDaS \(DPTDepthModel\), which predicts inverse.*AlignedNetwork"):
+            wrap(kind())
+    aligned = AlignedNetwork(kind(), Alignment("inverse", 0.5, 0.1))
+    assert float(aligned(torch.ones(1, 3, 8, 8)).depth[0, 0, 0]) == pytest.approx(1 / 1.1)
