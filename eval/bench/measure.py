@@ -167,7 +167,7 @@ def _mean(values: Sequence[Any]) -> Any:
 
 
 def _obstacle(row: Row, networks: Mapping[str, TimedNetwork]) -> str | None:
-    """Why a row cannot be measured."""
+    """The reason for which a row cannot be measured."""
     base, setting = row.method.base, row.setting
     if base not in networks:
         return f"no network for {base}"

@@ -125,7 +125,7 @@ class EvalFolder:
         return f"{item.label}: failed: {reason}"
 
     def failures(self, items: Iterable[WorkItem]) -> dict[str, str]:
-        """Why a sequence cannot be judged, as :meth:`fail` has stored it, by its label."""
+        """Reasons for which sequences cannot be judged, as :meth:`fail` stored them, by label."""
         failures = {}
         for item in items:
             path = self.sequence_folder(item) / FAILED

@@ -1,8 +1,9 @@
 """Learns ``running`` from a frame's anchors: each is predicted from the others, alone or without its whole region.
 
-Anchors of discs that move over the image are left out of the field, which then predicts them: they count by area and
-not by number, since corners cluster on what is well textured. ``unseen`` fits what their errors are beyond the field's
-in proportion to the distance from evidence, and ``wrong`` is the mean probability that they are on another surface.
+Roughness and noise follow from anchors that are left out alone. For the rest, discs that move over the image are left
+out of the field, which then predicts the anchors in them. Products of errors in neighbouring cells teach the amplitude,
+and ``unseen`` in proportion to the distance from evidence. ``wrong`` is the mean probability that an anchor lies on
+another surface, by area and not by number, since corners cluster on what is well textured.
 """
 
 from __future__ import annotations
