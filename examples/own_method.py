@@ -32,10 +32,9 @@ class Coverage(SumMetric):
     OF_VARIANCE = "Coverage"
     STATES = (("inside", COUNT), ("pixels", COUNT))
 
-    def add(self, pixels):
-        judged = pixels.use & (pixels.target > 0) & (pixels.variance >= 0)
-        hits = np.abs(pixels.target - pixels.depth)[judged] <= 2 * np.sqrt(pixels.variance[judged])
-        self.inside, self.pixels = self.inside + int(hits.sum()), self.pixels + int(judged.sum())
+    def sums(self, pixels):
+        depth, variance, truth = pixels.judged
+        return {"inside": (np.abs(truth - depth) <= 2 * np.sqrt(variance)).sum(), "pixels": len(truth)}
 
     def compute(self):
         return {"within_2_sigma": share(self.inside, self.pixels)}

@@ -247,7 +247,7 @@ def _onnxruntime() -> Any:
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:
-    """Exceptions of ONNX Runtime for a graph that it cannot load or run; those of its own have no common base class."""
+    """Exceptions that ONNX Runtime raises for a graph that it cannot load or run. Its own have no common base class."""
     from onnxruntime.capi import onnxruntime_pybind11_state as state
 
     names = ("InvalidProtobuf", "InvalidGraph", "InvalidArgument", "Fail", "NotImplemented", "RuntimeException")

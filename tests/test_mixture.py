@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.metrics.base import flat_pixels
 from ufmstar_torch.eval.metrics.mixture import Mixture
 
 
@@ -45,8 +46,8 @@ def test_without_outliers_it_is_the_normal_distribution() -> None:
 
 def test_nll_of_one_pixel_by_hand() -> None:
     """v = 1.09, v_1 = .1 and p = .1: v_2 = 10."""
-    metric = Mixture()
-    metric.add_mixture(*(torch.tensor([[x]]) for x in (3.0, 1.09, 3.5, 0.1, 0.1)))
+    metric, (depth, variance, truth, *mixture) = Mixture(), (torch.tensor([[x]]) for x in (3.0, 1.09, 3.5, 0.1, 0.1))
+    metric.add(flat_pixels(depth, variance, truth, mixture=(mixture[0], mixture[1])))
     density = sum(w * math.exp(-(0.5**2) / v / 2) / math.sqrt(2 * math.pi * v) for w, v in ((0.9, 0.1), (0.1, 10.0)))
     assert float(metric.compute()["mixture_nll"]) == pytest.approx(-math.log(density), rel=1e-5)
 
@@ -54,17 +55,19 @@ def test_nll_of_one_pixel_by_hand() -> None:
 def test_pixels_that_state_no_mixture_are_left_out_and_none_gives_no_figures() -> None:
     one, nan = torch.ones(1), torch.tensor([torch.nan])
     metric = Mixture()
-    for maps in (
+    for depth, variance, truth, inlier, outlier in (
         (nan, one, one, one, one),
         (one, one, 0 * one, one, one),
         (one, one, one, nan, one),
         (one,) * 4 + (nan,),
     ):
-        metric.add_mixture(*maps)
+        metric.add(flat_pixels(depth, variance, truth, mixture=(inlier, outlier)))
     assert metric.compute() == {}
     metrics = SequenceMetrics()
     metrics.update(one, one, one)
     assert not [name for name in metrics.compute() if name.startswith("mixture")]
+    with pytest.raises(ValueError, match=r"outlier must have the depth's shape \(1,\), got \(2,\)"):
+        metrics.update(one, one, one, mixture=(one, torch.ones(2)))
 
 
 def test_parts_of_a_sequence_add_up() -> None:

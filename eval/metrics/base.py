@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,6 +28,8 @@ class Pixels:
     variance: Array  # [P] v [m^2]; [0] where there is none
     target: Array  # [P] g [m]
     use: NDArray[np.bool_]  # [P] True = use
+    inlier: Array  # [P] variance of a mixture's inliers [m^2]; [0] where there is no mixture
+    outlier: Array  # [P] probability of an outlier; likewise
 
     @cached_property
     def with_truth(self) -> NDArray[np.bool_]:
@@ -100,17 +103,13 @@ class SumMetric(Metric):
         if self.OF_VARIANCE and len(pixels.variance) != len(pixels.depth):
             judged = f"{self.OF_VARIANCE} judges the predicted distribution N(depth, variance)"
             raise ValueError(f"variance must be given: {judged}")
-        self.add_sums(self.sums(pixels))
-
-    def add_sums(self, sums: Mapping[str, Any]) -> None:
-        """Add to states by their names."""
-        for name, added in sums.items():
+        for name, added in self.sums(pixels).items():
             state = getattr(self, name)
             setattr(self, name, state + torch.as_tensor(added, dtype=state.dtype, device=state.device))
 
+    @abstractmethod
     def sums(self, pixels: Pixels) -> Mapping[str, Any]:
-        """The pixels' contribution to each state, by its name."""
-        raise NotImplementedError
+        """The pixels' contribution to each state, by its name; a state that is left out stays."""
 
     def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:
         """Add another metric's sums to this one's. Raises ValueError: the other one was made with other settings, so
@@ -125,7 +124,10 @@ class SumMetric(Metric):
             self._update_count += incoming_state._update_count
 
 
-def flat_pixels(depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> Pixels:
+def flat_pixels(
+    depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None,
+    mixture: tuple[Tensor, Tensor] | None = None,
+) -> Pixels:  # fmt: skip
     """All pixels of maps of one shape [...], in float64.
 
     Args:
@@ -133,11 +135,14 @@ def flat_pixels(depth: Tensor, variance: Tensor | None, target: Tensor, valid: T
         variance: predicted variance v [m^2], or None; not finite or < 0 = no prediction.
         target: ground truth [m]; NaN, infinite or <= 0 means there is none.
         valid: bool, True = use; None = everywhere.
+        mixture: variance of the inliers [m^2] and probability of an outlier; None: no mixture is stated.
 
     Raises:
         ValueError: an argument has another shape than ``depth`` or the wrong type.
     """
-    for name, value in (("depth", depth), ("variance", variance), ("target", target), ("valid", valid)):
+    inlier, outlier = mixture or (None, None)
+    given = {"depth": depth, "variance": variance, "target": target, "valid": valid}
+    for name, value in (given | {"inlier": inlier, "outlier": outlier}).items():
         if value is None:
             continue
         if value.shape != depth.shape:
@@ -147,11 +152,11 @@ def flat_pixels(depth: Tensor, variance: Tensor | None, target: Tensor, valid: T
         if name != "valid" and not torch.is_floating_point(value):
             raise ValueError(f"{name} must be floating point, got {value.dtype}")
 
-    def flat(value: Tensor) -> NDArray[Any]:
-        return value.detach().to("cpu", torch.float64).flatten().numpy()
+    def flat(value: Tensor | None) -> NDArray[Any]:
+        return np.zeros(0) if value is None else value.detach().to("cpu", torch.float64).flatten().numpy()
 
     use = np.ones(depth.numel(), np.bool_) if valid is None else valid.cpu().flatten().numpy()
-    return Pixels(flat(depth), np.zeros(0) if variance is None else flat(variance), flat(target), use)
+    return Pixels(flat(depth), flat(variance), flat(target), use, flat(inlier), flat(outlier))
 
 
 def share(part: Tensor, whole: Tensor) -> Tensor:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics.base import COUNT, SUM, SumMetric, share
+from ufmstar_torch.eval.metrics.base import COUNT, SUM, Pixels, SumMetric, share
 from ufmstar_torch.eval.metrics.calibration import quantile_levels
 
 _BINS, _DELTA = 10, 0.25
@@ -28,12 +31,12 @@ class Mixture(SumMetric):
         *((name, COUNT, _BINS) for name in ("accurate", "pixels", "at_or_below")),
     )
 
-    def add_mixture(self, depth: Tensor, variance: Tensor, target: Tensor, inlier: Tensor, outlier: Tensor) -> None:
-        """Add maps of one shape: d [m], v [m^2], ground truth [m], v_1 [m^2] and p."""
-        d, v, g, v1, p = (
-            x.detach().to("cpu", torch.float64).flatten() for x in (depth, variance, target, inlier, outlier)
-        )
-        used = (g > 0) & g.isfinite() & d.isfinite() & v.isfinite() & (v1 > 0) & v1.isfinite() & (p >= 0) & (p <= 1)
+    def sums(self, pixels: Pixels) -> Mapping[str, Any]:
+        if not len(pixels.inlier):
+            return {}
+        maps = pixels.depth, pixels.variance, pixels.target, pixels.inlier, pixels.outlier
+        d, v, g, v1, p = (torch.from_numpy(x[pixels.with_truth & pixels.predicted]) for x in maps)
+        used = (v1 > 0) & v1.isfinite() & (p >= 0) & (p <= 1)
         d, v, g, v1, p = (x[used] for x in (d, v, g, v1, p))
         parts = torch.stack([v1, torch.maximum((v - (1 - p) * v1) / p.clamp_min(1e-12), v1)])
         weight, sigma, error = torch.stack([1 - p, p]), parts.sqrt(), g - d
@@ -42,16 +45,14 @@ class Mixture(SumMetric):
         below = (weight * torch.special.ndtr(error / sigma)).sum(0)
         bins = (confidence * _BINS).long().clamp_max(_BINS - 1)
         accurate = error.abs() <= _DELTA * d.abs()
-        self.add_sums(
-            {
-                "total": -torch.logsumexp(weight.log() + log_density, 0).sum(),
-                "confidence": torch.bincount(bins, confidence, _BINS),
-                "pixels": torch.bincount(bins, minlength=_BINS),
-                "accurate": torch.bincount(bins[accurate], minlength=_BINS),
-                "at_or_below": (below[:, None] <= quantile_levels(_BINS)).sum(0),
-                "covered": ((below - 0.5).abs() <= _THREE_SIGMA / 2).sum(),
-            }
-        )
+        return {
+            "total": -torch.logsumexp(weight.log() + log_density, 0).sum(),
+            "confidence": torch.bincount(bins, confidence, _BINS),
+            "pixels": torch.bincount(bins, minlength=_BINS),
+            "accurate": torch.bincount(bins[accurate], minlength=_BINS),
+            "at_or_below": (below[:, None] <= quantile_levels(_BINS)).sum(0),
+            "covered": ((below - 0.5).abs() <= _THREE_SIGMA / 2).sum(),
+        }
 
     def compute(self) -> dict[str, Tensor]:
         count = self.pixels.sum()

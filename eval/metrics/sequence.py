@@ -74,12 +74,9 @@ class SequenceMetrics(nn.Module):
         Raises:
             ValueError: shapes or types disagree, or a needed variance is missing.
         """
-        pixels = flat_pixels(depth, variance, target, valid)
+        pixels = flat_pixels(depth, variance, target, valid, mixture)
         for metric in self._all():
-            if not isinstance(metric, Mixture):
-                metric.add(pixels)
-            elif mixture is not None and variance is not None:
-                metric.add_mixture(depth, variance, target if valid is None else target.where(valid, 0), *mixture)
+            metric.add(pixels)
 
     def compute(self) -> dict[str, float]:
         """The scalar figures by name: delta1, delta1_ratio, abs_rel, rmse [m], nll, ece_delta, ece_q, ...

@@ -169,8 +169,9 @@ def make_job(
 
 
 def recalibration_of(options: Mapping[str, Any], config: UfMStarConfig, source: DepthSource) -> Recalibration | None:
-    """The map that is named or lies beside the weights; None = none. Raises FileNotFoundError: the named file does not
-    exist; ValueError: it is no recalibration, or was fitted under other settings or to another network."""
+    """The recalibration of ``--recalibration``, or of the file beside the weights; None: there is neither. Raises
+    FileNotFoundError: the named file does not exist; ValueError: it is no recalibration, or was fitted under other
+    settings or to another network."""
     name, weights = options["recalibration"], options["weights"]
     if name == "none" or (name is None and not (weights and beside(weights[0]).is_file())):
         return None

@@ -99,8 +99,8 @@ def _figures(row: RowResult) -> dict[str, Any]:
 
 
 def _times(result: FrameResult, row: RowResult, writing: float, saving: float) -> dict[str, float]:
-    """The times by stage [ms], which overlap. "prepare" is the rest of the prediction beside the network, "save" that
-    of the previous frame, "cycle" the time since then."""
+    """Times by stage [ms]; stages overlap. "prepare" is the prediction's time without the network's. "save" is the
+    previous frame's, and "cycle" the time since the previous frame."""
     ms = result.ms
     return {
         "read": ms["read"],

@@ -26,9 +26,9 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a SensReader export; depth comes as it is, with ``depth_intrinsics``. Exports with resized images keep the
-    original ``intrinsic_color.txt``: intrinsics that fit 1296x968 (depth: 640x480) but not the files' size are scaled
-    to it. Raises ValueError: no usable frame, intrinsics that fit neither size, a malformed pose file."""
+    """Opens a SensReader export. Depth maps keep their own camera, ``depth_intrinsics``. Exports with resized images
+    have the original ``intrinsic_color.txt``: intrinsics that fit 1296x968 (depth: 640x480) but not the files' size are
+    scaled to it. Raises ValueError: no usable frame, intrinsics that fit neither size, a malformed pose file."""
     images = list_images(path / "color")
     frames = [_frame(path, image, options) for image in images]
     if not images:

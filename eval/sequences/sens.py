@@ -55,9 +55,9 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a ``.sens`` file; depth comes as it is, with ``depth_intrinsics``, as from a SensReader export. Frames are
-    called by their number. In a truncated file, those before the break are used and the others skipped. Raises
-    ValueError: another version or compression, a broken header, or no usable frame."""
+    """Opens a ``.sens`` file. Depth maps keep their own camera, ``depth_intrinsics``. Frames are named by their number.
+    In a truncated file, those before the break are used and the others skipped. Raises ValueError: another version or
+    compression, a broken header, or no usable frame."""
     file = _files(path)[0] if path.is_dir() else path
     with file.open("rb") as opened:
         header = _read_header(opened, file)

@@ -20,7 +20,7 @@ from ufmstar_torch.posterior.scene import LeftOut, Scene, away_from, second_mome
 # Variance of the difference between neighbouring nodes, over that of the link between them: on a square lattice the
 # other ways from one to the other are worth as much as the link.
 APART = 0.5
-# With fewer anchors beside the discs, nothing is held out: the field would be the prior.
+# With fewer anchors outside the discs, no anchor is held out: the field alone would be close to its prior.
 LEAST_REST = 5
 # The frame's number moves the discs along this sequence of low discrepancy (R2, Roberts).
 STEPS = (0.7548776662466927, 0.5698402909980532)
