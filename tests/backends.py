@@ -68,7 +68,7 @@ def make_backend(name: str) -> Backend:
     if name == "numba":
         numba_kernels = replace(
             REFERENCE, spgf=segment_cpu.segment, floor_covariance=_floored, correspond=_corresponding, fuse=_fused,
-            regress_image=_regressed, smooth=regress_cpu.smooth,
+            regress_image=_regressed,
         )  # fmt: skip
         return Backend(name, "cpu", numba_kernels, select_check(name, "cpu"))
     if not INTERPRETED and not torch.cuda.is_available():

@@ -139,7 +139,7 @@ def test_kernels_import_back_only_plain_types():
         "DAMPING",
         "STEPS",
         "FrameInput",
-        "FrameMaps",
+        "HALF",
         "DEPTH_RANGE",
         "FARTHEST",
         "FOCAL_RANGE",

@@ -17,9 +17,11 @@ import ufmstar_torch.regress as regress_module
 from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels import regress_cpu
+from ufmstar_torch.kernels.regress_cpu import fill_and_smooth
 from ufmstar_torch.kernels.vectors_cpu import vectors
-from ufmstar_torch.regress import regress, regress_image, shares
+from ufmstar_torch.regress import Regression, distribute, regress, regress_image, shares, smooth
 from ufmstar_torch.sample import sample_pixels
+from ufmstar_torch.unmeasured import after_regression
 
 pytestmark = pytest.mark.numerics
 
@@ -62,7 +64,7 @@ def test_agrees_with_the_oracle(backend, config, seed):
 
 
 @BOTH
-def test_shares_make_up_the_regression(backend, config):
+def test_shares_make_up_the_regression(config):
     m = mixture(2, 9, 4, features=2)
     m = m.replace(weight=m.weight * (torch.arange(9) != 5))  # an empty slot
     points = torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
@@ -77,7 +79,7 @@ def test_shares_make_up_the_regression(backend, config):
     torch.testing.assert_close(share @ m.features, result.features, rtol=1e-11, atol=1e-300)
     values = torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     for points_at in (slice(None), slice(0, 11)):
-        summed = backend.kernels.distribute(m, points[:, points_at], values[:, points_at], config)
+        summed = distribute(m, points[:, points_at], values[:, points_at], config)
         torch.testing.assert_close(summed, share[:, points_at].mT @ values[:, points_at], rtol=1e-10, atol=1e-12)
 
 
@@ -176,13 +178,29 @@ def test_chunks_change_nothing(monkeypatch):
     assert regress(m, points[:, :0], EXACT).disagreement.shape == (1, 0)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_smooth_averages_where_both_are_known(backend, dtype):
+def test_smooth_averages_where_both_are_known():
     nan = float("nan")
-    before, now = torch.tensor([[[1.0, nan, 2.0, nan]]]), torch.tensor([[[3.0, 4.0, nan, nan]]], dtype=dtype)
-    memory, shown = backend.kernels.smooth(before, now, 0.25)
+    before, now = torch.tensor([[[1.0, nan, 2.0, nan]]]), torch.tensor([[[3.0, 4.0, nan, nan]]]).double()
+    memory, shown = smooth(before, now, 0.25)
     torch.testing.assert_close(memory, torch.tensor([[[1.5, 4.0, 2.0, nan]]]), equal_nan=True)
-    torch.testing.assert_close(shown, torch.tensor([[[1.5, 4.0, nan, nan]]], dtype=dtype), equal_nan=True)
+    torch.testing.assert_close(shown, torch.tensor([[[1.5, 4.0, nan, nan]]]).double(), equal_nan=True)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("stated", ["relative", "paper", "nan"])
+def test_filling_and_smoothing_at_once_equal_both(stated, dtype):
+    config, generator = UfMStarConfig(unmeasured=stated), torch.Generator().manual_seed(6)
+    maps = torch.rand(4, 2, 9, 11, generator=generator).to(dtype)
+    maps[3, :, :2, ::2], maps[:3, :, 1:4, :3] = torch.nan, torch.nan  # of the memory, and of the frame
+    disagreement, measured, depth, memory = (*maps[:3], maps[3].float())
+    filled, _ = after_regression(Regression(disagreement, measured[..., None]), depth, config)
+    for alpha in (0.3, 1.0):
+        expected = smooth(memory, filled.disagreement, alpha)
+        *found, counts = fill_and_smooth(disagreement, measured, depth, memory, config, alpha)
+        assert counts == (measured < 0.5).sum((1, 2)).tolist()
+        for a, b in zip(found, expected, strict=True):
+            assert a.dtype == b.dtype
+            torch.testing.assert_close(a, b, rtol=4 * torch.finfo(torch.float32).eps, atol=0, equal_nan=True)
 
 
 def test_sample_is_seeded_uniform_and_valid():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +14,7 @@ import oracle
 import scenes
 from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.frame import FrameMaps, check_values
+from ufmstar_torch.frame import check_values
 from ufmstar_torch.kernels import threads_cpu
 
 pytestmark = pytest.mark.numerics
@@ -267,11 +266,10 @@ def test_the_check_agrees_with_the_reference(compiled_backend, dtype):
         return torch.where(pick < len(special), torch.tensor(special).double()[pick % len(special)], values).to(dtype)
 
     size = (9, 17)
-    full = FrameMaps(hostile(b, *size), hostile(b, *size), hostile(b, *size), hostile(b, 2, *size),
-                     torch.rand(b, *size, generator=generator) > 0.2)  # fmt: skip
-    plain = FrameMaps(full.depth, None, None, None, None)
-    for maps in (full, plain, replace(plain, epistemic=full.epistemic, mask=full.mask)):
-        given = (maps, poses, cameras)
+    depth, a, e, features = hostile(b, *size), hostile(b, *size), hostile(b, *size), hostile(b, 2, *size)
+    mask = torch.rand(b, *size, generator=generator) > 0.2
+    for optional in ((a, e, features, mask), (None,) * 4, (None, e, None, mask)):
+        given = (depth, poses, cameras, *optional)
         slow = check_values(*given, rotation_tolerance=0.01, max_depth=20.3)
         fast = compiled_backend.check(*given, rotation_tolerance=0.01, max_depth=20.3)
         for name, value in vars(slow).items():

@@ -24,7 +24,7 @@ from triton.runtime.jit import KernelInterface
 import scenes
 from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
-from ufmstar_torch.frame import FrameMaps, check_frame
+from ufmstar_torch.frame import check_frame
 from ufmstar_torch.kernels.select import select_kernels
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
@@ -101,6 +101,7 @@ def cases() -> dict[str, Callable[[], object]]:
             last=False,
         )  # fmt: skip
 
+    values = depth, torch.eye(4).double().expand(2, 4, 4), K, depth, depth, depth[:, None], depth > 0
     given = SegmentInput.checked(depth, K, None, depth, depth > 0, depth[:, None])
     return {
         "regress": lambda: regress.regress_image(m, depth, K, depth > 0, config),
@@ -110,13 +111,7 @@ def cases() -> dict[str, Callable[[], object]]:
         "correspond": lambda: correspond.correspond(m, current, K, SIZE, config),
         "bits": bits,
         "fuse": lambda: fuse.fuse(m, current, pairs, config.replace(overlap_weighted=True)),
-        "check": lambda: check.check_values(
-            FrameMaps(depth, depth, depth, depth[:, None], depth > 0),
-            torch.eye(4).double().expand(2, 4, 4),
-            K,
-            rotation_tolerance=0.01,
-            max_depth=20.0,
-        ),
+        "check": lambda: check.check_values(*values, rotation_tolerance=0.01, max_depth=20.0),
         "floor": lambda: fuse.floor_covariance(m.covariance, m.weight),
         "segment": lambda: segment.segment(given),
         "device": device,

@@ -76,66 +76,71 @@ class FrameInput:
         return self.depth.shape[-2], self.depth.shape[-1]
 
 
-@dataclass(frozen=True)
-class FrameMaps:
-    """Maps of B streams of one shape, dtype and device, whose values are not checked yet.
-
-    Attributes:
-        depth: [B, H, W] [m], detached, float32 or float64.
-        aleatoric, epistemic: [B, H, W] [m^2] or None.
-        features: [B, F, H, W] or None.
-        mask: [B, H, W] bool, True = use, or None.
-    """
-
-    depth: Tensor
-    aleatoric: Tensor | None
-    epistemic: Tensor | None
-    features: Tensor | None
-    mask: Tensor | None
-
-
 class CheckKernel(Protocol):
     """The check of values; see :func:`check_values`."""
 
     def __call__(
-        self, maps: FrameMaps, pose: Tensor, intrinsics: Tensor, /, *, rotation_tolerance: float, max_depth: float
+        self,
+        depth: Tensor,
+        pose: Tensor,
+        intrinsics: Tensor,
+        aleatoric: Tensor | None,
+        epistemic: Tensor | None,
+        features: Tensor | None,
+        mask: Tensor | None,
+        /,
+        *,
+        rotation_tolerance: float,
+        max_depth: float,
     ) -> FrameInput: ...
 
 
 def check_values(
-    maps: FrameMaps, pose: Tensor, intrinsics: Tensor, *, rotation_tolerance: float, max_depth: float
+    depth: Tensor,
+    pose: Tensor,
+    intrinsics: Tensor,
+    aleatoric: Tensor | None,
+    epistemic: Tensor | None,
+    features: Tensor | None,
+    mask: Tensor | None,
+    *,
+    rotation_tolerance: float,
+    max_depth: float,
 ) -> FrameInput:
-    """Check a frame's values, where shapes and dtypes are right.
+    """Check a frame's values, where shapes and dtypes are right; all maps have one dtype and device.
 
     Args:
-        maps: of B streams.
+        depth: [B, H, W] [m], detached, float32 or float64.
         pose: [B, 4, 4], or [1, 4, 4] or [4, 4] for all streams, of any floating dtype, on any device.
         intrinsics: likewise [B, 3, 3] and so on [px].
+        aleatoric, epistemic: [B, H, W] [m^2] or None.
+        features: [B, F, H, W] or None.
+        mask: [B, H, W] bool, True = use, or None.
         rotation_tolerance, max_depth: as :func:`check_frame`.
     """
-    plain, device = maps.depth, maps.depth.device
-    pose, intrinsics = (of_streams(camera, len(plain)) for camera in (pose, intrinsics))
+    device = depth.device
+    pose, intrinsics = (of_streams(camera, len(depth)) for camera in (pose, intrinsics))
     deviation = rotation_deviation(pose[..., :3, :3])
-    faults = pose_fault(pose, deviation, rotation_tolerance), intrinsics_fault(intrinsics, plain.shape[-2:])
+    faults = pose_fault(pose, deviation, rotation_tolerance), intrinsics_fault(intrinsics, depth.shape[-2:])
     known = _first(*faults, torch.device("cpu")) if pose.device.type == intrinsics.device.type == "cpu" else None
     fault = _first(*faults, device) if known is None else _moved(known, device)
     fine = fault == 0
-    given = (plain > 0) & (plain < torch.inf) & fine[:, None, None]  # NaN is neither
-    if maps.mask is not None:
-        given = given & maps.mask
-    beyond = given & (plain > max_depth)
+    given = (depth > 0) & (depth < torch.inf) & fine[:, None, None]  # NaN is neither
+    if mask is not None:
+        given = given & mask
+    beyond = given & (depth > max_depth)
     near = given & ~beyond
-    use = near & (plain >= DEPTH_RANGE[0]) & (plain <= DEPTH_RANGE[1])
-    for variance in (maps.aleatoric, maps.epistemic):
+    use = near & (depth >= DEPTH_RANGE[0]) & (depth <= DEPTH_RANGE[1])
+    for variance in (aleatoric, epistemic):
         if variance is not None:
             use = use & (variance.detach() >= 0) & (variance.detach() <= LARGEST)
-    if maps.features is not None:
-        use = use & (maps.features.abs() <= LARGEST).all(1)
+    if features is not None:
+        use = use & (features.abs() <= LARGEST).all(1)
     T_safe, K_safe = _harmless(_moved(pose, device), _moved(intrinsics, device), fine)
-    safe_depth = torch.where(use, plain, torch.zeros_like(plain))
+    safe_depth = torch.where(use, depth, torch.zeros_like(depth))
     return FrameInput(
-        safe_depth, T_safe, K_safe, maps.aleatoric, maps.epistemic, maps.features, use, fault,
-        _moved(deviation, device), beyond.sum((1, 2)), (near & ~use).sum((1, 2)), known,
+        safe_depth, T_safe, K_safe, aleatoric, epistemic, features, use, fault, _moved(deviation, device),
+        beyond.sum((1, 2)), (near & ~use).sum((1, 2)), known,
     )  # fmt: skip
 
 
@@ -193,8 +198,7 @@ def check_frame(
     if valid is not None:
         either = [*shapes, (shape[0], 1, *shape[-2:])]
         mask = _as(require_mask("valid", as_tensor("valid", valid), either, depth), size, torch.bool)
-    maps = FrameMaps(plain, a, e, extra, mask)
-    return kernel(maps, T, K, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
+    return kernel(plain, T, K, a, e, extra, mask, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
 
 
 def raise_faults(frame: FrameInput) -> None:

@@ -93,7 +93,8 @@ class _MergeFrame(FrameExtension):
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
         """Merge the streams that are due, and count the components."""
         state = merged(state, self._frame.fault == 0, self._config, self._kernels)
-        return state, replace(out, statistics=replace(out.statistics, components=state.mixture.components))
+        counts = {"components": state.mixture.components, "single_view": (state.count == 1).sum(1)}
+        return state, replace(out, statistics=replace(out.statistics, **counts))
 
 
 def merged(state: UfMStarState, fine: Tensor, config: UfMStarConfig, kernels: MergeKernels) -> UfMStarState:

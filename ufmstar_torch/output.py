@@ -62,7 +62,7 @@ class FrameStatistics:
     unmeasured: Tensor
     fault: Tensor
     rotation_deviation: Tensor
-    single_view: Tensor | None = None
+    single_view: Tensor
     anchors: Tensor | None = None
     anchors_used: Tensor | None = None
     anchors_rejected: Tensor | None = None

@@ -7,7 +7,6 @@ average of m_k with weights w_k(x), a weak prior (pi_0, mu_0) taking over where 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -94,9 +93,9 @@ def regress_image(
         pixels: [B, n] indices into the flattened image; None = every pixel.
     """
     if pixels is not None:
-        chosen = torch.gather(depth.flatten(1), 1, pixels)
-        result = regress(mixture_cam, unproject_at(chosen, pixels, depth.shape[2], intrinsics), config)
-        return _where(torch.gather(valid.flatten(1), 1, pixels), result.disagreement, result.features)
+        points = unproject_at(at_pixels(depth, pixels), pixels, depth.shape[2], intrinsics)
+        result = regress(mixture_cam, points, config)
+        return _where(at_pixels(valid, pixels), result.disagreement, result.features)
     result = regress(mixture_cam, unproject(depth, intrinsics).flatten(1, 2), config)
     return _where(valid, result.disagreement.view(valid.shape), result.features.view(*valid.shape, -1))
 
@@ -204,16 +203,9 @@ def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Ten
 
 
 def moving_average(
-    memory: Tensor,
-    disagreement: Tensor,
-    size: tuple[int, int],
-    alpha: float,
-    pixels: Tensor | None,
-    kernel: Callable[[Tensor, Tensor, float], tuple[Tensor, Tensor]] = smooth,
+    memory: Tensor, disagreement: Tensor, size: tuple[int, int], alpha: float, pixels: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """The moving average of a frame: the new memory [B, H, W], and the map to show.
-
-    The memory keeps its dtype, so that a saved run goes on as it was, and restarts when the image size changes.
+    """The moving average of a frame: the new memory [B, H, W] in its dtype, and the map to show.
 
     Args:
         memory: [B, h, w] of the frame before [m^2].
@@ -221,12 +213,22 @@ def moving_average(
         size: H and W.
         alpha: in (0, 1].
         pixels: [B, n] indices into the flattened image, or None.
-        kernel: an implementation of :func:`smooth`.
     """
-    if memory.shape[1:] != size:
-        memory = memory.new_full((memory.shape[0], *size), torch.nan)
-    if pixels is None:
-        return kernel(memory, disagreement, alpha)
-    flat = memory.flatten(1)
-    mixed, shown = kernel(torch.gather(flat, 1, pixels), disagreement, alpha)
-    return flat.scatter(1, pixels, mixed).view(memory.shape), shown
+    memory = memory_for(memory, size)
+    mixed, shown = smooth(at_pixels(memory, pixels), disagreement, alpha)
+    return with_pixels(memory, pixels, mixed), shown
+
+
+def memory_for(memory: Tensor, size: tuple[int, int]) -> Tensor:
+    """The memory of a moving average [B, h, w] for a frame of ``size``: it restarts when the size changes."""
+    return memory if memory.shape[1:] == size else memory.new_full((memory.shape[0], *size), torch.nan)
+
+
+def at_pixels(values: Tensor, pixels: Tensor | None) -> Tensor:
+    """The values of a map [B, H, W] at pixels [B, n], indices into the flattened image; None = the map."""
+    return values if pixels is None else torch.gather(values.flatten(1), 1, pixels)
+
+
+def with_pixels(values: Tensor, pixels: Tensor | None, changed: Tensor) -> Tensor:
+    """The map [B, H, W] with other values [B, n] at pixels [B, n]; None = all of them [B, H, W]."""
+    return changed if pixels is None else values.flatten(1).scatter(1, pixels, changed).view(values.shape)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import torch
@@ -44,11 +44,6 @@ class UfMStarState:
     smoothed: Tensor
     by_component: Mapping[str, Tensor] = field(default_factory=dict)
     by_stream: Mapping[str, Tensor] = field(default_factory=dict)
-
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Names of the tensors that the paper's state has."""
-        return tuple(f.name for f in fields(cls) if f.name not in ("by_component", "by_stream"))
 
     @classmethod
     def initial(
@@ -121,25 +116,18 @@ class UfMStarState:
         if b and float(rotation_deviation(R).max()) > 1e-6:
             raise ValueError("T_world_first holds matrices that are not rigid")
 
-    @property
-    def extensions(self) -> dict[str, Tensor]:
-        """The tensors of extensions by name."""
-        return {**self.by_component, **self.by_stream}
-
     def tensors(self) -> dict[str, Tensor]:
         """The tensors by name, without copying."""
-        return {name: getattr(self, name) for name in self.names()} | self.extensions
+        return {**{name: getattr(self, name) for name in NAMES}, **self.by_component, **self.by_stream}
 
     def with_tensors(self, changed: Mapping[str, Tensor]) -> UfMStarState:
         """A copy with some of its tensors exchanged, by name."""
-        if not changed:
-            return self
-        kept = {
-            name: {n: changed.get(n, v) for n, v in getattr(self, name).items()}
-            for name in ("by_component", "by_stream")
-        }
-        own = {name: changed[name] for name in self.names() if name in changed}
-        return replace(self, **own, by_component=kept["by_component"], by_stream=kept["by_stream"])
+        tensors = {**self.tensors(), **changed}
+        return UfMStarState(
+            **{name: tensors[name] for name in NAMES},
+            by_component={name: tensors[name] for name in self.by_component},
+            by_stream={name: tensors[name] for name in self.by_stream},
+        )
 
     def restarted(self, again: Tensor) -> UfMStarState:
         """The state with the streams of the mask ``again`` [B] as they were before their first frame."""
@@ -150,3 +138,7 @@ class UfMStarState:
             return torch.where(mask, torch.as_tensor(start.get(name, 0), dtype=old.dtype, device=old.device), old)
 
         return self.with_tensors({name: value(name, old) for name, old in self.tensors().items()})
+
+
+# Names of the tensors that the paper's state has, in order.
+NAMES = tuple(f.name for f in fields(UfMStarState) if f.name not in ("by_component", "by_stream"))

@@ -16,7 +16,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ufmstar_torch import fuse, unmeasured
+from ufmstar_torch import fuse, regress, unmeasured
 from ufmstar_torch.camera import focal_and_centre, relative_pose
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
@@ -26,7 +26,6 @@ from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import pixel_footprint, storage_floor
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import FrameStatistics, StepOutput, given
-from ufmstar_torch.regress import Regression, moving_average
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step_parts import REFERENCE, Kernels, StepObserver
@@ -107,12 +106,12 @@ def step(
         mixture, sums, _, gone = fuse.make_room(mixture, sums, mixture.components, new.sum(1), position, limit)
     mixture, dropped = fuse.append(mixture, current_first, new)
     mixture_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
-    changed, mixture_cam = extensions.before_regression({**state.by_stream, **sums}, mixture_cam, kernels.distribute)
+    changed, mixture_cam = extensions.before_regression({**state.by_stream, **sums}, mixture_cam, regress.distribute)
     mixture_cam = unmeasured.before_regression(mixture_cam)
     stage("append")
 
     result = kernels.regress_image(mixture_cam, frame.depth, frame.intrinsics, frame.valid, config, pixels)
-    result, measured = filled_in(result, frame, config, pixels)
+    result, measured = unmeasured.after_regression(result, regress.at_pixels(frame.depth, pixels), config)
     result = extensions.after_regression(result)
     stage("regress")
 
@@ -125,12 +124,11 @@ def step(
         "dropped": gone + dropped + (current_cam.valid & ~far_enough).sum(1),
         "valid_pixels": frame.valid.sum((1, 2)),
         "unmeasured": (measured < unmeasured.HALF).flatten(1).sum(1),
+        "single_view": (mixture.count == 1).sum(1),
     }
     disagreement, smoothed = result.disagreement, state.smoothed
     if smooth and config.ema_alpha < 1.0:
-        smoothed, disagreement = moving_average(
-            smoothed, disagreement, frame.size, config.ema_alpha, pixels, kernels.smooth
-        )
+        smoothed, disagreement = regress.moving_average(smoothed, disagreement, frame.size, config.ema_alpha, pixels)
     updated = state.with_tensors({
         **mixture.tensors(), **sums, **changed, "T_world_first": first, "started": state.started | fine,
         "frames": state.frames + fine, "skipped": state.skipped + ~fine, "smoothed": smoothed,
@@ -139,16 +137,6 @@ def step(
     out = StepOutput(disagreement, result.features, measured, partial(given, labels), current_cam, statistics)
     stage("average")
     return updated, out
-
-
-def filled_in(
-    result: Regression, frame: FrameInput, config: UfMStarConfig, pixels: Tensor | None
-) -> tuple[Regression, Tensor]:
-    """:func:`ufmstar_torch.unmeasured.after_regression` of a frame, at every pixel or at some."""
-    depth = frame.depth
-    if pixels is not None and config.unmeasured == "relative":  # nothing else reads it
-        depth = torch.gather(depth.flatten(1), 1, pixels)
-    return unmeasured.after_regression(result, depth, config)
 
 
 def frame_statistics(frame: FrameInput, counts: Mapping[str, Tensor]) -> FrameStatistics:

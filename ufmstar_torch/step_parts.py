@@ -37,10 +37,6 @@ SegmentKernel = Callable[[SegmentInput], tuple[GaussianMixture, Tensor]]
 FloorKernel = Callable[[Tensor, Tensor], Tensor]
 # Step 3: M_(i-1) and C_i in the camera frame, K, (H, W) -> pairs (correspond.correspond).
 CorrespondKernel = Callable[[GaussianMixture, GaussianMixture, Tensor, tuple[int, int], UfMStarConfig], Correspondence]
-# Memory, map, alpha -> new memory, map to show (regress.smooth).
-SmoothKernel = Callable[[Tensor, Tensor, float], tuple[Tensor, Tensor]]
-# M_i in the camera frame and values at points -> their sums by component (regress.distribute).
-DistributeKernel = Callable[[GaussianMixture, Tensor, Tensor, UfMStarConfig], Tensor]
 
 
 class FuseKernel(Protocol):
@@ -82,8 +78,6 @@ class Kernels:
     correspond: CorrespondKernel
     fuse: FuseKernel
     regress_image: RegressKernel
-    smooth: SmoothKernel
-    distribute: DistributeKernel
 
 
 REFERENCE = Kernels(
@@ -92,6 +86,4 @@ REFERENCE = Kernels(
     correspond=correspond.correspond,
     fuse=fuse.fuse,
     regress_image=regress.regress_image,
-    smooth=regress.smooth,
-    distribute=regress.distribute,
 )

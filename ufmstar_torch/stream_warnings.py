@@ -102,8 +102,7 @@ def hardly_compared(alone: int, components: int, frames: int) -> str:
 
 
 def _alone(statistics: FrameStatistics, frames: Tensor) -> Iterator[tuple[int, str, str]]:
-    assert statistics.single_view is not None
-    counts = torch.stack([statistics.single_view, statistics.components, frames]).T.tolist()
-    for b, each in enumerate(counts):
+    counts = (value.tolist() for value in (statistics.single_view, statistics.components, frames))
+    for b, each in enumerate(zip(*counts, strict=True)):
         if text := hardly_compared(*each):
             yield b, "views", text

@@ -17,14 +17,14 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension
 from ufmstar_torch.extensions import extensions_of
 from ufmstar_torch.fixed_order import apply
-from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
+from ufmstar_torch.frame import CheckKernel, FrameInput, check_frame, raise_faults
 from ufmstar_torch.kernels.select import LateStep, select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.network_variance import NetworkVariance
 from ufmstar_torch.output import MeanUncertainty, StepOutput, UfMStarOutput
 from ufmstar_torch.regress import Regression, regress
 from ufmstar_torch.sample import mean_uncertainty, sample_pixels, sample_size
-from ufmstar_torch.state import UfMStarState
+from ufmstar_torch.state import NAMES, UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
 from ufmstar_torch.step import Step
 from ufmstar_torch.step_parts import StepObserver
@@ -59,10 +59,10 @@ class UfMStar(StatefulModule):
             trust = out.std  # [m]
     """
 
-    STATE = UfMStarState.names()
+    STATE = NAMES
     config: UfMStarConfig
     observer: StepObserver | None = None
-    _kept_step: tuple[tuple[str, str], Step] | None = None
+    _kept_step: tuple[tuple[str, str], Step, CheckKernel] | None = None
 
     def __init__(
         self,
@@ -174,6 +174,7 @@ class UfMStar(StatefulModule):
         Raises:
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
+        depth = as_tensor("depth", depth)
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         index, used = sample_pixels(frame.valid, sample_size(frame.size, pixels, fraction), seed)
         out, maps = self._observe(frame, inputs, index, average=average)
@@ -263,14 +264,13 @@ class UfMStar(StatefulModule):
         if state["weight"].device.type != "meta":
             self._extensions.require_state(state)
 
-    def _checked(self, depth: Array, pose: CameraLike, intrinsics: CameraLike, *optional: Array | None) -> FrameInput:
+    def _checked(self, depth: Tensor, pose: CameraLike, intrinsics: CameraLike, *optional: Array | None) -> FrameInput:
         aleatoric, epistemic, valid, features = optional
-        depth = as_tensor("depth", depth)
         return check_frame(
             depth, pose, intrinsics, aleatoric, epistemic, valid, features,
             feature_count=self.config.features, aleatoric_in_h=self.config.aleatoric_in_h,
             rotation_tolerance=self.config.rotation_tolerance, max_depth=self.config.segment.depth_limit,
-            kernel=select_check(self.config.backend, depth.device.type),
+            kernel=self._kernels(depth.device.type)[1],
         )  # fmt: skip
 
     def _observe(
@@ -296,13 +296,12 @@ class UfMStar(StatefulModule):
                 raise_faults(frame)
             if self.observer is not None:
                 self.observer.stage("check")
-            step = self._step(frame.depth.device.type)
+            step, _ = self._kernels(frame.depth.device.type)
             state, out = step(
                 state, frame, self.config, pixels=pixels, smooth=average, extensions=extensions, observer=self.observer
             )
             state, out = extensions.after_frame(state, out, partial(total, features=out.features))
             disagreement = extensions.disagreement(out.disagreement, chosen(frame.depth))
-            out = replace(out, statistics=replace(out.statistics, single_view=(state.count == 1).sum(1)))
         maps = {"disagreement": out.disagreement, **vars(of_network.at(chosen, out.features, self.config))}
         maps |= {**extensions.outputs(), "variance": total(disagreement, out.features)}
         self._store(state.tensors())  # last, so that an error before it, or a warning that is one, changes nothing
@@ -313,13 +312,13 @@ class UfMStar(StatefulModule):
         buffers = cast("dict[str, Tensor]", self._buffers)  # none is None; without the detour by ``__getattr__``
         return self._empty.with_tensors(buffers)
 
-    def _step(self, device_type: str) -> Step:
-        """The step for a device, the same one as long as the state goes on."""
+    def _kernels(self, device_type: str) -> tuple[Step, CheckKernel]:
+        """The step for a device, the same one as long as the state goes on, and the check."""
         key = (self.config.backend, device_type)
         if self._kept_step is None or self._kept_step[0] != key:
             self._settle()
-            self._kept_step = key, select_step(*key)
-        return self._kept_step[1]
+            self._kept_step = key, select_step(*key), select_check(*key)
+        return self._kept_step[1:]
 
     def _settle(self) -> None:
         """Write the step's pending components into the state before it is saved, copied or moved."""

@@ -44,6 +44,6 @@ def after_regression(result: Regression, depth: Tensor | None, config: UfMStarCo
     if config.unmeasured == "nan" or (config.unmeasured == "relative" and depth is None):
         disagreement = torch.where(measured < HALF, torch.nan, disagreement)
     elif config.unmeasured == "relative" and depth is not None:
-        share = (1 - measured).clamp_min_(0).mul_(depth).mul_(depth)  # in place: memory costs more than arithmetic
-        disagreement = disagreement.add(share, alpha=config.unmeasured_relative**2)
+        share = (1 - measured).clamp_min(0)
+        disagreement = disagreement.add(share * depth * depth, alpha=config.unmeasured_relative**2)
     return replace(result, disagreement=disagreement, features=result.features[..., :-1]), measured

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.frame import DEPTH_RANGE, FARTHEST, FOCAL_RANGE, LARGEST, POLAR_STEPS, FrameInput, FrameMaps
+from ufmstar_torch.frame import DEPTH_RANGE, FARTHEST, FOCAL_RANGE, LARGEST, POLAR_STEPS, FrameInput
 from ufmstar_torch.kernels.arrays_cpu import array
 
 _Matrix = list[list[float]]
@@ -25,42 +25,50 @@ _ROUNDING = 4e-16  # of R^T R: a further step changes nothing
 
 
 def check_values(
-    maps: FrameMaps, pose: Tensor, intrinsics: Tensor, *, rotation_tolerance: float, max_depth: float
+    depth: Tensor,
+    pose: Tensor,
+    intrinsics: Tensor,
+    aleatoric: Tensor | None,
+    epistemic: Tensor | None,
+    features: Tensor | None,
+    mask: Tensor | None,
+    *,
+    rotation_tolerance: float,
+    max_depth: float,
 ) -> FrameInput:
     """As :func:`ufmstar_torch.frame.check_values`, for the CPU. Depth that is valid everywhere is not copied."""
-    b, height, width = maps.depth.shape
+    b, height, width = depth.shape
     poses, cameras = (_matrices(given, b) for given in (pose, intrinsics))
     checked = [_camera(T, K, height, width, rotation_tolerance) for T, K in zip(poses, cameras, strict=True)]
     T_safe, K_safe, faults, deviations = zip(*checked, strict=True)
-    depth, mask = array(maps.depth), None if maps.mask is None else array(maps.mask)
-    use = np.ones(depth.shape, np.bool_) if mask is None else mask.copy()
-    _restrict(use, depth, DEPTH_RANGE[0], min(max_depth, DEPTH_RANGE[1]))
-    for variance in (maps.aleatoric, maps.epistemic):
+    z, wanted = array(depth), None if mask is None else array(mask)
+    use = np.ones(z.shape, np.bool_) if wanted is None else wanted.copy()
+    _restrict(use, z, DEPTH_RANGE[0], min(max_depth, DEPTH_RANGE[1]))
+    for variance in (aleatoric, epistemic):
         if variance is not None:
             _restrict(use, array(variance), 0.0, LARGEST)
-    for channel in [] if maps.features is None else array(maps.features).swapaxes(0, 1):
+    for channel in [] if features is None else array(features).swapaxes(0, 1):
         _restrict(use, channel, -LARGEST, LARGEST)
     if any(faults):
         use[np.flatnonzero(faults)] = False
-    safe, counts = depth, np.zeros((3, b), np.int64)
+    safe, counts = z, np.zeros((3, b), np.int64)
     counts[0] = faults
     if not use.all():
         left_out = np.flatnonzero(~use)
-        values, stream = depth.reshape(-1)[left_out], left_out // (height * width)
+        values, stream = z.reshape(-1)[left_out], left_out // (height * width)
         given = (values > 0) & (values < np.inf) & (counts[0] == 0)[stream]
-        if mask is not None:
-            given &= mask.reshape(-1)[left_out]
+        if wanted is not None:
+            given &= wanted.reshape(-1)[left_out]
         far = values > max_depth
         for kind, chosen in enumerate((given & far, given & ~far), start=1):
             counts[kind] = np.bincount(stream[chosen], minlength=b)
-        safe = depth.copy()
+        safe = z.copy()
         safe.reshape(-1)[left_out] = 0
     arrays = safe, np.array(T_safe), np.array(K_safe), use, np.array(deviations), *counts
     safe_depth, T, K, valid, deviation, fault, beyond, out_of_range = map(torch.from_numpy, arrays)
     return FrameInput(
-        safe_depth, T, K, maps.aleatoric, maps.epistemic, maps.features, valid, fault, deviation, beyond, out_of_range,
-        fault,
-    )  # fmt: skip
+        safe_depth, T, K, aleatoric, epistemic, features, valid, fault, deviation, beyond, out_of_range, fault
+    )
 
 
 def _matrices(cameras: Tensor, streams: int) -> list[_Matrix]:

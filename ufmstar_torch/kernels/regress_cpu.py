@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.compile_cpu import kernel
+from ufmstar_torch.kernels.compile_cpu import contracted, kernel
 from ufmstar_torch.kernels.regress_cull_cpu import in_view
 from ufmstar_torch.kernels.regress_near_cpu import near
 from ufmstar_torch.kernels.regress_tiles_cpu import exact, exact_at
@@ -24,6 +24,7 @@ from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, padded
 from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression
+from ufmstar_torch.unmeasured import HALF
 
 # Share of the denominator that culling may leave out: about the rounding of a sum in the dtype, so that culling is no
 # coarser than the arithmetic itself.
@@ -128,20 +129,46 @@ def regress_maps(
     return _regression(out, out_f)
 
 
-def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
-    """As :func:`ufmstar_torch.regress.smooth`, for CPU tensors, in one pass."""
-    given = array(previous), array(current)
-    memory, shown = map(np.empty_like, given)
-    _smooth(*(value.reshape(-1) for value in given), alpha, memory.reshape(-1), shown.reshape(-1))
-    return torch.from_numpy(memory), torch.from_numpy(shown)
+def fill_and_smooth(
+    disagreement: Tensor, measured: Tensor, depth: Tensor, memory: Tensor, config: UfMStarConfig, alpha: float
+) -> tuple[Tensor, Tensor, list[int]]:
+    """:func:`ufmstar_torch.unmeasured.after_regression` and :func:`ufmstar_torch.regress.smooth` in one pass.
+
+    Args:
+        disagreement, measured, depth: at the pixels that are regressed, [B, H, W] or [B, n]; one dtype.
+        memory: likewise, in any dtype; with ``alpha`` = 1 it counts nowhere else than where M has no value.
+
+    Returns:
+        The new memory, the map to show, and the number of pixels of each stream that are not measured.
+    """
+    given = [array(value) for value in (disagreement, depth, memory)]
+    after, shown = np.empty_like(given[2]), np.empty_like(given[0])
+    share = given[0].dtype.type(config.unmeasured_relative**2 if config.unmeasured == "relative" else 0)
+    settings = share, config.unmeasured == "nan", alpha
+    maps = (*given, array(measured), after, shown)
+    counts = each(_fill_and_smooth, [(*(value[b].reshape(-1) for value in maps), *settings) for b in range(len(after))])
+    return torch.from_numpy(after), torch.from_numpy(shown), counts
 
 
 @kernel
-def _smooth(previous, current, alpha, memory, shown):
-    for i in range(previous.size):
-        before, now = previous[i], memory.dtype.type(current[i])
+def _fill_and_smooth(disagreement, depth, previous, measured, memory, shown, share, blank, alpha):
+    one, zero, unmeasured = shown.dtype.type(1), shown.dtype.type(0), 0
+    half = shown.dtype.type(HALF)
+    for i in range(shown.size):
+        value, known = disagreement[i], measured[i]
+        missing = one - known
+        value = _plus(value, (missing if missing > zero else zero) * depth[i] * depth[i], share)
+        unmeasured += known < half
+        now, before = memory.dtype.type(np.nan if blank and known < half else value), previous[i]
         memory[i] = before if now != now else now if before != before else (1 - alpha) * before + alpha * now
         shown[i] = now if now != now else memory[i]
+    return unmeasured
+
+
+@contracted
+def _plus(value, more, factor):
+    """As torch's ``add`` with ``alpha``."""
+    return value + more * factor
 
 
 def _doubles(*values: Tensor) -> list[NDArray[np.float64]]:

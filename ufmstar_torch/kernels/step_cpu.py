@@ -8,7 +8,7 @@ of threads changes a bit.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch import unmeasured
 from ufmstar_torch.camera import relative_pose
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.disagree import overlap_disagreement
@@ -25,24 +24,23 @@ from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.fuse import make_room
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.regress_cpu import Seen, View, in_slots, look, regress_maps
-from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
+from ufmstar_torch.kernels.regress_cpu import Seen, View, fill_and_smooth, in_slots, look, regress_maps
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, padded
 from ufmstar_torch.kernels.segment_cpu import feature_means, fit, most_gaussians
 from ufmstar_torch.kernels.stream_cpu import describe, join, match
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import StepOutput
-from ufmstar_torch.regress import distribute, moving_average
+from ufmstar_torch.regress import at_pixels, distribute, memory_for, with_pixels
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.step import filled_in, frame_statistics, unobserved
+from ufmstar_torch.step import frame_statistics, unobserved
 from ufmstar_torch.step_parts import StepObserver
 
 Floats = NDArray[np.floating[Any]]
 _NAMES = tuple(field.name for field in fields(GaussianMixture))
 _COUNTS: tuple[str, ...] = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
-_COUNTS += ("unmeasured",)
+_COUNTS += ("unmeasured", "single_view")
 
 
 class _Pairs(NamedTuple):
@@ -99,19 +97,23 @@ def step(
     stage("append")
 
     result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels, views, shift)
-    result, measured = filled_in(result, frame, config, pixels)
-    result = extensions.after_regression(result)
+    measured, disagreement = result.features[..., -1], result.disagreement
+    result = extensions.after_regression(replace(result, features=result.features[..., :-1]))
     stage("regress")
 
-    disagreement, smoothed = result.disagreement, state.smoothed
-    if smooth and config.ema_alpha < 1.0:
-        smoothed, disagreement = moving_average(
-            smoothed, disagreement, frame.size, config.ema_alpha, pixels, smooth_maps
-        )
+    smoothed, alpha, before = state.smoothed, config.ema_alpha if smooth else 1.0, disagreement
+    if alpha < 1:
+        smoothed = memory_for(smoothed, frame.size)
+        before = at_pixels(smoothed, pixels)
+    after, disagreement, unmeasured = fill_and_smooth(
+        disagreement, measured, at_pixels(frame.depth, pixels), before, config, alpha
+    )
+    if alpha < 1:
+        smoothed = with_pixels(smoothed, pixels, after)
     names = ("T_world_first", "started", "frames", "skipped")
     followed = dict(zip(names, map(torch.from_numpy, cameras), strict=True))
     updated = state.with_tensors({**joined.mixture, **joined.sums, **changed, **followed, "smoothed": smoothed})
-    statistics = frame_statistics(frame, _counts(frame, pairs, joined, measured))
+    statistics = frame_statistics(frame, _counts(frame, pairs, joined, unmeasured))
     out = StepOutput(disagreement, result.features, measured, labels, current_cam, statistics)
     stage("average")
     return updated, out
@@ -258,10 +260,12 @@ def _distance(b: int, pair: _Pairs, segments: Sequence[Floats], config: UfMStarC
     return overlap_disagreement(*map(torch.from_numpy, both)).numpy()
 
 
-def _counts(frame: FrameInput, pairs: Sequence[_Pairs], joined: _Joined, measured: Tensor) -> dict[str, Tensor]:
-    """The statistics [B] that the step counts itself."""
+def _counts(
+    frame: FrameInput, pairs: Sequence[_Pairs], joined: _Joined, unmeasured: Sequence[int]
+) -> dict[str, Tensor]:
+    """The statistics [B] that the step counts itself, beside the pixels that are not measured."""
     totals = np.zeros((len(_COUNTS), len(pairs)), np.int64)
-    valid, shares = array(frame.valid), array(measured)
+    valid, seen_in = array(frame.valid), array(joined.mixture["count"])
     for b, (pair, one, new, gone) in enumerate(zip(pairs, joined.seen, joined.new, joined.dropped, strict=True)):
         totals[:, b] = (
             len(one.disagreement),
@@ -271,6 +275,7 @@ def _counts(frame: FrameInput, pairs: Sequence[_Pairs], joined: _Joined, measure
             new,
             gone + pair.found - pair.matched - new,  # too many, or too near
             np.count_nonzero(valid[b]),
-            np.count_nonzero(shares[b] < unmeasured.HALF),
+            unmeasured[b],
+            np.count_nonzero(seen_in[b] == 1),
         )
     return dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))

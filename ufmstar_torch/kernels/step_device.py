@@ -210,6 +210,7 @@ def device_step(
         beyond=frame.beyond,
         out_of_range=frame.out_of_range,
         unmeasured=counts[ends.UNMEASURED],
+        single_view=(mixture.count == 1).sum(1),
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
     )

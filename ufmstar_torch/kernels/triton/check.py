@@ -14,7 +14,6 @@ from ufmstar_torch.frame import (
     FOCAL_RANGE,
     LARGEST,
     FrameInput,
-    FrameMaps,
     intrinsics_fault,
     of_streams,
     pose_fault,
@@ -23,10 +22,19 @@ from ufmstar_torch.kernels.triton.launch import launch
 
 
 def check_values(
-    maps: FrameMaps, pose: Tensor, intrinsics: Tensor, *, rotation_tolerance: float, max_depth: float
+    depth: Tensor,
+    pose: Tensor,
+    intrinsics: Tensor,
+    aleatoric: Tensor | None,
+    epistemic: Tensor | None,
+    features: Tensor | None,
+    mask: Tensor | None,
+    *,
+    rotation_tolerance: float,
+    max_depth: float,
 ) -> FrameInput:
     """As :func:`ufmstar_torch.frame.check_values`."""
-    depth = maps.depth.contiguous()
+    depth = depth.contiguous()
     b, height, width = depth.shape
     device = depth.device
     pose, intrinsics = (of_streams(camera, b) for camera in (pose, intrinsics))
@@ -43,18 +51,17 @@ def check_values(
         farthest=FARTHEST, shortest=FOCAL_RANGE[0], longest=FOCAL_RANGE[1], steps=POLAR_STEPS, warps=1,
     )  # fmt: skip
     safe, valid = torch.empty_like(depth), torch.empty_like(depth, dtype=torch.bool)
-    optional = (maps.mask, maps.aleatoric, maps.epistemic, maps.features)
+    optional = (mask, aleatoric, epistemic, features)
     launch(
         _maps, (triton.cdiv(height * width, 1024), b), depth,
         *(depth if v is None else v.detach().contiguous() for v in optional), fault, safe, valid, counts,
-        height * width, b, masked=maps.mask is not None, a_given=maps.aleatoric is not None,
-        e_given=maps.epistemic is not None, channels=0 if maps.features is None else maps.features.shape[1],
+        height * width, b, masked=mask is not None, a_given=aleatoric is not None,
+        e_given=epistemic is not None, channels=0 if features is None else features.shape[1],
         nearest=DEPTH_RANGE[0], deepest=DEPTH_RANGE[1], max_depth=float(max_depth), largest=LARGEST, chunk=1024,
     )  # fmt: skip
     return FrameInput(
-        safe, T_safe, K_safe, maps.aleatoric, maps.epistemic, maps.features, valid, fault, deviation, counts[0],
-        counts[1], known,
-    )  # fmt: skip
+        safe, T_safe, K_safe, aleatoric, epistemic, features, valid, fault, deviation, counts[0], counts[1], known
+    )
 
 
 @triton.jit
