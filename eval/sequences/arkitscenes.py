@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped
 from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, depth_loader, list_files, list_images
-from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import associate, read_matrix, trajectory_of
 from ufmstar_torch.trajectory import Trajectory
@@ -59,8 +60,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         lenses[image.stem] = _lens(cameras[camera_of[number]])
         load_depth = depth_loader(depths[depth_of[number]] if number in depth_of else None, options.depth_scale)
         frames.append(frame_of_image(image.stem, image, load_depth, timestamp=float(times[number])))
-    own = partial(_trajectory, root / _POSES)
-    return sequence_of_lenses(path.resolve().name, "arkitscenes", frames, lenses, path, options, own=own)
+    return assemble("arkitscenes", path, frames, lenses, options, own=partial(_trajectory, root / _POSES))
 
 
 def _times(files: list[Path]) -> np.ndarray:

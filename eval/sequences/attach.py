@@ -8,7 +8,7 @@ skipped and counted; nothing is moved to the next image.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,8 +17,8 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import Entry, Loader, Skipped
 from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, list_files, read_color
-from ufmstar_torch.eval.sequences.options import Options, resolve
-from ufmstar_torch.eval.sequences.poses import read_pose, read_trajectory
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.poses import read_pose
 from ufmstar_torch.trajectory import Trajectory, interpolate_pose
 
 # Integer timestamps as file names: EuRoC and ROS write nanoseconds, some cameras microseconds [units/s].
@@ -62,22 +62,17 @@ def attach(frames: Sequence[Entry | Skipped], trajectory: Trajectory, options: O
     return attached
 
 
-def attach_given(
-    frames: Sequence[Entry | Skipped], root: Path, options: Options, own: Callable[[], Trajectory] | None = None
-) -> list[Entry | Skipped]:
-    """A layout's frames, all that are on disk, with the poses of ``options.trajectory``, or else of the layout's own
-    trajectory; as they are without either. With ``fps``, times are frame number / fps. Raises FileNotFoundError: no
-    such trajectory; ValueError: see :func:`attach`."""
-    if options.trajectory is None:
-        return list(frames) if own is None else attach(frames, own(), options)
-    if options.fps is not None:
-        numbers = frame_numbers([frame.name for frame in frames])
-        times = (np.arange(len(frames)) if numbers is None else numbers) / options.fps
-        frames = [
-            replace(frame, timestamp=float(time)) if isinstance(frame, Entry) else frame
-            for frame, time in zip(frames, times, strict=True)
-        ]
-    return attach(frames, read_trajectory(resolve(root, options.trajectory)), options)
+def number_times(frames: Sequence[Entry | Skipped], fps: float | None) -> Sequence[Entry | Skipped]:
+    """The frames with the times number / ``fps``, by the numbers in their names or else counted; as they are without
+    ``fps``."""
+    if fps is None:
+        return frames
+    numbers = frame_numbers([frame.name for frame in frames])
+    times = (np.arange(len(frames)) if numbers is None else numbers) / fps
+    return [
+        replace(frame, timestamp=float(time)) if isinstance(frame, Entry) else frame
+        for frame, time in zip(frames, times, strict=True)
+    ]
 
 
 def frame_of_files(

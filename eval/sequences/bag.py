@@ -18,9 +18,10 @@ from weakref import finalize
 import numpy as np
 
 from ufmstar_torch.eval.sequences import ros_messages as ros
+from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Skipped
-from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import associate
 from ufmstar_torch.optional import optional
@@ -169,13 +170,13 @@ def read(path: Path, options: Options) -> FrameSequence:
             entries.append(Skipped(name, f"no pose within {options.max_pose_gap:g} s around the image"))
         else:
             entries.append(Entry(name, T, partial(_decoded, ros.colour, bag, place), load_depth, time))
-    lens = content.lens
-    if lens is None:  # its focal length is that of options.intrinsics
+    size = None
+    if content.lens is None:
         if not content.images:
             raise ValueError(f"{file} holds no image")
         height, width = _decoded(ros.colour, bag, content.images[0][1]).shape[:2]
-        lens = Lens((1.0, 1.0, width / 2, height / 2), (height, width))
-    return sequence_of_lenses(path.resolve().stem, "bag", entries, lens, path, options)
+        size = height, width
+    return assemble("bag", path, entries, content.lens, options, name=path.resolve().stem, size=size)
 
 
 def _decoded(decode: Callable[..., np.ndarray], bag: Bag, place: Place, *how: Any) -> np.ndarray:

@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image, pair_depth
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.generic import depth_folder, listed_times
 from ufmstar_torch.eval.sequences.images import depth_loader, natural_key
-from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_quaternions
 
@@ -77,7 +78,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         time = None if times is None else float(times[number])
         frames.append(frame_of_image(name, folder / view.name, load_depth, _pose(view, model), time))
     metric = _metric(root) and model == root / MODEL
-    return sequence_of_lenses(path.resolve().name, "colmap", frames, lenses, path, options, metric=metric)
+    return assemble("colmap", path, frames, lenses, options, metric=metric)
 
 
 def read_landmarks(path: Path) -> dict[str, np.ndarray]:

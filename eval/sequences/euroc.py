@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import FrameSequence, Size
 from ufmstar_torch.eval.sequences.images import first_image_size
-from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens, sequence_of_lenses
+from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import csv_numbers, csv_rows, read_matrix, trajectory_of
 from ufmstar_torch.trajectory import Trajectory
@@ -48,7 +49,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         frames.append(frame_of_image(images[-1].stem, images[-1], timestamp=time))
     lens = _lens(folder / "sensor.yaml", first_image_size(images))
     name = folder.parent.parent.resolve().name if folder.parent.name == "mav0" else folder.resolve().name
-    return sequence_of_lenses(name, "euroc", frames, lens, path, options, own=partial(_trajectory, folder))
+    return assemble("euroc", path, frames, lens, options, name=name, own=partial(_trajectory, folder))
 
 
 def _camera_folder(path: Path) -> Path | None:

@@ -13,19 +13,20 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach, pair_depth, stem_times
-from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.assemble import assemble
+from ufmstar_torch.eval.sequences.attach import UNKNOWN, pair_depth, stem_times
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.images import (
     DEPTH_SUFFIXES,
     IMAGE_SUFFIXES,
     depth_loader,
-    depth_size,
     first_image_size,
     list_files,
     list_images,
     read_color,
 )
-from ufmstar_torch.eval.sequences.intrinsics import depth_camera_matrix, read_intrinsics
+from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import associate, read_trajectory
 from ufmstar_torch.eval.sequences.tum import SCALE as TUM_SCALE
@@ -65,18 +66,11 @@ def read(path: Path, options: Options) -> FrameSequence:
     """
     root = path if path.is_dir() else path.parent
     images, size = open_images(path, options)
-    trajectory = read_trajectory(_given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
-    frames = attach(_with_depth(images, root, options, options.depth_scale), trajectory, options)
-    K, size_of_depth = _intrinsics(root, options), depth_size(frames)
-    return make_sequence(
-        path.resolve().stem if path.is_file() else path.resolve().name,
-        "generic",
-        frames,
-        K,
-        image_size=size,
-        depth_intrinsics=depth_camera_matrix(options.depth_intrinsics, K, size, size_of_depth),
-        depth_size=size_of_depth,
-    )
+    own = partial(read_trajectory, _given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
+    frames = _with_depth(images, root, options, options.depth_scale)
+    # Of a generic sequence, ``fps`` counts images, whatever their names.
+    counted = replace(options, trajectory=None)
+    return assemble("generic", path, frames, _lens(root, options, size), counted, size=size, own=own)
 
 
 def has_images_and_depth(path: Path) -> bool:
@@ -100,24 +94,19 @@ def open_unposed(path: Path, options: Options) -> FrameSequence:
         replace(image, T_world_cam=np.eye(4)) if image.load_depth is not None else Skipped(image.name, "no depth map")
         for image in _with_depth(images, path, options, scale)
     ]
-    return make_sequence(
-        path.resolve().name,
-        "unposed",
-        frames,
-        _intrinsics(path, options),
-        image_size=size,
-        depth_size=depth_size(frames),
-        posed=False,
-    )
+    return assemble("unposed", path, frames, _lens(path, options, size), options, size=size, posed=False)
 
 
-def _intrinsics(root: Path, options: Options) -> np.ndarray:
-    given = options.intrinsics
-    return read_intrinsics(_given_or_found(root, None, INTRINSICS, "intrinsics") if given is None else given)
+def _lens(root: Path, options: Options, size: Size) -> Lens | None:
+    """The camera of a file beside the images; None where the options have one."""
+    if options.intrinsics is not None:
+        return None
+    return Lens.of(read_intrinsics(_given_or_found(root, None, INTRINSICS, "intrinsics")), size)
 
 
-def open_images(path: Path, options: Options) -> tuple[list[Entry], Size | None]:
-    """The images without poses and depth, with their times where they are known, and their (H, W)."""
+def open_images(path: Path, options: Options) -> tuple[list[Entry], Size]:
+    """The images without poses and depth, with their times where they are known, and their (H, W). Raises ValueError:
+    no images, or none that can be read."""
     source = path
     if options.images is not None:
         source = resolve(path, options.images)
@@ -134,8 +123,9 @@ def open_images(path: Path, options: Options) -> tuple[list[Entry], Size | None]
         images = [Entry(f"{i:06d}", UNKNOWN, loaders[i], None, time) for i, time in enumerate(times.tolist())]
         return images, video.size
     files = list_images(source)
-    if not files:
-        raise ValueError(f"{source} holds no image ({', '.join(IMAGE_SUFFIXES)})")
+    size = first_image_size(files)
+    if size is None:
+        raise ValueError(f"{source} holds no image that can be read ({', '.join(IMAGE_SUFFIXES)})")
     known = listed_times(source, files)
     if known is None and options.fps is not None:
         known = np.arange(len(files)) / options.fps
@@ -143,7 +133,7 @@ def open_images(path: Path, options: Options) -> tuple[list[Entry], Size | None]
         known = stem_times([file.stem for file in files])
     stamps = [None] * len(files) if known is None else known.tolist()
     images = [Entry(f.stem, UNKNOWN, partial(read_color, f), None, t) for f, t in zip(files, stamps, strict=True)]
-    return images, first_image_size(files)
+    return images, size
 
 
 def _image_sources(path: Path) -> list[Path]:

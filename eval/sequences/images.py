@@ -117,7 +117,7 @@ def first_image_size(paths: Iterable[Path]) -> Size | None:
     return None
 
 
-def depth_size(frames: Iterable[Entry | Skipped]) -> Size | None:
+def first_depth_size(frames: Iterable[Entry | Skipped]) -> Size | None:
     """(H, W) of the first depth map that can be loaded; None where none can."""
     for frame in frames:
         if isinstance(frame, Entry) and frame.load_depth is not None:

@@ -49,9 +49,9 @@ def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | N
     return [fx, fy, cx, cy]
 
 
-def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+def pinhole(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) -> np.ndarray:
     """The matrix [3, 3] of a pinhole camera [px]."""
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def pinhole_values(K: np.ndarray) -> tuple[float, float, float, float]:
@@ -62,15 +62,6 @@ def pinhole_values(K: np.ndarray) -> tuple[float, float, float, float]:
 def camera_matrix(given: IntrinsicsLike | None, known: np.ndarray, known_size: Size, size: Size | None) -> np.ndarray:
     """K [3, 3] of images of ``size``: the ``given`` one, or the layout's own of ``known_size``, scaled."""
     return scale_intrinsics(known, known_size, size) if given is None else read_intrinsics(given)
-
-
-def depth_camera_matrix(
-    given: IntrinsicsLike | None, K: np.ndarray, size: Size | None, depth_size: Size | None
-) -> np.ndarray | None:
-    """K [3, 3] of the depth maps, where it is given or follows from a size that is not the images'; else None."""
-    if given is not None:
-        return read_intrinsics(given)
-    return None if size is None or depth_size in (None, size) else scale_intrinsics(K, size, depth_size)
 
 
 def scale_intrinsics(K: np.ndarray, old: Size | None, new: Size | None) -> np.ndarray:

@@ -27,11 +27,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given, frame_of_image, pair_depth
-from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.assemble import assemble
+from ufmstar_torch.eval.sequences.attach import UNKNOWN, frame_of_image, pair_depth
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.ground_truth import project
-from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, list_images
-from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, depth_camera_matrix
+from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, list_images
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import numbered_lines, read_matrix, read_trajectory
 
@@ -77,29 +78,28 @@ def read(path: Path, options: Options) -> FrameSequence:
     perspective = root / "calibration" / "perspective.txt"
     width, height = (int(value) for value in _values(perspective, f"S_rect_{camera}", 2))
     P = _values(perspective, f"P_rect_{camera}", 12).reshape(3, 4)
-    K = camera_matrix(options.intrinsics, P[:, :3].copy(), (height, width), size)
     for image in images:
         if not image.stem.isdecimal():
             raise ValueError(f"{image}: expected a frame number as the file's name")
     numbers = [int(image.stem) for image in images]
     times = _times(folder / "timestamps.txt", numbers)
     poses = _poses(root, drive, camera) if options.trajectory is None else dict.fromkeys(numbers, UNKNOWN)
+    maps = {} if options.depth is None else pair_depth([i.stem for i in images], resolve(folder, options.depth))
     frames = [
-        frame_of_image(image.stem, image, None, poses[number], time)
+        frame_of_image(
+            image.stem, image, depth_loader(maps.get(image.stem), options.depth_scale, _SCALE), poses[number], time
+        )
         if number in poses
         else Skipped(image.stem, "no pose for this frame number")
         for image, number, time in zip(images, numbers, times, strict=True)
     ]
-    frames = attach_given(frames, folder, options)
-    if options.trajectory is not None:
-        poses = {int(frame.name): frame.T_world_cam for frame in frames if isinstance(frame, Entry)}
-    loaders = _depth(folder, poses, [image.stem for image in images], options, K, size or (height, width))
-    frames = [replace(f, load_depth=loaders.get(f.name)) if isinstance(f, Entry) else f for f in frames]
-    maps_size = size if options.depth is None else depth_size(frames)
-    name = drive if camera == "00" else f"{drive}_{folder.name}"
-    K_depth = depth_camera_matrix(options.depth_intrinsics, K, size, maps_size)
-    maps_size = maps_size if loaders else None
-    return make_sequence(name, "kitti360", frames, K, image_size=size, depth_intrinsics=K_depth, depth_size=maps_size)
+    lens, name = Lens.of(P[:, :3], (height, width)), drive if camera == "00" else f"{drive}_{folder.name}"
+    sequence = assemble("kitti360", folder, frames, lens, options, name=name, size=size)
+    if options.depth is None:
+        return _with_laser(sequence, root, drive, camera, poses, options)
+    if options.scans is not None:
+        raise ValueError("scans goes with depth from the laser, not with a folder of depth maps")
+    return sequence
 
 
 def _camera(path: Path) -> Path | None:
@@ -159,24 +159,25 @@ def _poses(root: Path, drive: str, camera: str) -> dict[int, np.ndarray]:
     return dict(zip(trajectory.timestamps.astype(int).tolist(), T, strict=True))
 
 
-def _depth(
-    folder: Path, poses: dict[int, np.ndarray], names: list[str], options: Options, K: np.ndarray, size: Size
-) -> dict[str, Loader | None]:
-    """The loaders of depth, for the frames that have any."""
-    if options.depth is not None:
-        if options.scans is not None:
-            raise ValueError("scans goes with depth from the laser, not with a folder of depth maps")
-        pairs = pair_depth(names, resolve(folder, options.depth))
-        return {name: depth_loader(file, options.depth_scale, _SCALE) for name, file in pairs.items()}
-    calibration = folder.parents[2] / "calibration"
-    scans_folder = folder.parents[2] / "data_3d_raw" / folder.parent.name / "velodyne_points" / "data"
-    if not scans_folder.is_dir() or not (calibration / _LASER).is_file():
-        return {}
-    scans = {int(file.stem): file for file in scans_folder.glob("*.bin") if file.stem.isdecimal()}
-    finite = {number: T for number, T in poses.items() if np.isfinite(T).all()}
-    T_cam_laser = _T_rect_laser(calibration, folder.name.removeprefix("image_"))
-    laser = _Laser(scans, finite, T_cam_laser, K, size, options.scans or 0)
-    return {name: partial(laser.depth, int(name)) for name in names if laser.sees(int(name))}
+def _with_laser(
+    sequence: FrameSequence, root: Path, drive: str, camera: str, poses: dict[int, np.ndarray], options: Options
+) -> FrameSequence:
+    """The sequence with depth from the laser, for the frames that have a scan."""
+    folder, calibration = root / "data_3d_raw" / drive / "velodyne_points" / "data", root / "calibration"
+    if not folder.is_dir() or not (calibration / _LASER).is_file():
+        return sequence
+    scans = {int(file.stem): file for file in folder.glob("*.bin") if file.stem.isdecimal()}
+    if options.trajectory is not None:
+        poses = {int(entry.name): entry.T_world_cam for entry in sequence.entries}
+    poses = {number: T for number, T in poses.items() if np.isfinite(T).all()}
+    assert sequence.image_size is not None
+    T_cam_laser = _T_rect_laser(calibration, camera)
+    laser = _Laser(scans, poses, T_cam_laser, sequence.intrinsics, sequence.image_size, options.scans or 0)
+    entries = tuple(
+        replace(entry, load_depth=partial(laser.depth, int(entry.name))) if laser.sees(int(entry.name)) else entry
+        for entry in sequence.entries
+    )
+    return replace(sequence, entries=entries, depth_intrinsics=None, depth_size=sequence.image_size)
 
 
 @dataclass(frozen=True, eq=False)

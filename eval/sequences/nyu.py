@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, make_sequence
-from ufmstar_torch.eval.sequences.images import depth_size, natural_key, positive
-from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
+from ufmstar_torch.eval.sequences.assemble import assemble
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.images import first_depth_size, natural_key, positive
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 
 LOOKED_FOR = "val/SCENE/*.h5 or train/SCENE/*.h5 (the root, meaning val, the part's folder or the scene's)"
@@ -50,10 +51,11 @@ def read(path: Path, options: Options) -> FrameSequence:
         Entry(f"{file.parent.name}__{file.stem}", np.eye(4), partial(_image, file), partial(_depth, file, scale))
         for file in files
     ]
-    size = depth_size(entries)
-    K = camera_matrix(options.intrinsics, pinhole(*INTRINSICS), NATIVE_SIZE, size)
     name = "_".join(["nyu", *folder.resolve().parts[-1 if folder.name in PARTS else -2 :]])
-    return make_sequence(name, "nyu", entries, K, image_size=size, depth_size=size, posed=False)
+    size = first_depth_size(entries)
+    if size is None:
+        raise ValueError(f"{folder} holds no h5 file that can be read")
+    return assemble("nyu", folder, entries, Lens(INTRINSICS, NATIVE_SIZE), options, name=name, size=size, posed=False)
 
 
 def read_h5(path: Path) -> tuple[np.ndarray, np.ndarray]:

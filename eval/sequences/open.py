@@ -8,10 +8,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.sequences.frame import FrameSequence
+from ufmstar_torch.eval.sequences.assemble import undistort
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence
 from ufmstar_torch.eval.sequences.images import within
 from ufmstar_torch.eval.sequences.layout import READERS, layout_of, readers
-from ufmstar_torch.eval.sequences.lens import parse_distortion, undistort
+from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS, in_metres
 
@@ -70,9 +71,16 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
     refused += ["fps"] if layout == "tum" or (layout != "generic" and chosen.trajectory is None) else []
     chosen.reject(layout, *refused)
     sequence = readers(chosen.plugin)[layout].read(path, chosen)
-    if chosen.distortion is not None:
-        coefficients = parse_distortion(chosen.distortion)
-        sequence = undistort(sequence, *coefficients, depth_too=chosen.depth_intrinsics is None)
+    if chosen.distortion is not None and layout not in READERS:
+        coefficients, fisheye = parse_distortion(chosen.distortion)
+
+        def lens_of(entry: Entry) -> Lens:
+            size = entry.image_size or sequence.image_size
+            if size is None:
+                raise ValueError(f"distortion: the reader {layout!r} does not state the images' size")
+            return Lens.of(sequence.intrinsics_of(entry), size, coefficients, fisheye)
+
+        sequence = undistort(sequence, lens_of)
     sequence = convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), poses)
     if chosen.max_truth is not None:
         entries = []

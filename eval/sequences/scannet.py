@@ -10,10 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import attach_given, frame_of_files
-from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, fits, make_sequence
-from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, list_images
+from ufmstar_torch.eval.sequences.assemble import assemble
+from ufmstar_torch.eval.sequences.attach import frame_of_files
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, fits
+from ufmstar_torch.eval.sequences.images import depth_loader, first_depth_size, first_image_size, list_images
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 
 LOOKED_FOR = "color/, pose/ and intrinsic/ folders"
@@ -33,15 +35,12 @@ def read(path: Path, options: Options) -> FrameSequence:
     frames = [_frame(path, image, options) for image in images]
     if not images:
         raise ValueError(f"scannet sequence {path.name!r}: the folder color/ holds no image")
-    frames = attach_given(frames, path, options)
     color_size = first_image_size(images) or _NATIVE_COLOR
-    size = depth_size(frames)
+    size = first_depth_size(frames)
     K = _intrinsics(options.intrinsics, path / "intrinsic" / "intrinsic_color.txt", _NATIVE_COLOR, color_size)
     file = path / "intrinsic" / "intrinsic_depth.txt"
     K_depth = None if size is None else _intrinsics(options.depth_intrinsics, file, _NATIVE_DEPTH, size)
-    return make_sequence(
-        path.resolve().name, "scannet", frames, K, image_size=color_size, depth_intrinsics=K_depth, depth_size=size
-    )
+    return assemble("scannet", path, frames, Lens.of(K, color_size), options, K_depth=K_depth, depth_size=size)
 
 
 def _frame(path: Path, image: Path, options: Options) -> Entry | Skipped:

@@ -18,10 +18,11 @@ from typing import BinaryIO
 import numpy as np
 
 from ufmstar_torch.eval.sequences import scannet
-from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
-from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.assemble import assemble
+from ufmstar_torch.eval.sequences.attach import UNKNOWN
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.images import read_color
-from ufmstar_torch.eval.sequences.intrinsics import camera_matrix
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 
 LOOKED_FOR = "a .sens file, or a folder that holds one (and no SensReader export)"
@@ -67,19 +68,12 @@ def read(path: Path, options: Options) -> FrameSequence:
         color_size, depth_size = (tuple(header[key].tolist()[::-1]) for key in ("color_size", "depth_size"))
         scale = options.depth_scale or 1 / float(header["units_per_metre"])
         frames = _frames(opened, file, int(header["frames"]), depth_size, scale)
-    frames = attach_given(frames, file.parent, options)
     for number in range(len(frames), int(header["frames"])):
         frames.append(Skipped(str(number), "beyond the end of the truncated file"))
     K_color, K_depth = (header[key][:3, :3].astype(np.float64) for key in ("K_color", "K_depth"))
-    return make_sequence(
-        file.resolve().stem,
-        "sens",
-        frames,
-        camera_matrix(options.intrinsics, K_color, color_size, None),
-        image_size=color_size,
-        depth_intrinsics=camera_matrix(options.depth_intrinsics, K_depth, depth_size, None),
-        depth_size=depth_size,
-    )
+    lens = Lens.of(K_color, color_size) if options.intrinsics is None else None
+    name, sizes = file.resolve().stem, {"size": color_size, "depth_size": depth_size}
+    return assemble("sens", path, frames, lens, options, name=name, K_depth=K_depth, **sizes)
 
 
 def _read_header(file: BinaryIO, path: Path) -> np.void:

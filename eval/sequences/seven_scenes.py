@@ -17,11 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import attach_given, frame_of_files
-from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, make_sequence
+from ufmstar_torch.eval.sequences.assemble import assemble
+from ufmstar_torch.eval.sequences.attach import frame_of_files
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
-from ufmstar_torch.eval.sequences.images import depth_size, first_image_size, natural_key, read_map
+from ufmstar_torch.eval.sequences.images import first_depth_size, first_image_size, natural_key, read_map
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import read_pose
 
@@ -58,7 +60,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     for name, kinds in files.items():
         load = partial(_read_depth, kinds["depth"], options.depth_scale or _MILLIMETRE) if "depth" in kinds else None
         frames.append(frame_of_files(name, kinds.get("color"), kinds.get("pose"), load, options))
-    own_size = depth_size(frames)
+    own_size = first_depth_size(frames)
     K_color = camera_matrix(options.intrinsics, pinhole(*_K_COLOR), _NATIVE_SIZE, color_size)
     K_depth = camera_matrix(options.depth_intrinsics, pinhole(*_K_DEPTH), _NATIVE_SIZE, own_size)
     T_color_depth = _T_COLOR_DEPTH if options.T_color_depth is None else options.T_color_depth
@@ -71,16 +73,10 @@ def read(path: Path, options: Options) -> FrameSequence:
             )
             T_world_color = frame.T_world_cam @ np.linalg.inv(T_color_depth)
             frames[i] = replace(frame, T_world_cam=T_world_color, load_depth=load)
-    frames = attach_given(frames, path, options)
-    return make_sequence(
-        path.resolve().name,
-        "7scenes",
-        frames,
-        K_color,
-        image_size=color_size,
-        depth_intrinsics=None if options.register else K_depth,
-        depth_size=color_size if options.register else own_size,
-    )
+    lens = Lens.of(K_color, color_size)
+    if options.register:
+        return assemble("7scenes", path, frames, lens, replace(options, depth_intrinsics=None), depth_size=color_size)
+    return assemble("7scenes", path, frames, lens, options, K_depth=K_depth, depth_size=own_size)
 
 
 def _read_depth(path: Path, scale: float) -> np.ndarray:

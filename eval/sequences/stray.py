@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Skipped
 from ufmstar_torch.eval.sequences.images import read_color, read_depth
 from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
-from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import csv_numbers, csv_rows, poses_from_columns, read_matrix
 from ufmstar_torch.eval.sequences.video import Video
@@ -69,7 +70,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         load = partial(_depth, file, path / "confidence" / file.name, options.depth_scale) if file.is_file() else None
         time = float(column["timestamp"][row])
         frames.append(Entry(name, T, partial(video.read, int(number)), load, time))
-    return sequence_of_lenses(path.resolve().name, "stray", frames, lenses, path, options)
+    return assemble("stray", path, frames, lenses, options)
 
 
 def _depth(file: Path, confidence: Path, scale: float | None) -> np.ndarray:

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ufmstar_torch.eval.sequences.attach import attach_given, frame_of_image
-from ufmstar_torch.eval.sequences.frame import FrameSequence, make_sequence
-from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, list_images
-from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
+from ufmstar_torch.eval.sequences.assemble import assemble
+from ufmstar_torch.eval.sequences.attach import frame_of_image
+from ufmstar_torch.eval.sequences.frame import FrameSequence
+from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, list_images
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, read_trajectory
 
 LOOKED_FOR = "pose_left.txt and image_left/ (also in a single sub-folder P000)"
-_NATIVE_SIZE = (480, 640)
-_K = (320.0, 320.0, 320.0, 240.0)
+_LENS = Lens((320.0, 320.0, 320.0, 240.0), (480, 640))
 
 
 def detect(path: Path) -> bool:
@@ -49,11 +49,9 @@ def read(path: Path, options: Options) -> FrameSequence:
         depth = folder / "depth_left" / f"{image.stem}_depth.npy"
         load_depth = depth_loader(depth if depth.is_file() else None, options.depth_scale)
         frames.append(frame_of_image(image.stem, image, load_depth, T))
-    frames = attach_given(frames, folder, options)
-    size = first_image_size(images) or _NATIVE_SIZE
-    K = camera_matrix(options.intrinsics, pinhole(*_K), _NATIVE_SIZE, size)
     name = path.resolve().name if folder == path else f"{path.resolve().name}_{folder.name}"
-    return make_sequence(name, "tartanair", frames, K, image_size=size, depth_size=depth_size(frames))
+    size = first_image_size(images) or _LENS.size
+    return assemble("tartanair", folder, frames, _LENS, options, name=name, size=size)
 
 
 def parts(path: Path) -> list[Path]:

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, depth_loader, image_size, read_color
-from ufmstar_torch.eval.sequences.lens import Lens, sequence_of_lenses
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS
 from ufmstar_torch.stream_warnings import LOGGER
@@ -71,7 +72,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         LOGGER.warning("%s: no ground truth: its depth is a prediction, with a sigma beside it", file)
     metric = not any(key in part for part in (content, *frames) for key in _NOT_METRIC)
     name = file.parent.resolve().name if file.name == FILE else file.stem
-    return sequence_of_lenses(name, "transforms", entries, lenses, file.parent, options, metric=metric)
+    return assemble("transforms", path, entries, lenses, options, name=name, metric=metric)
 
 
 def _path(frame: Mapping[str, Any], file: Path) -> Path:

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import attach_given, frame_of_image
-from ufmstar_torch.eval.sequences.frame import FrameSequence, make_sequence
-from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size
-from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
-from ufmstar_torch.eval.sequences.lens import undistort
+from ufmstar_torch.eval.sequences.assemble import assemble
+from ufmstar_torch.eval.sequences.attach import frame_of_image
+from ufmstar_torch.eval.sequences.frame import FrameSequence
+from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size
+from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import associate, numbered_lines, read_trajectory
 
@@ -24,12 +24,11 @@ LOOKED_FOR = "rgb.txt and groundtruth.txt"
 SCALE = 1 / 5000
 _NATIVE_SIZE = (480, 640)
 # The colour cameras' published calibration, by robot. Depth is registered to the distorted image (k1 k2 p1 p2 k3).
-_DISTORTION = {
-    "1": (0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
-    "2": (0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
-    "3": (),
+_LENSES = {
+    "1": Lens((517.3, 516.5, 318.6, 255.3), _NATIVE_SIZE, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": Lens((520.9, 521.0, 325.1, 249.7), _NATIVE_SIZE, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": Lens((535.4, 539.2, 320.1, 247.6), _NATIVE_SIZE),
 }
-_INTRINSICS = {"1": (517.3, 516.5, 318.6, 255.3), "2": (520.9, 521.0, 325.1, 249.7), "3": (535.4, 539.2, 320.1, 247.6)}
 
 
 def detect(path: Path) -> bool:
@@ -49,16 +48,10 @@ def read(path: Path, options: Options) -> FrameSequence:
         frame_of_image(Path(file).stem, path / file, load_depth, timestamp=float(time))
         for file, load_depth, time in zip(files, loaders, times, strict=True)
     ]
-    frames = attach_given(frames, path, options, partial(read_trajectory, path / "groundtruth.txt"))
-    size = first_image_size(path / file for file in files)
-    if options.intrinsics is None:
-        K = scale_intrinsics(pinhole(*_INTRINSICS[_robot(path)]), _NATIVE_SIZE, size)
-    else:
-        K = read_intrinsics(options.intrinsics)
-    sequence = make_sequence(path.resolve().name, "tum", frames, K, image_size=size, depth_size=depth_size(frames))
-    if options.distortion is not None or options.intrinsics is not None or size is None:
-        return sequence
-    return undistort(sequence, _DISTORTION[_robot(path)], fisheye=False, depth_too=True)
+    lens = _LENSES[_robot(path)] if options.intrinsics is None else None
+    size = first_image_size(path / file for file in files) or _NATIVE_SIZE
+    own = partial(read_trajectory, path / "groundtruth.txt")
+    return assemble("tum", path, frames, lens, options, size=size, own=own)
 
 
 def read_file_list(path: Path) -> tuple[np.ndarray, list[str]]:

@@ -1,0 +1,121 @@
+"""The last step of every reader: poses of a trajectory, cameras, undistorted images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.attach import attach, number_times
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.images import first_depth_size
+from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
+from ufmstar_torch.eval.sequences.options import Options, resolve
+from ufmstar_torch.eval.sequences.poses import read_trajectory
+from ufmstar_torch.trajectory import Trajectory
+
+
+def assemble(
+    layout: str,
+    path: Path,
+    frames: Sequence[Entry | Skipped],
+    lenses: Lens | Mapping[str, Lens] | None,
+    options: Options,
+    *,
+    name: str | None = None,
+    size: Size | None = None,
+    own: Callable[[], Trajectory] | None = None,
+    K_depth: np.ndarray | None = None,
+    depth_size: Size | None = None,
+    posed: bool = True,
+    metric: bool = True,
+) -> FrameSequence:
+    """The sequence of a layout's frames.
+
+    Args:
+        layout: name of the layout.
+        path: of the sequence; a relative ``options.trajectory`` is looked for there first.
+        frames: all that are on disk, in order.
+        lenses: the camera, or one by frame name; None: ``options.intrinsics`` and ``size`` are given.
+        options: ``trajectory``, ``fps``, ``intrinsics``, ``depth_intrinsics`` and ``distortion`` replace the layout's.
+        name: of the sequence; None: that of the path.
+        size: (H, W) of the images where they may be resized; None: the lenses'.
+        own: reads the layout's trajectory; None: the frames have poses.
+        K_depth: [3, 3] of the camera of the depth maps [px]; None: they show what the images show.
+        depth_size: (H, W) of the depth maps; None: of the first that can be read.
+        posed: whether poses are known.
+        metric: whether the layout's poses are in metres; those of ``options.trajectory`` are.
+
+    Raises:
+        FileNotFoundError: no such trajectory.
+        ValueError: no usable frame, or a trajectory, camera or size that does not fit.
+    """
+    if options.trajectory is not None:
+        root = path if path.is_dir() else path.parent
+        frames = attach(number_times(frames, options.fps), read_trajectory(resolve(root, options.trajectory)), options)
+    elif own is not None:
+        frames = attach(frames, own(), options)
+    if isinstance(lenses, Mapping):
+        lens_of = {frame.name: _lens(lenses[frame.name], size, options) for frame in frames if isinstance(frame, Entry)}
+        frames = [_with_camera(frame, lens_of) for frame in frames]
+        first = next(iter(lens_of.values()), Lens((1.0, 1.0, 0.0, 0.0), (1, 1)))
+    else:
+        first = _lens(lenses, size, options)
+        lens_of = dict.fromkeys((frame.name for frame in frames), first)
+    sequence = make_sequence(
+        name or (path.resolve().name if path.is_dir() else path.stem),
+        layout,
+        frames,
+        pinhole(*first.intrinsics),
+        image_size=first.size,
+        depth_intrinsics=K_depth if options.depth_intrinsics is None else read_intrinsics(options.depth_intrinsics),
+        depth_size=depth_size or first_depth_size(frames),
+        posed=posed,
+        metric=metric or options.trajectory is not None,
+    )
+    return undistort(sequence, lambda entry: lens_of[entry.name])
+
+
+def undistort(sequence: FrameSequence, lens_of: Callable[[Entry], Lens]) -> FrameSequence:
+    """The sequence with the images that its lenses made undistorted; depth maps without a camera of their own too.
+    Raises ValueError: no lens has these coefficients."""
+
+    def K_depth(lens: Lens) -> np.ndarray | None:
+        if sequence.depth_intrinsics is not None or sequence.depth_size in (None, lens.size):
+            return sequence.depth_intrinsics
+        return scale_intrinsics(lens.K, lens.size, sequence.depth_size)
+
+    depth_size = None if sequence.depth_intrinsics is not None else sequence.depth_size
+    entries = []
+    for entry in sequence.entries:
+        lens = lens_of(entry)
+        seen = lens.see(entry, depth_size)
+        own = seen.intrinsics is not None
+        entries.append(replace(seen, intrinsics=lens.K, depth_intrinsics=K_depth(lens)) if own else seen)
+    first = lens_of(sequence.entries[0])
+    return replace(sequence, entries=tuple(entries), intrinsics=first.K, depth_intrinsics=K_depth(first))
+
+
+def _with_camera(frame: Entry | Skipped, lens_of: Mapping[str, Lens]) -> Entry | Skipped:
+    if isinstance(frame, Skipped):
+        return frame
+    lens = lens_of[frame.name]
+    return replace(frame, intrinsics=pinhole(*lens.intrinsics), image_size=lens.size)
+
+
+def _lens(known: Lens | None, size: Size | None, options: Options) -> Lens:
+    """The camera of images of a ``size``, of the options where they have one."""
+    if options.intrinsics is not None:
+        own_size = known.size if size is None and known is not None else size
+        assert own_size is not None
+        lens = Lens.of(read_intrinsics(options.intrinsics), own_size)
+    else:
+        assert known is not None
+        lens = known if size is None else known.resized(size)
+    if options.distortion is None:
+        return lens
+    coefficients, fisheye = parse_distortion(options.distortion)
+    return replace(lens, coefficients=coefficients, fisheye=fisheye)
