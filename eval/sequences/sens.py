@@ -72,8 +72,17 @@ def read(path: Path, options: Options) -> FrameSequence:
         frames.append(Skipped(str(number), "beyond the end of the truncated file"))
     K_color, K_depth = (header[key][:3, :3].astype(np.float64) for key in ("K_color", "K_depth"))
     lens = Lens.of(K_color, color_size) if options.intrinsics is None else None
-    name, sizes = file.resolve().stem, {"size": color_size, "depth_size": depth_size}
-    return assemble("sens", path, frames, lens, options, name=name, K_depth=K_depth, **sizes)
+    return assemble(
+        "sens",
+        path,
+        frames,
+        lens,
+        options,
+        name=file.resolve().stem,
+        size=color_size,
+        K_depth=K_depth,
+        depth_size=depth_size,
+    )
 
 
 def _read_header(file: BinaryIO, path: Path) -> np.void:
