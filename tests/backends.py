@@ -154,6 +154,19 @@ def _floored(cov, floor):
     return out
 
 
+def seen(m: GaussianMixture, features: int | None = None) -> list[regress_cpu.Seen]:
+    """The occupied slots of each stream as the compiled regression takes them; with so many features, zeros."""
+    out = []
+    for b in range(m.streams):
+        at = m.valid[b]
+        rows = torch.cat([m.mean[b], m.covariance[b].flatten(1), m.weight[b, :, None]], 1)[at].double()
+        components = np.zeros((rigid_cpu.FIELDS, rigid_cpu.padded(len(rows))))
+        components[:, : len(rows)] = rows.T
+        own = m.features[b][at].double().numpy() if features is None else np.zeros((len(rows), features))
+        out.append(regress_cpu.Seen(components, m.disagreement[b][at].double().numpy(), own))
+    return out
+
+
 def _regressed(m, depth, intrinsics, valid, config, pixels=None):
     positive = torch.where(valid, depth, 0)
-    return regress_cpu.regress_maps(regress_cpu.all_seen(m)[0], positive, intrinsics, config, pixels)
+    return regress_cpu.regress_maps(seen(m), positive, intrinsics, config, pixels)

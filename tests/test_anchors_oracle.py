@@ -5,17 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from backends import seen as seen_of
 from oracle_anchors import AnchoredOracle
 from walks import HEIGHT, SPGF, WIDTH, oracle_settings
 
 import scenes
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
-from ufmstar_torch.anchors.anchors import AnchorInput, Anchors, check_anchors, check_values
+from ufmstar_torch.anchors.anchors import AnchorInput, Anchors, check_anchors
 from ufmstar_torch.anchors.evidence import Evidence, inliers
 from ufmstar_torch.anchors.extension import learn
 from ufmstar_torch.frame import check_frame
 from ufmstar_torch.kernels import anchors_cpu
-from ufmstar_torch.kernels.regress_cpu import all_seen, regress_maps
+from ufmstar_torch.kernels.regress_cpu import look, regress_maps
 from ufmstar_torch.regress import distribute
 
 pytestmark = pytest.mark.numerics
@@ -121,7 +122,8 @@ def test_neighbours_of_anchors_that_lie_together(where):
     assert torch.equal(anchors_cpu.inliers(given), inliers(given))
 
 
-def test_compiled_checks_are_the_references_own():
+def test_what_is_checked_of_strange_anchors():
+    """Positions, depths and variances of every kind, on a map with a hole: against a plain statement, one by one."""
     size, n = (40, 60), 400
     pixel, _, depth, variance, chance = drawn(3, 2, n)
     generator = torch.Generator().manual_seed(0)
@@ -135,15 +137,24 @@ def test_compiled_checks_are_the_references_own():
     maps[0, 0, 10:20, 10:20] = 0
     cameras = torch.eye(4).expand(2, 4, 4), torch.tensor([[60.0, 0, 30], [0, 60, 20], [0, 0, 1]])
     frame = check_frame(maps[0], *cameras, None, None, None, None, feature_count=0, rotation_tolerance=1e-3)
-    claims: list[tuple[torch.Tensor, ...]] = [(), (maps[1],), (maps[1], maps[2])]
-    for own, mask in zip(claims, (None, chance < 0.7, None), strict=True):
-        given = Anchors(pixel, depth, variance, mask)
-        slow, fast = (check_anchors(given, frame, own, kernel) for kernel in (check_values, anchors_cpu.check_values))
-        assert 100 < slow.valid.sum() < 2 * n
-        for name in ("pixel", "predicted", "depth", "variance", "own_variance", "valid"):
-            torch.testing.assert_close(getattr(fast, name), getattr(slow, name), rtol=5e-7, atol=0, msg=name)
-        assert torch.equal(fast.index[slow.valid], slow.index[slow.valid])
-        assert 0 <= int(fast.index.min()) <= int(fast.index.max()) < size[0] * size[1]
+    for own, mask in (((), None), ((maps[1],), chance < 0.7), ((maps[1], maps[2]), None)):
+        found, far = check_anchors(Anchors(pixel, depth, variance, mask), frame, own), [0, 0]
+        for b, i in np.ndindex(2, n):
+            (u, v), g, s2 = np.rint(pixel[b, i].numpy()), float(depth[b, i]), float(variance[b, i])
+            fine = 0 <= u < size[1] and 0 <= v < size[0] and 0 < g < np.inf and 0 <= s2 < g * g
+            d = float(frame.depth[b, int(v), int(u)]) if fine else 0.0
+            fine = fine and d > 0 and (mask is None or bool(mask[b, i]))
+            near = fine and 0.01 <= g / d <= 100
+            far[b] += fine and not near
+            assert bool(found.valid[b, i]) == near
+            if near:
+                claimed = sum(float(one[b, int(v), int(u)]) for one in own)
+                mine = [float(x[b, i]) for x in (found.predicted, found.depth, found.variance, found.own_variance)]
+                np.testing.assert_allclose(mine, [d, g, s2, claimed], rtol=5e-7)
+                assert int(found.index[b, i]) == v * size[1] + u
+        assert 100 < found.valid.sum() < 2 * n
+        assert found.rejected.tolist() == far
+        assert 0 <= int(found.index.min()) <= int(found.index.max()) < size[0] * size[1]
 
 
 @pytest.mark.parametrize("some", [False, True])
@@ -152,7 +163,7 @@ def test_what_was_learnt_may_be_small_and_is_moved_by_the_streams(some):
     depths, poses, K = scenes.sequence(1, HEIGHT, WIDTH, 0.04)
     walked = UfMStar(ANCHORED.replace(backend="numba"))
     walked(torch.tensor(depths[0])[None], torch.tensor(poses[0]), torch.tensor(K))
-    seen, _ = all_seen(walked.mixture.to(torch.float64), features=3)
+    seen = seen_of(walked.mixture, features=3)
     seen[0].features[:] = 1e-32, 0.5, 1.0
     pixels = torch.arange(0, HEIGHT * WIDTH, 7)[None] if some else None
     depth = torch.tensor(depths[0], dtype=torch.float32)[None].nan_to_num(0, posinf=0).clamp_min(0)
@@ -189,7 +200,9 @@ def test_the_compiled_lesson_is_the_references_own(n, dtype, tolerance):
         g = seen[0, v.clamp_max(HEIGHT - 1), u.clamp_max(WIDTH - 1)] * relative
         anchors = check_anchors(Anchors(pixel, g, (0.02 * g).square()), frame, (0.01 * seen,))
         a = learn(slow, mixture, frame, anchors, config, distribute)
-        b = anchors_cpu.learn(fast, mixture, frame, anchors, config)
+        components = seen_of(mixture, features=3)
+        views = look(components, frame.depth, frame.intrinsics, config, dtype)
+        b = anchors_cpu.learn_in_view(fast, mixture.capacity, components, views, frame, anchors, config)
         slow, fast = a.evidence, b.evidence
         assert torch.equal(a.used, b.used)
         for name in ("beyond", "stream"):

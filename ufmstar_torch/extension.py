@@ -67,9 +67,9 @@ class FrameExtension:
         """
         raise NotImplementedError(f"{type(self).__name__} states columns, but does not compute them")
 
-    def in_view(self, tensors: Tensors, capacity: int, slots: Any, seen: Any, views: Any) -> Columns | None:
+    def in_view(self, tensors: Tensors, capacity: int, seen: Any, views: Any) -> Columns | None:
         """Like :meth:`before_regression` for the compiled step, where it has a faster way (None: it has none): the
-        columns are written into ``seen`` and ``views`` (``kernels.regress_cpu``) of the components in ``slots``."""
+        columns are written into ``seen`` and ``views`` (``kernels.regress_cpu``), which hold the first slots."""
         return None
 
     def after_regression(self, values: Tensor) -> None:
@@ -173,14 +173,14 @@ class FrameExtensions:
         return after, mixture_cam.replace(features=torch.cat(features, -1)) if self._shifts else mixture_cam
 
     def in_view(
-        self, tensors: Tensors, capacity: int, slots: Any, seen: Any, views: Any
+        self, tensors: Tensors, capacity: int, seen: Any, views: Any
     ) -> tuple[dict[str, Tensor], Tensor] | None:
         """As :meth:`FrameExtension.in_view`, of a single extension with columns: the tensors that change, and the shift
         [B, C], which the regression then adds. None: take :meth:`before_regression`."""
         with_columns = [one for one in self.each if one.columns]
         if len(with_columns) != 1:
             return None
-        columns = with_columns[0].in_view(tensors, capacity, slots, seen, views)
+        columns = with_columns[0].in_view(tensors, capacity, seen, views)
         return None if columns is None else (columns.tensors, columns.shift)
 
     def after_regression(self, result: Regression) -> Regression:

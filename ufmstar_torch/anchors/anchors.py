@@ -6,7 +6,7 @@ prediction is known. ``evidence`` says what is learnt from that, and how it is s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -123,7 +123,7 @@ class AnchorInput:
     """Checked anchors, and the frame's values where they lie.
 
     Attributes:
-        pixel: [B, N, 2] position (u, v) [px], 0 where not finite.
+        pixel: [B, N, 2] position (u, v) [px], 0 where not inside the image or impossible.
         index: [B, N] int64 of the pixel, in the flattened image.
         predicted: [B, N] the network's depth there [m]; 1 where not valid.
         depth, variance: [B, N] as given [m], [m^2]; 1 and 0 where not valid.
@@ -149,55 +149,7 @@ class AnchorInput:
     shared: Tensor | None = None
 
 
-def claimed(own: Sequence[Tensor], index: Tensor, valid: Tensor) -> Tensor:
-    """[B, N] float64 the sum of the maps ``own`` [B, H, W] at pixels ``index``, 0 where not valid."""
-    zero = torch.zeros(index.shape, dtype=torch.float64, device=index.device)
-    if not own:
-        return zero
-    total, *others = (torch.gather(value.detach().flatten(1), 1, index) for value in own)
-    for other in others:
-        total = total + other
-    return torch.where(valid, total.double(), zero)
-
-
-def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> AnchorInput:
-    """The anchors, ready to be used; see :func:`check_anchors`.
-
-    Args:
-        anchors: of the right shapes, in float64.
-        frame, own: as :func:`check_anchors`.
-    """
-    pixel, depth, variance = anchors.pixel, anchors.depth, anchors.variance
-    height, width = frame.size
-    # Compared as standard deviations: the square of a large depth overflows.
-    valid = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & pixel.isfinite().all(-1)
-    if anchors.valid is not None:
-        valid = valid & anchors.valid
-    pixel = torch.where(valid[..., None], pixel, torch.zeros_like(pixel))
-    u, v = pixel.round().long().unbind(-1)
-    index = v.clamp(0, height - 1) * width + u.clamp(0, width - 1)
-    predicted = torch.gather(frame.depth.flatten(1), 1, index).double()
-    valid = valid & _inside(pixel, frame.size) & torch.gather(frame.valid.flatten(1), 1, index)
-    valid = valid & (depth <= FARTHEST_OFF * predicted) & (predicted <= FARTHEST_OFF * depth)
-    one, zero = torch.ones_like(depth), torch.zeros_like(depth)
-    return AnchorInput(
-        pixel=pixel,
-        index=index,
-        predicted=torch.where(valid, predicted, one),
-        depth=torch.where(valid, depth, one),
-        variance=torch.where(valid, variance, zero),
-        own_variance=claimed(own, index, valid),
-        valid=valid,
-    )
-
-
-# As :func:`check_values`.
-CheckKernel = Callable[[Anchors, FrameInput, Sequence[Tensor]], AnchorInput]
-
-
-def check_anchors(
-    anchors: Anchors, frame: FrameInput, own: Sequence[Tensor] = (), kernel: CheckKernel = check_values
-) -> AnchorInput:
+def check_anchors(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor] = ()) -> AnchorInput:
     """Anchors of one frame, ready to be used; in float64 on the depth's device.
 
     An anchor is not valid whose values are impossible, which lies beside the image or on a pixel without a depth, whose
@@ -207,7 +159,6 @@ def check_anchors(
         anchors: see :class:`Anchors`.
         frame: B streams, the same.
         own: the network's own variances that count, A and E, each [B, H, W] [m^2].
-        kernel: an implementation of :func:`check_values`.
 
     Raises:
         TypeError: something else than anchors; a field is no tensor or of the wrong kind of dtype.
@@ -221,25 +172,44 @@ def check_anchors(
     shape = [(b, pixel.shape[1])]
     depth = require_float("anchors.depth", anchors.depth, shape, frame.depth).detach().double()
     variance = require_float("anchors.variance", anchors.variance, shape, frame.depth).detach().double()
-    valid = None if anchors.valid is None else require_mask("anchors.valid", anchors.valid, shape, frame.depth)
-    given = Anchors(pixel, depth, variance, valid)
-    checked = replace(kernel(given, frame, own), pose_error=anchors.pose_error, shared=anchors.shared)
-    return _with_rejected(checked, given, frame)
-
-
-def _with_rejected(checked: AnchorInput, given: Anchors, frame: FrameInput) -> AnchorInput:
-    """Count the anchors that are off by more than a factor of ``FARTHEST_OFF``."""
-    predicted = torch.gather(frame.depth.flatten(1), 1, checked.index).double()
-    ratio = given.depth / predicted
-    far = ((ratio > FARTHEST_OFF) | (ratio < 1 / FARTHEST_OFF)) & ~checked.valid & _inside(given.pixel, frame.size)
-    far = far & (given.depth > 0) & (given.variance >= 0) & (given.variance.sqrt() < given.depth) & ratio.isfinite()
-    if given.valid is not None:
-        far = far & given.valid
-    square = torch.where(far, (ratio - 1).clamp_max(FARTHEST_OFF).square(), torch.zeros_like(ratio))
+    # Compared as standard deviations: the square of a large depth overflows.
+    known = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & _inside(pixel, frame.size)
+    if anchors.valid is not None:
+        known = known & require_mask("anchors.valid", anchors.valid, shape, frame.depth)
+    one, zero = torch.ones_like(depth), torch.zeros_like(depth)
+    pixel = torch.where(known[..., None], pixel, zero[..., None])
+    u, v = pixel.round().long().unbind(-1)
+    index = v * frame.size[1] + u
+    predicted = torch.gather(frame.depth.flatten(1), 1, index).double()
+    known = known & torch.gather(frame.valid.flatten(1), 1, index)
+    near = (depth <= FARTHEST_OFF * predicted) & (predicted <= FARTHEST_OFF * depth)
+    valid, far = known & near, known & ~near
     rejected = far.sum(1)
-    many = (rejected > FEW) & (rejected > checked.valid.sum(1))
-    mean = square.sum(1) / rejected.clamp_min(1)
-    return replace(checked, rejected=rejected, contradiction=torch.where(many, mean, torch.zeros_like(mean)))
+    square = torch.where(far, (depth / predicted - 1).clamp_max(FARTHEST_OFF).square(), zero).sum(1)
+    many = (rejected > FEW) & (rejected > valid.sum(1))
+    return AnchorInput(
+        pixel=pixel,
+        index=index,
+        predicted=torch.where(valid, predicted, one),
+        depth=torch.where(valid, depth, one),
+        variance=torch.where(valid, variance, zero),
+        own_variance=torch.where(valid, _claimed(own, index, zero), zero),
+        valid=valid,
+        rejected=rejected,
+        contradiction=torch.where(many, square / rejected.clamp_min(1), torch.zeros_like(square)),
+        pose_error=anchors.pose_error,
+        shared=anchors.shared,
+    )
+
+
+def _claimed(own: Sequence[Tensor], index: Tensor, none: Tensor) -> Tensor:
+    """[B, N] float64 the sum of the maps ``own`` [B, H, W] at pixels ``index``, ``none`` without maps."""
+    if not own:
+        return none
+    total, *others = (torch.gather(value.detach().flatten(1), 1, index) for value in own)
+    for other in others:
+        total = total + other
+    return total.double()
 
 
 def require_anchors(anchors: object) -> Anchors:

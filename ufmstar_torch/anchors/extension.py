@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.anchors import FARTHEST_OFF, AnchorInput, CheckKernel, check_anchors, check_values
+from ufmstar_torch.anchors.anchors import FARTHEST_OFF, AnchorInput, check_anchors
 from ufmstar_torch.anchors.evidence import SUMS, Evidence, inliers, means, observe
 from ufmstar_torch.camera import unproject_at
 from ufmstar_torch.config import UfMStarConfig
@@ -40,13 +40,6 @@ class Learnt:
     used: Tensor
     beyond: Tensor
     stream: Tensor
-
-
-# As :func:`learn`, with the function that distributes by name.
-LearnKernel = Callable[..., Learnt]
-# Like :func:`learn`, from what the compiled step has in view, into which it writes the columns
-# (``kernels.anchors_cpu.learn_in_view``).
-LearnInView = Callable[..., Learnt]
 
 
 def learn(
@@ -101,17 +94,16 @@ class AnchorKernels:
     """The replaceable parts.
 
     Attributes:
-        check: see ``anchors.check_values``.
-        learn: see :func:`learn`.
-        learn_in_view: the same for the compiled step; None = ``learn`` serves.
+        supported: see ``evidence.inliers``.
+        learn_in_view: :func:`learn` from what the compiled step has in view, into which it writes the columns
+            (``kernels.anchors_cpu.learn_in_view``); None = :func:`learn` serves.
     """
 
-    check: CheckKernel
-    learn: LearnKernel
-    learn_in_view: LearnInView | None
+    supported: Callable[[AnchorInput], Tensor]
+    learn_in_view: Callable[..., Learnt] | None
 
 
-REFERENCE = AnchorKernels(check_values, learn, None)
+REFERENCE = AnchorKernels(inliers, None)
 
 
 class AnchorFrame(FrameExtension):
@@ -141,15 +133,14 @@ class AnchorFrame(FrameExtension):
     def before_regression(self, tensors: Tensors, mixture_cam: GaussianMixture, distribute: Distribute) -> Columns:
         """Add the frame's anchors to the evidence."""
         evidence = _evidence(tensors).padded(mixture_cam.capacity)
-        return self._columns(
-            self._kernels.learn(evidence, mixture_cam, self.frame, self.anchors, self._config, distribute=distribute)
-        )
+        given = evidence, mixture_cam, self.frame, self.anchors, self._config
+        return self._columns(learn(*given, distribute, self._kernels.supported))
 
-    def in_view(self, tensors: Tensors, capacity: int, slots: Any, seen: Any, views: Any) -> Columns | None:
+    def in_view(self, tensors: Tensors, capacity: int, seen: Any, views: Any) -> Columns | None:
         """Add the frame's anchors to the evidence, in the compiled step."""
         if self._kernels.learn_in_view is None:
             return None
-        given = (_evidence(tensors), capacity, slots, seen, views, self.frame, self.anchors, self._config)
+        given = _evidence(tensors), capacity, seen, views, self.frame, self.anchors, self._config
         return self._columns(self._kernels.learn_in_view(*given))
 
     def _columns(self, learnt: Learnt) -> Columns:
@@ -227,7 +218,7 @@ class AnchorExtension(Extension):
             TypeError, ValueError: as :func:`check_anchors`.
         """
         kernels = self._kernels(self._config.backend, frame.depth.device.type)
-        anchors = None if given is None else check_anchors(given, frame, own, kernels.check)
+        anchors = None if given is None else check_anchors(given, frame, own)
         return AnchorFrame(frame, anchors, self._config, kernels, self._warn)
 
     def _warn(self, anchors: AnchorInput) -> None:

@@ -1,4 +1,4 @@
-"""A frame's anchors on the CPU (numba): their check, which of them their neighbours support, and what they teach.
+"""A frame's anchors on the CPU (numba): which of them their neighbours support, and what they teach.
 
 Neighbours, and the components near an anchor, are searched in a grid over the image: time and memory grow with the
 number of anchors. Shares are summed cell by cell, in each in the order of the anchors: padding and other streams change
@@ -7,72 +7,28 @@ no bit.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.anchors import FARTHEST_OFF, AnchorInput, Anchors, claimed
-from ufmstar_torch.anchors.evidence import (
-    CLAIM,
-    COUNTS,
-    LEAST_SIGMA,
-    Evidence,
-)
+from ufmstar_torch.anchors.anchors import AnchorInput
+from ufmstar_torch.anchors.evidence import CLAIM, COUNTS, LEAST_SIGMA, Evidence
 from ufmstar_torch.anchors.extension import Learnt
-from ufmstar_torch.anchors.extension import learn as learn_reference
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.extension import Distribute
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
 from ufmstar_torch.kernels.neighbours_cpu import grid, supported
-from ufmstar_torch.kernels.regress_cpu import Seen, View, all_seen, look
+from ufmstar_torch.kernels.regress_cpu import Seen, View
 from ufmstar_torch.kernels.regress_cull_cpu import FIELDS, cull
 from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, add_shares
 from ufmstar_torch.kernels.rigid_cpu import padded
 from ufmstar_torch.kernels.threads_cpu import each
-from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.regress import distribute
 
 _SOME = 16  # anchors of a cell, on average, where components are searched
 _NOTHING = 1e-30  # of a mean: less is 0 and not a number too small for single precision
-
-
-def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> AnchorInput:
-    """As :func:`ufmstar_torch.anchors.anchors.check_values`, for CPU tensors."""
-    b, n = anchors.depth.shape
-    pixel, index, valid = np.empty((b, n, 2)), np.empty((b, n), np.int64), np.empty((b, n), np.bool_)
-    predicted, depth, variance = np.empty((3, b, n))
-    mask = np.empty((b, 0), np.bool_) if anchors.valid is None else anchors.valid.contiguous().numpy()
-    given = (value.contiguous().numpy() for value in (anchors.pixel, anchors.depth, anchors.variance))
-    maps = (value.contiguous().numpy() for value in (frame.depth, frame.valid))
-    _check(*given, mask, *maps, FARTHEST_OFF, pixel, index, predicted, depth, variance, valid)
-    at, usable = torch.from_numpy(index), torch.from_numpy(valid)
-    p, d, g, s2 = (torch.from_numpy(value) for value in (pixel, predicted, depth, variance))
-    return AnchorInput(p, at, d, g, s2, claimed(own, at, usable), usable)
-
-
-@kernel
-def _check(given, measured, spread, mask, depth, use, farthest, pixel, index, predicted, out, variance, valid):
-    height, width = use.shape[1:]
-    for b in range(valid.shape[0]):
-        for i in range(valid.shape[1]):
-            u, v, g, s2 = given[b, i, 0], given[b, i, 1], measured[b, i], spread[b, i]
-            ok = 0 < g < np.inf and s2 >= 0 and math.sqrt(s2) < g and math.isfinite(u) and math.isfinite(v)
-            ok = ok and (mask.shape[1] == 0 or mask[b, i])
-            u, v = (u, v) if ok else (0.0, 0.0)
-            column, row = np.rint(u), np.rint(v)
-            inside = 0 <= column < width and 0 <= row < height
-            column, row = min(max(column, 0.0), width - 1.0), min(max(row, 0.0), height - 1.0)
-            x, y = int(column), int(row)
-            d = np.float64(depth[b, y, x])
-            ok = ok and inside and use[b, y, x] and g <= farthest * d and d <= farthest * g
-            pixel[b, i, 0], pixel[b, i, 1], index[b, i], valid[b, i] = u, v, y * width + x, ok
-            predicted[b, i], out[b, i], variance[b, i] = (d, g, s2) if ok else (1.0, 1.0, 0.0)
 
 
 def inliers(anchors: AnchorInput) -> Tensor:
@@ -89,42 +45,23 @@ def _inliers(pixel, predicted, depth, variance, valid, out):
     supported(pixel, predicted, depth, variance, valid, out)
 
 
-def learn(
-    evidence: Evidence,
-    mixture_cam: GaussianMixture,
-    frame: FrameInput,
-    anchors: AnchorInput | None,
-    config: UfMStarConfig,
-    distribute: Distribute = distribute,
-) -> Learnt:
-    """As :func:`ufmstar_torch.anchors.extension.learn`, for CPU tensors, of evidence that may have less room than the
-    mixture."""
-    if config.regression != "exact":
-        padded_evidence = evidence.padded(mixture_cam.capacity)
-        return learn_reference(padded_evidence, mixture_cam, frame, anchors, config, distribute, inliers)
-    seen, slots = all_seen(mixture_cam, features=3)
-    views = look(seen, frame.depth, frame.intrinsics, config, evidence.overall.dtype)
-    return learn_in_view(evidence, mixture_cam.capacity, slots, seen, views, frame, anchors, config)
-
-
 def learn_in_view(
     evidence: Evidence,
     capacity: int,
-    slots: Sequence[NDArray[np.int64]],
     seen: Sequence[Seen],
     views: Sequence[View],
     frame: FrameInput,
     anchors: AnchorInput | None,
     config: UfMStarConfig,
 ) -> Learnt:
-    """:func:`learn` with the exact sum, of what is in view (``regress_cpu.look``); shares are right to twice the error
-    of the regression's. Of the last three features of ``seen`` and ``views`` the first two, which are what was learnt
-    of the components, are written.
+    """As :func:`ufmstar_torch.anchors.extension.learn` with the exact sum, of what is in view (``regress_cpu.look``);
+    shares are right to twice the error of the regression's.
 
     Args:
-        evidence, frame, anchors, config: as :func:`learn`.
-        capacity: of the mixture.
-        slots: of each stream's ``seen`` components.
+        evidence: of the mixture's slots, or of fewer.
+        capacity: of the mixture, whose first slots hold each stream's ``seen`` components.
+        seen, views: of their last three features the first two are written: what was learnt of the components.
+        frame, anchors, config: as there.
     """
     b, before, overall_before = len(views), array(evidence.component), array(evidence.overall)
     component, overall = np.empty((b, capacity, 3), before.dtype), np.empty((b, 3), before.dtype)
@@ -137,7 +74,7 @@ def learn_in_view(
     features = [one.features for one in seen]
     assert config.anchors is not None
     settings = frame.size[1], 0.5 ** (1 / config.anchors.half_life), config.anchors.shrinkage
-    arrays = zip(slots, views, features, *fields, array(frame.intrinsics), before, overall_before, strict=True)
+    arrays = zip(views, features, *fields, array(frame.intrinsics), before, overall_before, strict=True)
     out = zip(component, overall, used, beyond, stream, strict=True)
     each(_learn, [(*arguments, *settings, *into) for arguments, into in zip(arrays, out, strict=True)])
     learnt = Evidence(torch.from_numpy(component), torch.from_numpy(overall))
@@ -146,7 +83,7 @@ def learn_in_view(
 
 @kernel
 def _learn(
-    slots, view, features, index, pixel, predicted, depth, variance, own, valid, K, before, overall_before,
+    view, features, index, pixel, predicted, depth, variance, own, valid, K, before, overall_before,
     width, memory, shrinkage, component, overall, used, beyond, stream,
 ):  # fmt: skip
     """One stream: N anchors, K components, of which only ``view`` can explain a point."""
@@ -155,7 +92,7 @@ def _learn(
     supported(pixel, predicted, depth, variance, valid, chosen)
     used[0] = _rows(predicted, depth, variance, own, chosen, rows)
     if valid.size > 0:
-        _distribute(index, predicted, chosen, rows, K, width, slots, view, sums)
+        _distribute(index, predicted, chosen, rows, K, width, view, sums)
     fade = memory if used[0] > 0 else 1.0
     for c in range(3):  # rounded as the state keeps it
         overall[c] = fade * overall_before[c] + _folded(rows[:, c])
@@ -170,10 +107,10 @@ def _learn(
             value = (np.float64(component[k, c + 1]) - n * stream[c]) / (n + shrinkage)
             beyond[k, c] = value if abs(value) > _NOTHING else 0.0
     last = features.shape[1] - 1
-    for i in range(slots.size):
-        features[i, last - 2], features[i, last - 1] = beyond[slots[i], 0], beyond[slots[i], 1]
+    for k in range(features.shape[0]):
+        features[k, last - 2], features[k, last - 1] = beyond[k, 0], beyond[k, 1]
     for i in range(view[0].size):
-        k = slots[view[0][i]]
+        k = view[0][i]
         view[3][i, TERMS - 1], view[3][i, TERMS - 2] = beyond[k, 0], beyond[k, 1]
 
 
@@ -223,7 +160,7 @@ def _folded(values):
 
 
 @part
-def _distribute(index, predicted, chosen, rows, K, width, slots, view, sums):
+def _distribute(index, predicted, chosen, rows, K, width, view, sums):
     """Add the rows [N, 3] of the chosen anchors to the components [K, 3] that explain their points, by their shares.
 
     A cell of anchors leaves out the components that the regression leaves out of a tile.
@@ -263,7 +200,7 @@ def _distribute(index, predicted, chosen, rows, K, width, slots, view, sums):
             add_shares(near, room, n, point, row, density, added)
         for i in range(count):
             for axis in range(3):
-                sums[slots[visible[kept[i]]], axis] += added[axis, i]
+                sums[visible[kept[i]], axis] += added[axis, i]
 
 
 @leaf

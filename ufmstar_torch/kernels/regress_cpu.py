@@ -20,7 +20,7 @@ from ufmstar_torch.kernels.compile_cpu import contracted, kernel
 from ufmstar_torch.kernels.regress_cull_cpu import in_view
 from ufmstar_torch.kernels.regress_near_cpu import near
 from ufmstar_torch.kernels.regress_tiles_cpu import exact, exact_at
-from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, padded
+from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, WEIGHT
 from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression
@@ -57,19 +57,6 @@ def in_slots(seen: Sequence[Seen], capacity: int) -> GaussianMixture:
         for field, value in zip(_tensors(mixture), values, strict=True):
             field[b, : len(value)] = value
     return mixture
-
-
-def all_seen(mixture_cam: GaussianMixture, features: int | None = None) -> tuple[list[Seen], list[NDArray[np.int64]]]:
-    """All components of each stream, and their slots; with so many features, zeros, in place of their own."""
-    seen, slots = [], []
-    for mean, covariance, weight, disagreement, own in zip(*_fields(mixture_cam), strict=True):
-        at = np.flatnonzero(weight > 0)
-        n = len(at)
-        components = np.zeros((FIELDS, padded(n)))
-        components[:, :n] = np.column_stack([mean[at], covariance[at].reshape(n, 9), weight[at]]).T
-        seen.append(Seen(components, disagreement[at], own[at] if features is None else np.zeros((n, features))))
-        slots.append(at)
-    return seen, slots
 
 
 def look(
@@ -177,10 +164,6 @@ def _doubles(*values: Tensor) -> list[NDArray[np.float64]]:
 
 def _tensors(m: GaussianMixture) -> tuple[Tensor, ...]:
     return m.mean, m.covariance, m.weight, m.disagreement, m.features
-
-
-def _fields(m: GaussianMixture) -> list[NDArray[np.float64]]:
-    return _doubles(*_tensors(m))
 
 
 def _regression(out: NDArray[Any], features: NDArray[Any]) -> Regression:

@@ -238,10 +238,9 @@ def _columns(
     """Write the columns of extensions to the features before the last. Returns the tensors of the state that change;
     what is in view, and what the regression is to add to the columns, where an extension works on what is in view."""
     capacity, tensors = joined.mixture["weight"].shape[1], {**state.by_stream, **joined.sums}
-    slots = [np.arange(len(one.disagreement)) for one in joined.seen]
     if config.regression == "exact":
         views = look(joined.seen, frame.depth, frame.intrinsics, config, state.covariance.dtype)
-        if (found := extensions.in_view(tensors, capacity, slots, joined.seen, views)) is not None:
+        if (found := extensions.in_view(tensors, capacity, joined.seen, views)) is not None:
             return found[0], views, array(found[1])
     mixture_cam = in_slots(joined.seen, capacity)
     changed, with_columns = extensions.before_regression(tensors, mixture_cam, distribute)
