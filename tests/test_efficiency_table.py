@@ -46,7 +46,7 @@ def line(depth=(27.0, 206.3), dnn=(252.0, 1857.0), mvd=None, memory=None, overhe
 
 def cells(measured):
     table, *_ = efficiency_tables(measured)
-    return [cell.value for cell in table.lines[0].cells]
+    return [cell.value for cell in table.cells.iloc[0]]
 
 
 def test_the_papers_lines_are_printed_as_in_the_paper():

@@ -83,7 +83,8 @@ class TestCalibration:
             np.testing.assert_array_equal(line.get_ydata(), np.array(curves["ece_delta_accuracy"], float)[kept])
             assert line.get_color() == look_of(row.method).colour
         assert list(drawn(shown[1])) == ["exactly right", "UfM*"]  # a network of depth alone has no variance of its own
-        assert named(shown[0]) == {"alone", "UfM-100K", "UfM*", "exactly right"}
+        (legend,) = figure.legends
+        assert {text.get_text() for text in legend.get_texts()} == {"alone", "UfM-100K", "UfM*", "exactly right"}
 
 
 class TestError:

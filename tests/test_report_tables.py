@@ -37,19 +37,19 @@ from ufmstar_torch.eval.methods.setting import Setting, setting_from
 from ufmstar_torch.eval.methods.suite import names, suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.data import Results, ResultsError, load_results
-from ufmstar_torch.eval.report.means import Mean, difference, has_variance, mean_of, references
-from ufmstar_torch.eval.report.names import NLL, SPEARMAN, row_labels
+from ufmstar_torch.eval.report.means import Mean, difference, mean_of
+from ufmstar_torch.eval.report.names import NLL, row_labels
 from ufmstar_torch.eval.report.paper import paper_tables
 from ufmstar_torch.eval.report.table import (
     Cell,
-    Column,
-    Line,
     Table,
     csv_text,
+    frame_of,
     latex,
     markdown,
     markdown_text,
     number,
+    significant,
 )
 from ufmstar_torch.eval.report.tables import (
     difference_table,
@@ -74,37 +74,34 @@ def test_a_mixture_has_columns_where_a_row_states_one():
     plain = {(row, ("d", "s")): {"rmse": 0.5} for row in (ALONE, UFM_STAR)}
     stated = plain | {(UFM_STAR, ("d", "s")): {"rmse": 0.5, "mixture_nll": 0.25, "mixture_coverage": 0.99}}
     without, extended = extra_table(in_memory(plain)), extra_table(in_memory(stated))
-    new = [column.name for column in extended.columns if column not in without.columns]
+    new = [heading for heading in extended.headings if heading not in without.headings]
     assert new == ["mixture: NLL ↓", "mixture: ECE_δ ↓", "mixture: ECE_q ↓", "mixture: within 3 σ [%]"]
-    assert [cell.value for cell in extended.lines[1].cells[-4:]] == ["0.25", "", "", "99.0"]
+    assert [cell.value for cell in extended.cells.iloc[1][-4:]] == ["0.25", "", "", "99.0"]
 
 
 class TestMainTable:
     def test_fewer_than_five_sequences_have_no_interval(self, results):
-        table = main_table(results, "7-scenes")
-        assert all(cell.half == "" for line in table.lines for cell in line.cells[:5])
-        assert table.notes[1] == "One sequence: no confidence intervals."
+        assert main_table(results, "7-scenes").notes[1] == "One sequence: no confidence intervals."
         four = in_memory({(row, ("d", s)): {"nll": ord(s) / 9} for row in (ALONE, UFM_STAR) for s in "abcd"})
         assert main_table(four).notes[1] == "4 sequences, fewer than 5: no confidence intervals."
-        assert all(cell.half == "" for line in main_table(four).lines for cell in line.cells)
-        assert less(four, UFM_STAR, ALONE).better(NLL) is None
+        assert not any(cell.half for cell in main_table(four).cells.to_numpy().flat)
+        assert not any(cell.remark for cell in difference_table(four).cells.to_numpy().flat)
 
     def test_the_best_of_each_base_is_bold(self):
         values = {"Ensemble": 2.0, "UfM*-Ensemble": 1.0, "Aleatoric": 0.5, "UfM*-Aleatoric": 0.7}
         figures = {(Row(Method.parse(n)), ("d", "s")): {"nll": v, "delta1": 0.7} for n, v in values.items()}
-        table = main_table(in_memory(figures))
-        assert [line.cells[1].bold for line in table.lines] == [False, True, True, False]
-        assert [len(block) for block in table.blocks] == [2, 2]
-        assert not any(line.cells[0].bold for line in table.lines)  # all alike
+        cells = main_table(in_memory(figures)).cells
+        assert [cell.bold for cell in cells["", "NLL ↓"]] == [False, True, True, False]
+        assert [block for block, _ in cells.index] == [0, 0, 1, 1]
+        assert not any(cell.bold for cell in cells["", "δ₁ ↑"])  # all alike
 
     def test_rows_over_different_sequences_are_not_compared(self):
         figures = {(row, ("d", s)): {"nll": v} for row, s, v in ((ALONE, "a", 1.0), (ALONE, "b", 3.0), (UFM, "a", 1.5))}
         table = main_table(in_memory(figures))
-        assert table.columns[0].name == "sequences"
-        assert [line.cells[0].value for line in table.lines] == ["2", "1"]
-        assert not any(cell.bold for line in table.lines for cell in line.cells)
+        assert [cell.value for cell in table.cells["", "sequences"]] == ["2", "1"]
+        assert not any(cell.bold for cell in table.cells.to_numpy().flat)
         assert any("different sequences" in note for note in table.notes)
-        assert not any("paper" in column.name for column in table.columns), "a suite of one's own"
+        assert not any("Paper" in heading for heading in table.headings), "a suite of one's own"
 
     def test_a_network_of_depth_alone_has_dashes(self, tmp_path):
         rows = rows_of("DepthOnly", "UfM*-DepthOnly")
@@ -112,13 +109,12 @@ class TestMainTable:
         cells = parsed(markdown(main_table(result)))
         assert cells["DepthOnly"]["NLL ↓"] == cells["DepthOnly"]["ECE_q ↓"] == "–"
         assert cells["DepthOnly"]["δ₁ ↑"] == cells["UfM*-DepthOnly"]["δ₁ ↑"] != "–"
-        assert not has_variance(result.of(rows[0]))
-        assert list(references(result, rows[1])) == []
         assert difference_table(result).is_empty
 
 
 def test_significant_digits():
-    assert [number(v, None) for v in (0.0256, 4.0, 76.04, 1319.4, 0.0)] == ["0.0256", "4.00", "76.0", "1319", "0"]
+    values = (0.0256, 4.0, 76.04, 1319.4, 0.0)
+    assert [number(v, significant(v)) for v in values] == ["0.0256", "4.00", "76.0", "1319", "0"]
 
 
 class TestLatex:
@@ -129,9 +125,9 @@ class TestLatex:
 
     def test_cells_as_the_paper_sets_them(self):
         cells = (Cell("0.96", "0.19", bold=True), Cell("0.12"), Cell())
-        columns = [Column("Ours", "NLL ↓"), Column("Ours", "ECE_δ"), Column("Paper", "ECE_q")]
-        lines = [Line(block, "UfM*-MCD", cells) for block in (0, 1)]
-        text = latex(Table("t", "A & B", "Method", columns, lines))
+        columns = [("Ours", "NLL ↓"), ("Ours", "ECE_δ"), ("Paper", "ECE_q")]
+        lines = [(block, "UfM*-MCD", cells) for block in (0, 1)]
+        text = latex(Table("t", "A & B", "Method", frame_of(lines, columns)))
         assert r"UfM$^*$-MCD & $\mathbf{0.96} \pm 0.19$ & $0.12$ & -- \\" in text
         assert r" & \multicolumn{2}{c}{Ours} & Paper \\" in text
         assert r"Method & NLL $\downarrow$ & ECE$_{\delta}$ & ECE$_{q}$ \\" in text
@@ -178,30 +174,29 @@ class TestDifferences:
         assert (mean.value, mean.sequences) == (pytest.approx(-0.5), 5)
         assert mean.half == pytest.approx(T_4 * 0.05 * math.sqrt(2.5) / math.sqrt(5))
         assert mean_of(result.of(ALONE), NLL).half == pytest.approx(T_4 * 2 * math.sqrt(2.5) / math.sqrt(5))
-        assert mean.better(NLL) is True
-        assert mean.better(SPEARMAN) is False  # there, more is better
-        assert less(result, ALONE, UFM_STAR).better(NLL) is False
+        row = parsed(markdown(difference_table(result)))["Ensemble – UfM*-Ensemble"]
+        assert (row["Δ NLL ↓"], row["sequences"]) == ("+0.50 ± 0.10 (worse)", "5")
 
     def test_on_common_sequences_only(self):
         figures = {(ALONE, ("d", s)): {"nll": 1.0} for s in "ab"} | {(UFM, ("d", s)): {"nll": 3.0} for s in "bc"}
         mean = less(in_memory(figures), UFM, ALONE)
         assert (mean.value, mean.sequences) == (2.0, 1)
-        assert math.isnan(mean.half)
-        assert mean.better(NLL) is None  # one sequence says nothing about others
+        assert math.isnan(mean.half)  # one sequence says nothing about others
 
-    def test_references(self):
-        skipped, noisy = Setting(skip=4), Setting(rotation_noise=2.0)
-        full, fixed = rows_of("UfM*-FullEnsemble", "UfM*-Ensemble-fixed-param")
-        method = UFM_STAR.method
-        rows = [*ENSEMBLE, full, fixed, Row(ALONE.method, skipped), Row(method, skipped), Row(method, noisy)]
-        result = in_memory({(row, ("d", "s")): {"ece_delta": 0.1} for row in [*rows, *rows_of("Aleatoric")]})
-        message = {row: list(references(result, row)) for row in rows}
-        assert message[ALONE] == []
-        assert message[UFM] == message[UFM_100K] == [ALONE]
-        assert message[UFM_STAR] == [ALONE, UFM_100K]
-        assert message[full] == message[fixed] == [ALONE, UFM_100K, UFM_STAR]
-        assert message[Row(method, skipped)] == [Row(ALONE.method, skipped), UFM_STAR]  # alone on the same images
-        assert message[Row(method, noisy)] == [ALONE, UFM_STAR]
+    def test_all_rows_are_compared_with_ufm_star_of_their_base(self):
+        rows = [*ENSEMBLE, *rows_of("UfM*-FullEnsemble", "Aleatoric"), Row(UFM_STAR.method, Setting(skip=4))]
+        values = {row: {"nll": float(n), "spearman": float(n)} for n, row in enumerate(rows)}
+        five = in_memory({(row, ("d", s)): figures for row, figures in values.items() for s in "abcde"})
+        table = parsed(markdown(difference_table(five)))
+        others = [
+            "Ensemble",
+            "UfM-Ensemble",
+            "UfM-Ensemble-100K",
+            "UfM*-FullEnsemble",
+            "UfM*-Ensemble, images skipped 4",
+        ]
+        assert list(table) == [f"{name} – UfM*-Ensemble" for name in others]
+        assert [row["Δ NLL ↓"].split()[0] for row in table.values()] == ["-3.00", "-2.00", "-1.00", "+1.00", "+3.00"]
 
 
 class TestSums:

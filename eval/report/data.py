@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -23,14 +22,6 @@ from ufmstar_torch.eval.suite.record import Record
 FORMAT = 1
 Sums = dict[str, dict[str, Tensor]]
 Curves = Mapping[str, list[float]]
-# The paper's groups of its figure of entropy, by the beginnings of words in the names of data sets and sequences
-# (TartanAir's environments, say); other data sets are groups of their own.
-ENVIRONMENTS = {
-    "indoor": ("indoor", "scannet", "7scenes", "scenes", "tum", "nyu", "tour", "office", "hospital"),
-    "forest": ("forest", "seasonsforest", "gascola"),
-    "driving": ("driving", "kitti"),
-    "city": ("city", "soulcity", "neighborhood", "oldtown", "japanesealley"),
-}
 
 
 class ResultsError(ValueError):
@@ -121,7 +112,7 @@ def load_results(out: Path, *, with_sums: bool = True) -> Results:
     """
     about = _about(out)
     order, loaded = {row: number for number, row in enumerate(listed_rows(about))}, []
-    for path in sorted((out / "records").rglob("*.json")):
+    for path in (out / "records").rglob("*.json"):
         if path.name != FAILED:
             try:
                 record = Record.load(path)
@@ -139,13 +130,6 @@ def load_results(out: Path, *, with_sums: bool = True) -> Results:
     missing = tuple((*s, row) for s in expected if s not in broken for row in order if (*s, row) not in done)
     merged, notes = _merged(by_path) if with_sums else ({}, [])
     return Results(out, about, records, merged, failed, missing, _read_json(out / "efficiency.json"), tuple(notes))
-
-
-def environment_of(record: Record) -> str:
-    """The group of a sequence in the figure of entropy: a key of ``ENVIRONMENTS``, or its data set."""
-    words = re.split("[^a-z0-9]+", f"{record.dataset}/{record.sequence}".lower())
-    fitting = (name for name, begins in ENVIRONMENTS.items() if any(word.startswith(begins) for word in words))
-    return next(fitting, record.dataset)
 
 
 def listed_rows(about: Mapping[str, Any]) -> list[Row]:
@@ -169,10 +153,8 @@ def _about(out: Path) -> dict[str, Any]:
 
 def _read_json(path: Path) -> Any:
     """The content of a JSON file, None where there is no file."""
-    if not path.is_file():
-        return None
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
     except (ValueError, RecursionError) as error:
         raise ResultsError(f"{path} is not JSON: {error}") from error
 
@@ -180,7 +162,7 @@ def _read_json(path: Path) -> Any:
 def _check(out: Path, about: Mapping[str, Any], records: Mapping[Path, Record]) -> None:
     """Raise ResultsError where there is no record, or records are not of one evaluation."""
     if not records:
-        raise ResultsError(f"{out} holds no finished sequence yet (no record under {out / 'work'})")
+        raise ResultsError(f"{out} holds no finished sequence yet (no record under {out / 'records'})")
     networks: dict[str, tuple[str, Path]] = {}
     seen: dict[tuple[str, str, Row], Path] = {}
     for path, record in records.items():
@@ -222,20 +204,27 @@ def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Curve
         if gone := [path for path in files if not path.is_file()]:
             notes.append(f"{dataset}, {row.label}: no curve over all sequences, {gone[0]} is not there")
             continue
-        total: Sums = {}  # added in the order of the files, which decides the last bits
+        total: Sums = {}
         try:
-            for path in files:
-                for name, states in read_sums(path).items():
-                    if name != CONFIDENCE:  # samples, no sums
-                        mine = total.setdefault(name, {key: torch.zeros_like(value) for key, value in states.items()})
-                        if {key: v.shape for key, v in mine.items()} != {key: v.shape for key, v in states.items()}:
-                            raise RuntimeError(f"{name} of other shapes than in the sequences before it")
-                        total[name] = {key: mine[key] + value for key, value in states.items()}
+            for path in files:  # their order decides the last bits
+                total = _added(total, read_sums(path))
             merged[dataset, row] = _curves(total)
         except RuntimeError as error:
             text = " ".join(str(error).split())[:200]
             raise ResultsError(f"{path} holds sums of other metrics: {text}") from error
     return merged, notes
+
+
+def _added(total: Sums, sums: Sums) -> Sums:
+    """Sums of some sequences and one more. Raises RuntimeError: they are of other metrics."""
+    added = dict(total)
+    for name, states in sums.items():
+        before = total.get(name, states)
+        if {key: v.shape for key, v in before.items()} != {key: v.shape for key, v in states.items()}:
+            raise RuntimeError(f"{name} of other shapes than in the sequences before it")
+        if name != CONFIDENCE:  # samples, no sums
+            added[name] = {key: before[key] + v for key, v in states.items()} if name in total else states
+    return added
 
 
 def read_sums(path: Path) -> Sums:

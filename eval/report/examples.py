@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,49 +16,64 @@ from ufmstar_torch.eval.run.colours import known_where, striped
 
 Map = NDArray[np.float32]
 _SCENE = ("image", "truth", "K")
+# The network's own A, the spread of members or samples E, and the disagreement between the views M.
+PARTS = ("aleatoric", "epistemic", "disagreement")
 
 
 @dataclass(frozen=True, eq=False)
 class RowMaps:
-    """One row's maps of a frame, [h, w] float32: depth [m], variance V [m^2], and its parts [m^2] where the row has
-    them: the network's own A, the spread of members or samples E, and the disagreement between the views M;
-    ``measured`` is the share of M that rests on two views or more.
+    """One row's maps of a frame, [h, w] float32, NaN where unknown.
+
+    Attributes:
+        depth: [m].
+        error: |depth - truth| [m].
+        sigma: standard deviation [m].
+        nll: (g - d)^2 / (2 v) + 0.5 ln(2 pi v) [nats], NaN also where v = 0; float64.
+        roots: square roots of the parts of the variance that the row has, by their names in ``PARTS`` [m].
+        unmeasured: bool, True where M rests on one view; None where the row has no M.
     """
 
     depth: Map
-    variance: Map
-    aleatoric: Map | None = None
-    epistemic: Map | None = None
-    disagreement: Map | None = None
-    measured: Map | None = None
+    error: Map
+    sigma: Map
+    nll: NDArray[np.float64]
+    roots: Mapping[str, Map]
+    unmeasured: NDArray[np.bool_] | None
 
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """[h, w] bool, True where depth and variance can be used."""
+    @classmethod
+    def of(cls, stored: Mapping[str, NDArray], truth: Map) -> RowMaps:
+        """The maps from those of ``suite.examples`` and the ground truth [h, w] [m], 0 or NaN = none."""
+        depth, variance = stored["depth"], stored["variance"]
         with np.errstate(invalid="ignore"):
-            return np.isfinite(self.depth) & (self.depth > 0) & np.isfinite(self.variance) & (self.variance >= 0)
+            valid = np.isfinite(depth) & (depth > 0) & np.isfinite(variance) & (variance >= 0)
+            known = valid & (truth > 0) & np.isfinite(truth)
+            v = np.where(known & (variance > 0), variance, np.nan).astype(np.float64)
+            error = known_where(known, np.abs(depth - truth))
+        exact = np.where(known, depth, 0).astype(np.float64) - np.where(known, truth, 0)
+        return cls(
+            depth=known_where(valid, depth),
+            error=error,
+            sigma=_root(variance, valid),
+            nll=exact**2 / (2 * v) + 0.5 * np.log(2 * math.pi * v),
+            roots={name: _root(stored[name], valid) for name in PARTS if name in stored},
+            unmeasured=stored["measured"] < unmeasured.HALF if "measured" in stored else None,
+        )
 
     @property
-    def known_depth(self) -> Map:
-        """[h, w] depth [m], NaN where invalid."""
-        return known_where(self.valid, self.depth)
-
-    def root(self, part: Map) -> Map:
-        """[h, w] square root of the variance or a part of it [m], NaN where invalid."""
-        usable = self.valid & np.isfinite(part) & (part >= 0)
-        return known_where(usable, np.sqrt(np.where(usable, part, 0)))
-
-    @property
-    def sigma(self) -> Map:
-        """[h, w] standard deviation [m], NaN where invalid."""
-        return self.root(self.variance)
+    def mean_nll(self) -> float | None:
+        """The mean NLL [nats]; None without a pixel that has one."""
+        judged = self.nll[np.isfinite(self.nll)]
+        return float(judged.mean()) if judged.size else None
 
     def striped(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A picture [h, w, 3] of M or sigma, striped where M was not measured."""
-        return rgb if self.measured is None else striped(rgb, self.measured < unmeasured.HALF)
+        return rgb if self.unmeasured is None else striped(rgb, self.unmeasured)
 
 
-_MAPS = tuple(f.name for f in fields(RowMaps))
+def _root(variance: Map, valid: NDArray[np.bool_]) -> Map:
+    """Standard deviation [m], NaN where invalid."""
+    usable = valid & np.isfinite(variance) & (variance >= 0)
+    return known_where(usable, np.sqrt(np.where(usable, variance, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +82,8 @@ class Example:
 
     Attributes:
         image: [H, W, 3] uint8.
-        truth: [h, w] ground truth [m], 0 = none.
-        K: [3, 3] intrinsics of the maps [px].
+        truth: [h, w] ground truth [m], NaN where there is none.
+        aspect: height by width of what the maps show: networks that take squares squeeze wide images.
         rows: maps by the row's file name.
         labels: rows' names for people, by file name.
     """
@@ -79,41 +93,17 @@ class Example:
     frame: str
     image: NDArray[np.uint8]
     truth: Map
-    K: NDArray[np.float64]
+    aspect: float
     rows: Mapping[str, RowMaps]
-    labels: Mapping[str, str] = field(default_factory=dict)
-
-    def label(self, row: str) -> str:
-        """The row's name for people."""
-        return self.labels.get(row, row)
+    labels: Mapping[str, str]
 
     @property
-    def aspect(self) -> float:
-        """Height by width of what the maps show: networks that take squares squeeze wide images."""
-        height, width = self.truth.shape
-        return float((height / self.K[1, 1]) / (width / self.K[0, 0]))
-
-    @property
-    def known_truth(self) -> Map:
-        """[h, w] ground truth [m], NaN where there is none."""
-        return known_where(self.truth > 0, self.truth)
-
-    def error(self, row: str) -> Map:
-        """[h, w] |depth - truth| [m], NaN where there is no truth or no prediction."""
-        maps = self.rows[row]
-        known = (self.truth > 0) & np.isfinite(self.truth) & maps.valid
-        return known_where(known, np.abs(maps.depth - self.truth))
-
-    def nll(self, row: str) -> NDArray[np.float64]:
-        """[h, w] (g - d)^2 / (2 v) + 0.5 ln(2 pi v) [nats], NaN where there is no truth or v = 0."""
-        maps = self.rows[row]
-        usable = np.isfinite(self.error(row)) & (maps.variance > 0)
-        v = np.where(usable, maps.variance, 1.0).astype(np.float64)
-        error = np.where(usable, maps.depth.astype(np.float64) - self.truth.astype(np.float64), 0.0)
-        return np.where(usable, error**2 / (2 * v) + 0.5 * np.log(2 * math.pi * v), np.nan)
+    def title(self) -> str:
+        """Sequence and frame."""
+        return f"{self.sequence}, frame {self.frame}"
 
 
-def find_examples(folder: Path, labels: Mapping[str, str] | None = None) -> list[Example]:
+def find_examples(folder: Path, dataset: str, sequence: str, labels: Mapping[str, str]) -> list[Example]:
     """The examples of one sequence, ``OUT/records/DATASET/SEQUENCE``, in the order of their frames.
 
     Rows whose maps show the frame with another camera (a network of another size) make an example of their own. Rows
@@ -127,9 +117,8 @@ def find_examples(folder: Path, labels: Mapping[str, str] | None = None) -> list
         cuts = [at for at, letter in enumerate(stem) if letter == "@" and stem[:at] in stems]
         if cuts:
             rows.setdefault(stem[: cuts[0]], {})[stem[cuts[0] + 1 :]] = file
-    about = folder.parent.name, folder.name
     return [
-        Example(*about, frame, **scene, rows=maps, labels=labels or {})
+        Example(dataset, sequence, frame, *scene, rows=maps, labels=labels)
         for frame, row_files in sorted(rows.items())
         for scene, maps in _cameras(stems[frame], row_files)
     ]
@@ -144,18 +133,21 @@ def load_arrays(file: Path, names: Sequence[str]) -> dict[str, NDArray]:
     return arrays
 
 
-def _cameras(file: Path, row_files: Mapping[str, Path]) -> Iterable[tuple[dict[str, Any], dict[str, RowMaps]]]:
-    """Image, truth and K of each camera that the rows of a frame have, and their maps."""
+def _cameras(
+    file: Path, row_files: Mapping[str, Path]
+) -> Iterable[tuple[tuple[NDArray, Map, float], dict[str, RowMaps]]]:
+    """Image, truth and aspect of each camera that the rows of a frame have, and the rows' maps."""
     common = load_arrays(file, _SCENE)
-    cameras: dict[bytes, tuple[dict[str, Any], dict[str, RowMaps]]] = {}
+    cameras: dict[tuple[bytes, tuple[int, ...]], tuple[tuple[NDArray, Map, float], dict[str, RowMaps]]] = {}
     for row, row_file in row_files.items():
         stored = load_arrays(row_file, ("depth",))
-        scene = {name: stored.get(name, common[name]) for name in _SCENE}
-        maps = {name: stored[name] for name in _MAPS if name in stored}
-        wrong = [name for name, value in maps.items() if value.shape != scene["truth"].shape]
+        image, truth, K = (stored.get(name, common[name]) for name in _SCENE)
+        wrong = [name for name in ("depth", "variance", *PARTS) if stored.get(name, truth).shape != truth.shape]
         if wrong:
-            raise ValueError(f"{row_file}: {', '.join(wrong)} must have the truth's shape {scene['truth'].shape}")
-        if "variance" in maps:
-            camera = scene["K"].astype(np.float64).tobytes() + repr(scene["truth"].shape).encode()
-            cameras.setdefault(camera, (scene, {}))[1][row] = RowMaps(**maps)
+            raise ValueError(f"{row_file}: {', '.join(wrong)} must have the truth's shape {truth.shape}")
+        if "variance" in stored:
+            height, width = truth.shape
+            scene = image, known_where(truth > 0, truth), float((height / K[1, 1]) / (width / K[0, 0]))
+            camera = K.astype(np.float64).tobytes(), truth.shape
+            cameras.setdefault(camera, (scene, {}))[1][row] = RowMaps.of(stored, truth)
     return cameras.values()

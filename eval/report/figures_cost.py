@@ -27,11 +27,12 @@ def draw_stages(results: Results) -> Any | None:
     figure = style.new_figure(8.6, 1.5 + 0.5 * len(staged), "Where the time of UfM* goes")
     axes = figure.subplots()
     for y, row in enumerate(staged):
-        times = {name: row["stages"]["stages"][name]["median_ms"] for name in STAGES if name in row["stages"]["stages"]}
+        times = {name: stage["median_ms"] for name, stage in row["stages"]["stages"].items()}
         total, left = math.fsum(times.values()), 0.0
-        for name, ms in times.items():
-            share = 100 * ms / total
-            axes.barh(y, share, left=left, color=STAGES[name], height=0.62, edgecolor="white", linewidth=0.5)
+        for name, colour in STAGES.items():
+            share = 100 * times[name] / total
+            label = name if y == 0 else ""
+            axes.barh(y, share, left=left, color=colour, label=label, height=0.62, edgecolor="white", linewidth=0.5)
             if share >= 6:
                 letters = INK if name in ("regress", "average") else "white"  # dark on the light colours
                 words = {"size": style.TICK, "color": letters, "ha": "center", "va": "center"}
@@ -42,8 +43,5 @@ def draw_stages(results: Results) -> Any | None:
     style.finish(axes, x="share of the step [%], medians of its stages")
     axes.grid(visible=False)
     axes.set(xlim=(0, 100), ylim=(len(staged) - 0.4, -0.6))
-    from matplotlib.patches import Patch
-
-    handles = [Patch(color=colour, label=name) for name, colour in STAGES.items()]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=style.TICK)
+    style.legend_below(figure)
     return figure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ from ufmstar_torch.eval.engine.judge import BY_ERROR
 from ufmstar_torch.eval.methods.method import ALONE, BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report import style
-from ufmstar_torch.eval.report.data import ENVIRONMENTS, Results, environment_of
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import value_of
 from ufmstar_torch.eval.report.names import count
 from ufmstar_torch.eval.report.style import Look
@@ -22,11 +23,22 @@ from ufmstar_torch.eval.run.colours import FAINT, INK
 from ufmstar_torch.eval.suite.record import Record
 
 Curves = Mapping[str, Sequence[float]]
-PER_LINE, MOST_SEQUENCES = 3, 12
+PER_LINE, MOST_SEQUENCES = 4, 12
 # Words at the axes of the two diagrams of calibration.
 DELTA, QUANTILE = ("predicted share within 25 %", "true share"), ("predicted quantile", "share of truth below")
 # The looks of methods that are known by name alone, as the demo's.
 _BY_ORDER = (("#6b6b6b", "^"), ("#E69F00", "s"), ("#0072B2", "o"), ("#009E73", "D"), ("#CC79A7", "v"), ("#D55E00", "P"))
+# The paper's groups of its figure of entropy, by the beginnings of words in the names of data sets and sequences
+# (TartanAir's environments, say); other data sets are groups of their own.
+ENVIRONMENTS = {
+    "indoor": ("indoor", "scannet", "7scenes", "scenes", "tum", "nyu", "tour", "office", "hospital"),
+    "forest": ("forest", "seasonsforest", "gascola"),
+    "driving": ("driving", "kitti"),
+    "city": ("city", "soulcity", "neighborhood", "oldtown", "japanesealley"),
+}
+
+
+# ---- calibration ----
 
 
 def draw_calibration(results: Results, dataset: str) -> Any | None:
@@ -35,11 +47,8 @@ def draw_calibration(results: Results, dataset: str) -> Any | None:
     for row in results.default_rows():
         if _has_curves(values := results.merged.get((dataset, row), {})):
             panels.setdefault(row.method.base, {})[row] = values
-    if not panels:
-        return None
     title = f"Calibration on {dataset}, {count(len(results.sequences(dataset)), 'sequence')}"
-    named = [((BASES[base][0], ""), curves) for base, curves in panels.items()]
-    return _draw_columns(title, named, PER_LINE, (0.9, 4.1, 0.4, 6.0), ends=True)
+    return _draw_columns(title, [((BASES[base][0], ""), curves) for base, curves in panels.items()])
 
 
 def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any | None:
@@ -47,23 +56,15 @@ def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any 
     smallest ECE_delta to that on which it has the largest."""
     of = {row: [r for r in results.of(row, dataset) if _has_curves(r.curves)] for row in results.default_rows(base)}
     rows = [row for row, records in of.items() if records]
-    if not rows:
-        return None
-    ordered = sorted(of[_ours(rows)], key=lambda r: (value_of(r, "ece_delta"), r.sequence))
+    ordered = sorted(of[_ours(rows)] if rows else [], key=lambda r: (value_of(r, "ece_delta"), r.sequence))
     chosen = np.linspace(0, len(ordered) - 1, min(len(ordered), MOST_SEQUENCES)).round().astype(int)
     panels = []
     for name in (ordered[i].sequence for i in chosen):
         shown = {row: record for row in rows for record in of[row] if record.sequence == name}
         titles = (f"{name}\n{_errors(shown, 'ece_delta', 'δ')}", _errors(shown, "ece_q", "q"))
         panels.append((titles, {row: record.curves for row, record in shown.items()}))
-    title = f"Calibration on single sequences of {dataset}, {BASES[base][0]}; errors alone → UfM*, from best to worst"
-    figure = _draw_columns(title, panels, 4, (0.4, 2.45, 0.7, 4.9), ends=False)
-    from matplotlib.lines import Line2D
-
-    judged = [row for row in results.default_rows(base) if any(_has_curves(r.curves) for r in results.of(row))]
-    handles = [Line2D([], [], **style.look_of(row.method).line) for row in judged]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=8)
-    return figure
+    title = f"Calibration on single sequences of {dataset}, {BASES[base][0]}\nerrors alone → UfM*, from best to worst"
+    return _draw_columns(title, panels)
 
 
 def _ours(rows: Sequence[Row]) -> Row:
@@ -71,35 +72,36 @@ def _ours(rows: Sequence[Row]) -> Row:
     return next((row for row in rows if row.method.fusion == UFM_STAR and not row.method.full), rows[-1])
 
 
-def _draw_columns(
-    title: str,
-    panels: Sequence[tuple[tuple[str, str], Mapping[Row, Curves]]],
-    most: int,
-    size: tuple[float, float, float, float],
-    *,
-    ends: bool,
-) -> Any:
-    """Delta calibration above quantile calibration for some rows of one base, UfM* last and so on top.
+def _errors(records: Mapping[Row, Record], key: str, letter: str) -> str:
+    """The calibration errors of the base alone and of UfM*, or of the first and the last row."""
+    rows = list(records)
+    values = (f"{value_of(records[row], key):.3f}" for row in dict.fromkeys((rows[0], _ours(rows))))
+    return f"ECE_{letter} {' → '.join(values)}"
 
-    Args:
-        panels: titles of both panels, and curves by row.
-        most: columns side by side.
-        size: width of the margin and of a column, height of the margin and of a line [in].
-        ends: with the rows' names at the right of every panel; else only the first column has words at the y axes.
-    """
-    columns = min(len(panels), most)
+
+def _has_curves(curves: Mapping[str, Any]) -> bool:
+    """Return whether a variance was judged on at least one pixel (a curve without one is NaN, None in a record)."""
+    levels = curves.get("ece_q_observed") or ()
+    return len(levels) > 0 and all(value is not None and value == value for value in levels)
+
+
+def _draw_columns(title: str, panels: Sequence[tuple[tuple[str, str], Mapping[Row, Curves]]]) -> Any | None:
+    """Delta calibration above quantile calibration in each column, ``PER_LINE`` columns side by side. ``panels`` has
+    the titles of both, and curves by row, of which UfM* is drawn last and so on top."""
+    if not panels:
+        return None
+    columns = min(len(panels), PER_LINE)
     lines = -(-len(panels) // columns)
-    figure = style.new_figure(size[0] + size[1] * columns, size[2] + size[3] * lines, title)
+    # A column alone needs room for the title and the names below.
+    figure = style.new_figure(max(5.0, 0.4 + 2.6 * columns), 0.7 + 5.2 * lines, title)
     axes = style.hidden_panels(figure, 2 * lines, columns)
-    for number, (titles, curves) in enumerate(panels):
-        line, column = divmod(number, columns)
-        ordered = sorted(curves, key=lambda row: (row.method.fusion == UFM_STAR, row.method.full))
-        drawn = {style.look_of(row.method): curves[row] for row in ordered}
-        for below, (words, own) in enumerate(zip((DELTA, QUANTILE), titles, strict=True)):
-            panel = axes[2 * line + below, column]
-            _draw_shares(panel, words, drawn, own, named=ends or column == 0)
-            if ends:
-                style.name_lines(panel)
+    for n, (titles, curves) in enumerate(panels):
+        rows = sorted(curves, key=lambda row: (row.method.fusion == UFM_STAR, row.method.full))
+        drawn = {style.look_of(row.method): curves[row] for row in rows}
+        for below, words in enumerate((DELTA, QUANTILE)):
+            panel = axes[2 * (n // columns) + below, n % columns]
+            _draw_shares(panel, words, drawn, titles[below], named=n % columns == 0)
+    style.legend_below(figure)
     return figure
 
 
@@ -122,19 +124,6 @@ def _draw_shares(
     style.finish(axes, title=title, x=words[0], y=words[1] if named else "")
 
 
-def _has_curves(curves: Mapping[str, Any]) -> bool:
-    """Return whether a variance was judged on at least one pixel (a curve without one is NaN, None in a record)."""
-    levels = curves.get("ece_q_observed") or ()
-    return len(levels) > 0 and all(value is not None and value == value for value in levels)
-
-
-def _errors(records: Mapping[Row, Record], key: str, letter: str) -> str:
-    """The calibration errors of the base alone and of UfM*, or of the first and the last row."""
-    rows = list(records)
-    values = (f"{value_of(records[row], key):.3f}" for row in dict.fromkeys((rows[0], _ours(rows))))
-    return f"ECE_{letter} {' → '.join(values)}"
-
-
 def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -> None:
     """Draw delta calibration, quantile calibration and sparsification (``SequenceMetrics.curves()`` by the name that
     the legend shows) side by side, and write the picture (PNG). Raises ValueError: there are no curves, or more than
@@ -154,7 +143,7 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
     sparse.set_ylim(bottom=0)
     title, x_words = "sparsification (dotted: best possible)", "share of pixels left out, largest σ first"
     style.finish(sparse, title=title, x=x_words, y="RMSE [m]")
-    figure.legend(*delta.get_legend_handles_labels(), loc="outside lower center", ncols=len(curves) + 1, frameon=False)
+    style.legend_below(figure)
     style.save_figure(figure, path)
 
 
@@ -169,20 +158,19 @@ def draw_error(results: Results, dataset: str) -> Any | None:
         return None
     columns = max(map(len, panels.values()))
     figure = style.new_figure(0.6 + 4.3 * columns, 0.5 + 3.1 * len(panels), f"NLL by size of the error on {dataset}")
-    for line, (base, by_reference) in zip(
-        style.hidden_panels(figure, len(panels), columns), panels.items(), strict=True
-    ):
-        for axes, (reference, curves) in zip(line, by_reference.items(), strict=False):
-            axes.set_visible(True)
+    axes = style.hidden_panels(figure, len(panels), columns)
+    for line, (base, by_reference) in zip(axes, panels.items(), strict=True):
+        for panel, (reference, curves) in zip(line, by_reference.items(), strict=False):
+            panel.set_visible(True)
             for row, values in sorted(curves.items(), key=lambda item: item[0].method.fusion == UFM_STAR):
                 x = (np.arange(len(values)) + 0.5) * 100 / len(values)
-                axes.plot(x, np.array(values, float), **style.look_of(row.method).line)
-            axes.set(xlim=(0, 100), xticks=[0, 25, 50, 75, 100])
+                panel.plot(x, np.array(values, float), **style.look_of(row.method).line)
+            panel.set(xlim=(0, 100), xticks=[0, 25, 50, 75, 100])
             method = Method.parse(reference)
             judge = "it" if method.fusion == ALONE else style.look_of(method).name
             title = f"{BASES[base][0]}: where {judge} is confident in each frame"
-            style.finish(axes, title=title, x="percentile of the row's error", y="mean NLL [nats]")
-            style.name_lines(axes)
+            style.finish(panel, title=title, x="percentile of the row's error", y="mean NLL [nats]")
+            style.name_lines(panel)
     return figure
 
 
@@ -220,9 +208,16 @@ def entropies(results: Results, base: str) -> dict[str, dict[Row, Histogram]]:
     for row in results.default_rows(base):
         for record in results.of(row):
             if sum(record.curves.get("entropy_counts", ())) > 0:
-                records.setdefault(environment_of(record), {}).setdefault(row, []).append(record)
+                records.setdefault(_environment(record), {}).setdefault(row, []).append(record)
     order = [*ENVIRONMENTS, *sorted(records.keys() - ENVIRONMENTS.keys())]
     return {name: {row: _histogram(r) for row, r in records[name].items()} for name in order if name in records}
+
+
+def _environment(record: Record) -> str:
+    """A key of ``ENVIRONMENTS``, or the data set."""
+    words = re.split("[^a-z0-9]+", f"{record.dataset}/{record.sequence}".lower())
+    fitting = (name for name, begins in ENVIRONMENTS.items() if any(word.startswith(begins) for word in words))
+    return next(fitting, record.dataset)
 
 
 def _histogram(records: Sequence[Record]) -> Histogram:
@@ -240,9 +235,7 @@ def draw_entropy(results: Results, base: str) -> Any | None:
         return None
     figure = style.new_figure(7.6, 1.0 + 2.1 * len(panels), f"Predictive entropy by environment, {BASES[base][0]}")
     axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True)[:, 0]
-    low, high = _entropy_range([histogram for rows in panels.values() for histogram in rows.values()])
     for panel, (environment, rows) in zip(axes, panels.items(), strict=True):
-        panel.set_xlim(low, high)
         for number, (row, histogram) in enumerate(rows.items()):
             look, density, edges = style.look_of(row.method), histogram.density, histogram.edges
             panel.stairs(density, edges, color=look.colour, linewidth=1.5, label=look.name)
@@ -255,6 +248,7 @@ def draw_entropy(results: Results, base: str) -> Any | None:
             panel.text(1.02, 0.95 - 0.13 * number, f"{look.name}: mean {histogram.mean:.2f}{remark}", **how)
         panel.set_ylim(bottom=0)
         style.finish(panel, title=environment, y="share of pixels per nat")
+    axes[0].set_xlim(*_entropy_range([histogram for rows in panels.values() for histogram in rows.values()]))
     axes[-1].set_xlabel("entropy ½ ln(2πeV) [nats]", size=style.LABEL, color=INK)
     return figure
 
@@ -264,6 +258,5 @@ def _entropy_range(histograms: Sequence[Histogram]) -> tuple[float, float]:
     edges = histograms[0].edges
     shares = np.array([histogram.counts / histogram.counts.sum() for histogram in histograms])
     filled = np.flatnonzero(shares[:, 1:-1].max(0) > 0.001)
-    if not len(filled):
-        return float(edges[0]), float(edges[-1])
-    return max(edges[filled[0]] - 0.5, float(edges[0])), min(edges[filled[-1] + 1] + 0.5, float(edges[-1]))
+    first, last = (filled[0], filled[-1] + 1) if len(filled) else (0, -1)
+    return max(edges[first] - 0.5, float(edges[0])), min(edges[last] + 0.5, float(edges[-1]))

@@ -26,8 +26,8 @@ COUNT = "anchor_count"
 Rest = tuple[tuple[str, Any], ...]
 # Rows without a number of anchors have at most so many.
 _COUNTS = {"": 0, CORNERS: TrackerConfig().max_points, TRUTH: TRUTH_COUNT}
-# Settings that a row without anchors cannot have, beside those that begin with "anchor_" or "anchors.".
-_OF_ANCHORS = ("anchors", "track_noise", "posterior")
+# Beginnings of settings that a row without anchors cannot have.
+_OF_ANCHORS = ("anchor", "track_noise", "posterior")
 _ANCHORED = {CORNERS: "anchored", DENSE: "dense anchors", TRUTH: "truth anchors"}
 
 
@@ -68,13 +68,12 @@ def sweep_lines(results: Results, base: str, name: str) -> list[SweepLine]:
     rows = [row for row in results.rows if row.method.base == base]
     left_out = {name} if len({row.setting.preprocess for row in rows}) > 1 else {name, "preprocess"}
     for row in rows:
-        value, values = _value(row, name), row.setting.to_dict()
-        if _is_number(value):
-            rest = tuple(sorted((other, values[other]) for other in _changed(row) if other not in left_out))
-            groups.setdefault((row.method, rest), {}).setdefault(float(value), []).append(row)
+        if not math.isnan(value := _value(row, name)):
+            rest = tuple(sorted((other, v) for other, v in _changed(row).items() if other not in left_out))
+            groups.setdefault((row.method, rest), {}).setdefault(value, []).append(row)
     if name == COUNT:  # lines over several numbers of anchors begin with the rows that do without
         for (method, rest), by_value in groups.items():
-            without = tuple(i for i in rest if i[0] not in _OF_ANCHORS and not i[0].startswith(("anchor_", "anchors.")))
+            without = tuple(item for item in rest if not item[0].startswith(_OF_ANCHORS))
             plain = groups.get((method, without), {})
             if len(by_value) > 1 and 0.0 in plain:
                 by_value.setdefault(0.0, plain[0.0])
@@ -94,24 +93,25 @@ def default_value(name: str, preset: str = DEFAULTS) -> float:
         value = default_of(name, preset)
     except ValueError:  # a setting of another version: without a default, its rows stand alone
         return math.nan
-    if value is None and name == "merge.loss":  # components are never merged
-        return 0.0
-    return float(value) if _is_number(value) else math.nan
+    return 0.0 if value is None and name == "merge.loss" else _number(value)  # 0: components are never merged
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def _number(value: Any) -> float:
+    """The value, NaN where it is no finite number."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return float(value) if is_number else math.nan
 
 
-def _value(row: Row, name: str) -> Any:
+def _value(row: Row, name: str) -> float:
     if name == COUNT and row.setting.anchor_count is None:
         return _COUNTS.get(row.setting.anchors, math.nan)
-    return row.setting.to_dict().get(name, default_value(name, row.setting.ufm_preset))
+    values = _changed(row)
+    return _number(values[name]) if name in values else default_value(name, row.setting.ufm_preset)
 
 
-def _changed(row: Row) -> list[str]:
-    """Names of the settings that a row changes, without the seed."""
-    return [name for name in row.setting.to_dict() if name != "seed"]
+def _changed(row: Row) -> dict[str, Any]:
+    """The settings that a row changes, without the seed."""
+    return {name: value for name, value in row.setting.to_dict().items() if name != "seed"}
 
 
 # ---- figures ----
@@ -157,22 +157,21 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
 
 
 def _draw_line(axes: Any, line: SweepLine, look: Look, quantity: names.Quantity) -> list[float]:
-    """Means over the values of a setting with their band; dashed without a band for reference. Returns the finite
-    values."""
+    """Means over the values of a setting with their band; dashed without a band for reference. Returns the means."""
     means = [(point.value, mean_of(point.records, quantity)) for point in line.points]
-    known = [(x, mean.value, mean.half) for x, mean in means if not math.isnan(mean.value)]
+    known = [(x, mean.value, mean.half) for x, mean in means if math.isfinite(mean.value)]
     if not known:
         return []
     x, y, half = np.array(known).T
     dashed: dict[str, Any] = {"color": look.colour, "linestyle": "--", "linewidth": 1.4, "label": look.name}
-    if line.method.fusion != ALONE and len(means) > 1:
+    if len(means) == 1:
+        axes.axhline(y[0], **dashed)
+    elif line.method.fusion == ALONE:
+        axes.plot(x, y, **dashed)
+    else:
         axes.plot(x, y, **look.line)
         axes.fill_between(x, y - half, y + half, color=look.colour, alpha=0.15, linewidth=0)
-    elif len(means) == 1:
-        axes.axhline(y[0], **dashed)
-    else:
-        axes.plot(x, y, **dashed)
-    return [value for value in y.tolist() if math.isfinite(value)]
+    return list(y.tolist())
 
 
 def _scale(axes: Any, values: Sequence[float]) -> None:

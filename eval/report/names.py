@@ -9,7 +9,7 @@ from typing import Any
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import PAPER
 
-LOWER, HIGHER = "lower", "higher"
+LOWER, HIGHER = "↓", "↑"  # is better
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Quantity:
     key: str  # of Record.figures, or "state.bytes_mean", "ms.network", "frames.done" for the others
     name: str
     decimals: int | None  # None = three significant digits
-    better: str | None = None  # "lower", "higher", or None where neither is
+    better: str = ""  # "↓", "↑", or "" where neither is
     unit: str = ""
     factor: float = 1.0  # by which the recorded value is multiplied to have that unit
 
@@ -31,28 +31,22 @@ class Quantity:
     @property
     def heading(self) -> str:
         """The label with an arrow the better way: "RMSE [m] ↓"."""
-        return f"{self.label}{ {LOWER: ' ↓', HIGHER: ' ↑', None: ''}[self.better] }"
+        return f"{self.label} {self.better}".strip()
 
 
-DELTA1 = Quantity("delta1", "δ₁", 3, HIGHER)
 NLL = Quantity("nll", "NLL", 2, LOWER)
 ECE_DELTA = Quantity("ece_delta", "ECE_δ", 3, LOWER)
 ECE_Q = Quantity("ece_q", "ECE_q", 3, LOWER)
-STATE = Quantity("state.bytes_mean", "state", None, None, "MB", 1e-6)
 SPEARMAN = Quantity("spearman", "Spearman", 2, HIGHER)
 AUSE = Quantity("ause_rmse", "AUSE", 3, LOWER, "m")
-UNCERTAINTY_MS = Quantity("ms.uncertainty", "uncertainty", 1, None, "ms")
-NETWORK_MS = Quantity("ms.network", "network", 1, None, "ms")
-# Shares of UfM*'s frames: without a segment; after the first, without a segment that met a component.
-NO_SEGMENT = Quantity("frames.without_segment", "no segment", 1, None, "%", 100.0)
-NO_MATCH = Quantity("frames.without_match", "no match", 1, None, "%", 100.0)
 
 # The cost of uncertainty, where it was measured.
 ENERGY = Quantity("energy_mj", "energy", None, LOWER, "mJ")
 MEMORY = Quantity("memory_mb", "memory", None, LOWER, "MB")
 
 # The paper's columns, and those that the field expects beside them.
-MAIN = (DELTA1, NLL, ECE_DELTA, ECE_Q, STATE)
+_STATE = Quantity("state.bytes_mean", "state", None, "", "MB", 1e-6)
+MAIN = (Quantity("delta1", "δ₁", 3, HIGHER), NLL, ECE_DELTA, ECE_Q, _STATE)
 EXTRA = (
     Quantity("delta1_ratio", "δ₁ (ratio)", 3, HIGHER),
     Quantity("abs_rel", "AbsRel", 3, LOWER),
@@ -61,22 +55,23 @@ EXTRA = (
     Quantity("aurg_rmse", "AURG", 3, HIGHER, "m"),
     SPEARMAN,
     Quantity("overconfidence", "overconfidence", 3),
-    Quantity("entropy", "entropy", 2, None, "nats"),
-    Quantity("left_out_share", "no depth", 1, None, "%", 100.0),
-    Quantity("nll_left_out_share", "no NLL", 1, None, "%", 100.0),
-    NO_SEGMENT,
-    NO_MATCH,
-    NETWORK_MS,
-    UNCERTAINTY_MS,
+    Quantity("entropy", "entropy", 2, "", "nats"),
+    Quantity("left_out_share", "no depth", 1, "", "%", 100.0),
+    Quantity("nll_left_out_share", "no NLL", 1, "", "%", 100.0),
+    # Of UfM*'s frames, those without a segment, and those after the first without a segment that met a component.
+    Quantity("frames.without_segment", "no segment", 1, "", "%", 100.0),
+    Quantity("frames.without_match", "no match", 1, "", "%", 100.0),
+    Quantity("ms.network", "network", 1, "", "ms"),
+    Quantity("ms.uncertainty", "uncertainty", 1, "", "ms"),
 )
 # The posterior as the mixture that it states; in the table where a row has one.
 MIXTURE = (
     Quantity("mixture_nll", "mixture: NLL", 2, LOWER),
     Quantity("mixture_ece_delta", "mixture: ECE_δ", 3, LOWER),
     Quantity("mixture_ece_q", "mixture: ECE_q", 3, LOWER),
-    Quantity("mixture_coverage", "mixture: within 3 σ", 1, None, "%", 100.0),
+    Quantity("mixture_coverage", "mixture: within 3 σ", 1, "", "%", 100.0),
 )
-OWN = "own"  # the group of figures of a user's metrics
+OWN = "own."  # before the figures of a user's metrics
 # Figures of which differences between rows are shown.
 DIFFERENCES = (NLL, ECE_DELTA, ECE_Q, AUSE, SPEARMAN)
 
@@ -129,16 +124,24 @@ _VALUES = {"corners": "tracked corners", "dense": "dense evidence", "truth": "gr
 
 def own_quantities(figures: Iterable[str]) -> list[Quantity]:
     """The columns of a user's metrics among the names of figures, each once."""
-    return [Quantity(key, key.partition(".")[2], 3) for key in dict.fromkeys(figures) if key.startswith(f"{OWN}.")]
+    return [Quantity(key, key.removeprefix(OWN), 3) for key in dict.fromkeys(figures) if key.startswith(OWN)]
 
 
 def setting_name(name: str) -> str:
     """A setting's name for people; the config's own where it has none."""
-    return SETTINGS.get(name, (name.rpartition(".")[2].replace("_", " "), ""))[0]
+    return SETTINGS[name][0] if name in SETTINGS else name.rpartition(".")[2].replace("_", " ")
 
 
-def setting_value(name: str, value: Any) -> str:
-    """A setting's value with its unit: "2°", ".5 m", "on"."""
+def setting_label(values: Mapping[str, Any]) -> str:
+    """A setting for people, "" for the default: "rotation noise 2°, images skipped 4"."""
+    shown = {name: value for name, value in values.items() if name != "seed" or value}
+    return ", ".join(
+        _WORDS.get((name, value)) or f"{setting_name(name)} {_with_unit(name, value)}" for name, value in shown.items()
+    )
+
+
+def _with_unit(name: str, value: Any) -> str:
+    """A setting's value with its unit: "2°", "0.5 m", "on"."""
     if isinstance(value, bool):
         return "on" if value else "off"
     unit = SETTINGS.get(name, ("", ""))[1]
@@ -146,25 +149,16 @@ def setting_value(name: str, value: Any) -> str:
     return f"{text}{unit}" if unit == "°" else f"{text} {unit}".strip()
 
 
-def setting_label(values: Mapping[str, Any]) -> str:
-    """A setting for people, "" for the default: "rotation noise 2°, images skipped 4"."""
-    shown = {name: value for name, value in values.items() if name != "seed" or value}
-    return ", ".join(
-        _WORDS.get((name, value)) or f"{setting_name(name)} {setting_value(name, value)}"
-        for name, value in shown.items()
-    )
-
-
 def row_labels(rows: Iterable[Row]) -> dict[Row, str]:
     """The labels of a table's rows: without the preprocessing that all of them share (:func:`shared_words`), and with
     "our defaults" where the same method stands there with the paper's settings as well."""
     listed = list(rows)
-    shared = len({row.setting.preprocess for row in listed}) == 1
+    shared = {"preprocess"} if len({row.setting.preprocess for row in listed}) == 1 else set()
     papers = {row.method for row in listed if row.setting.ufm_preset == PAPER}
     labels = {}
     for row in listed:
         ours = "our defaults" if row.method in papers and row.setting.ufm_preset != PAPER else ""
-        changed = {name: value for name, value in row.changed.items() if not (shared and name == "preprocess")}
+        changed = {name: value for name, value in row.changed.items() if name not in shared}
         labels[row] = row.title or ", ".join(filter(None, (row.name, ours, setting_label(changed))))
     return labels
 

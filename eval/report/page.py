@@ -26,22 +26,20 @@ TEMPLATES = Path(__file__).parent / "templates"
 QUALITY = 84
 # Kinds of figures, the first words of their files' names, by the part of the page in which they stand.
 CURVES, COST = ("calibration", "error", "entropy", "sweep"), ("latency",)
-_IDLE = ("data set", "row", "frames", "without a segment", "without a match")
 
 
 def write_page(
-    results: Results, figures: Sequence[Path], pictures: Sequence[Picture], undrawn: Mapping[str, str] | None = None
+    results: Results, figures: Sequence[Path], pictures: Sequence[Picture], undrawn: Mapping[str, str]
 ) -> Path:
-    """Write the report into the folder of the evaluation: tables, figures (SVG or PNG, whose names begin with their
-    kind), pictures with their words, and what is missing; its path.
+    """Write the report into the folder of the evaluation: tables, figures (SVG, whose names begin with their kind),
+    pictures with their words, and what is missing; its path.
 
     Raises:
         ValueError: a picture cannot be read.
         ImportError: Pillow or Jinja2 is missing.
     """
-    main, *further = overview(results).values()
+    main, *further = overview(results)
     cost = [] if results.efficiency is None else efficiency_tables(results.efficiency)
-    folder = results.out / "figures"
     made = {name: results.about.get(name) for name in ("networks", "settings", "versions", "machine")}
     digests = {f"{r.dataset}, {r.sequence}": r.provenance.get("sequence") for r in results.records}
     made["sequences (SHA-256)"] = {name: digest for name, digest in digests.items() if digest}
@@ -50,12 +48,12 @@ def write_page(
         networks=", ".join(dict.fromkeys(record.network for record in results.records)),
         main=main,
         curves=_figures(figures, CURVES),
-        pictures=[(picture, _embedded(folder / picture.file)) for picture in pictures],
+        pictures=[(picture, _embedded(results.out / "figures" / picture.file)) for picture in pictures],
         cost_figures=_figures(figures, COST),
         cost=[table for table in cost if not table.is_empty],
         further=[table for tables in further for table in tables.values()],
         sequences=[table for dataset in results.datasets for table in sequence_tables(results, dataset)],
-        limits=limits(results, undrawn or {}),
+        limits=limits(results, undrawn),
         min_sequences=MIN_SEQUENCES,
         command=command(results.about),
         made=json.dumps(made, indent=1, ensure_ascii=False, default=str),
@@ -92,14 +90,15 @@ def _figures(paths: Sequence[Path], kinds: Sequence[str]) -> list[tuple[str, str
 
 def _embedded(path: Path) -> str:
     """A data URI; a PNG becomes WebP, which is a fifth of it."""
-    if path.suffix == ".svg":
-        return f"data:image/svg+xml;base64,{base64.b64encode(path.read_bytes()).decode()}"
-    from PIL import Image
+    kind, content = "svg+xml", path.read_bytes()
+    if path.suffix == ".png":
+        from PIL import Image
 
-    with Image.open(path) as picture:
         buffer = io.BytesIO()
-        picture.convert("RGB").save(buffer, "WEBP", quality=QUALITY, method=4)
-    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+        with Image.open(path) as picture:
+            picture.convert("RGB").save(buffer, "WEBP", quality=QUALITY, method=4)
+        kind, content = "webp", buffer.getvalue()
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def limits(results: Results, undrawn: Mapping[str, str]) -> list[tuple[str, tuple[str, ...], list[tuple[str, ...]]]]:
@@ -121,10 +120,10 @@ def limits(results: Results, undrawn: Mapping[str, str]) -> list[tuple[str, tupl
             counted = [sum(f.get(key, 0) for f in of) for key in ("done", "without_segment", "without_match")]
             if any(counted[1:]):
                 idle.append((dataset, label, *map(str, counted)))
-    where = ("data set", "sequence")
+    where, uncompared = ("data set", "sequence"), ("data set", "row", "frames", "without a segment", "without a match")
     tables: list[tuple[str, tuple[str, ...], list[tuple[str, ...]]]] = [
         ("Sequences that failed", (*where, "reason"), [*results.failed]),
-        ("Frames in which UfM* compared no views", _IDLE, idle),
+        ("Frames in which UfM* compared no views", uncompared, idle),
         ("Frames that were skipped", (*where, "frames", "used", "reasons"), list(skipped)),
         ("Rows not evaluated yet", (*where, "rows"), [(*key, str(n)) for key, n in missing.items()]),
         ("Rows without a network", ("kind of network",), [(b,) for b in results.about.get("missing_bases") or ()]),

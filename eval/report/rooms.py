@@ -20,10 +20,9 @@ Array = NDArray[np.float64]
 SIGMAS = float(np.sqrt(3.0))
 # A ceiling hides the room from above: what lies so far above the highest camera is left out [m].
 HEADROOM = 0.3
-MOST_TIMES = 4
 ELEVATION = 35.0  # degrees
 _PATH = "#00a6d6"
-_STORED = ("mean_world", "covariance_world", "disagreement", "count", "T_world_cam")
+_STORED = ("mean_world", "covariance_world", "disagreement", "count", "T_world_cam", "path")
 _CELL, _LEFT, _TOP, _BOTTOM = 3.1, 0.1, 0.62, 0.66  # inches
 
 
@@ -37,7 +36,7 @@ class Snapshot:
     disagreement: Array  # [K] m [m^2]
     count: Array  # [K] views
     T_world_cam: Array  # [4, 4]
-    path: Array  # [n, 3] where the camera has been until then [m]; n may be 1
+    path: Array  # [n, 3] where the camera has been until then [m]
 
     @property
     def root(self) -> Array:
@@ -60,16 +59,8 @@ def find_rooms(folder: Path) -> dict[str, list[Snapshot]]:
         row, _, frame = file.stem.partition("_")
         if row and frame:
             stored = load_arrays(file, _STORED)
-            mean, covariance, disagreement, count, T = (stored[name].astype(np.float64) for name in _STORED)
-            path = stored.get("path", T[None, :3, 3]).astype(np.float64)
-            rooms.setdefault(row, []).append(Snapshot(frame, mean, covariance, disagreement, count, T, path))
+            rooms.setdefault(row, []).append(Snapshot(frame, *(stored[name].astype(np.float64) for name in _STORED)))
     return rooms
-
-
-def choose_times(snapshots: Sequence[Snapshot], most: int = MOST_TIMES) -> list[Snapshot]:
-    """Spread over the sequence, the last one included."""
-    chosen = np.linspace(0, len(snapshots) - 1, min(most, len(snapshots))).round().astype(int)
-    return [snapshots[i] for i in chosen]
 
 
 def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourScale:
@@ -79,9 +70,9 @@ def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourSc
     if not any(len(snapshot.mean) for snapshot in snapshots):
         raise ValueError("snapshots must hold at least one Gaussian")
     scale = ColourScale(*robust_range([snapshot.root for snapshot in snapshots], from_zero=True), ERROR_MAP)
-    view = oblique_view(np.stack([snapshot.T_world_cam for snapshot in snapshots]))
-    ceiling = max(float((snapshot.path @ view.vertical).max()) for snapshot in snapshots) + HEADROOM
-    shown = [snapshot.take(snapshot.mean @ view.vertical <= ceiling) for snapshot in snapshots]
+    view, vertical = oblique_view(np.stack([snapshot.T_world_cam for snapshot in snapshots]))
+    ceiling = max(float((snapshot.path @ vertical).max()) for snapshot in snapshots) + HEADROOM
+    shown = [snapshot.take(snapshot.mean @ vertical <= ceiling) for snapshot in snapshots]
     low, high = _limits(view, shown)
     height = _CELL * (high[1] - low[1]) / (high[0] - low[0])
     width = 2 * _LEFT + len(snapshots) * _CELL
@@ -98,10 +89,10 @@ def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourSc
     return scale
 
 
-def _draw_view(axes: Any, view: Projection, snapshot: Snapshot, scale: ColourScale) -> None:
+def _draw_view(axes: Any, view: Array, snapshot: Snapshot, scale: ColourScale) -> None:
     from matplotlib.collections import EllipseCollection
 
-    painted = snapshot.take(np.argsort(snapshot.mean @ view.towards, kind="stable"))  # from far to near
+    painted = snapshot.take(np.argsort(snapshot.mean @ view[2], kind="stable"))  # from far to near
     semi_axes, angle = project(view, painted.covariance)
     wide, narrow = 2 * semi_axes.T
     drawn = EllipseCollection(
@@ -109,25 +100,25 @@ def _draw_view(axes: Any, view: Projection, snapshot: Snapshot, scale: ColourSca
         np.maximum(narrow, 0.01),  # a plane seen edge-on would vanish
         angle,
         units="xy",
-        offsets=view.plane(painted.mean),
+        offsets=painted.mean @ view[:2].T,
         offset_transform=axes.transData,
         facecolors=np.concatenate([scale.rgb(painted.root) / 255, np.full((len(angle), 1), 0.85)], axis=1),
         edgecolors=(1, 1, 1, 0.55),
         linewidths=0.4,
     )
     axes.add_collection(drawn, autolim=False)
-    axes.plot(*view.plane(snapshot.path).T, color=_PATH, linewidth=1.3)
-    axes.plot(*view.plane(snapshot.T_world_cam[:3, 3]), "o", markersize=5, color=_PATH, markeredgecolor="white")
+    axes.plot(*view[:2] @ snapshot.path.T, color=_PATH, linewidth=1.3)
+    axes.plot(*view[:2] @ snapshot.T_world_cam[:3, 3], "o", markersize=5, color=_PATH, markeredgecolor="white")
 
 
-def _limits(view: Projection, snapshots: Sequence[Snapshot]) -> tuple[Array, Array]:
+def _limits(view: Array, snapshots: Sequence[Snapshot]) -> tuple[Array, Array]:
     """[2] lower and upper corner of what the picture shows, the same at all times [m].
 
     A Gaussian of a wrong depth can lie far outside; hence percentiles, and all of the camera's path.
     """
-    plane = np.concatenate([view.plane(snapshot.mean) for snapshot in snapshots])
-    reach = np.concatenate([project(view, s.covariance)[0][:, :1] for s in snapshots])
-    walked = np.concatenate([view.plane(snapshot.path) for snapshot in snapshots])
+    plane = np.concatenate([snapshot.mean for snapshot in snapshots]) @ view[:2].T
+    reach = np.concatenate([project(view, snapshot.covariance)[0][:, :1] for snapshot in snapshots])
+    walked = np.concatenate([snapshot.path for snapshot in snapshots]) @ view[:2].T
     low, high = np.percentile(plane - reach, 1, axis=0), np.percentile(plane + reach, 99, axis=0)
     low, high = np.minimum(low, walked.min(0)) - 0.2, np.maximum(high, walked.max(0)) + 0.2
     # Not flatter or taller than can be looked at.
@@ -141,47 +132,28 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-# ---- Gaussians seen from far away: an orthographic camera, and the ellipses that covariances leave on its image ----
+# ---- Gaussians seen from far away by an orthographic camera, and the ellipses that covariances leave on its image ----
 
 
-@dataclass(frozen=True, eq=False)
-class Projection:
-    """An orthographic camera, by the unit vectors [3] of the world that point right and up in its picture, and the
-    world's own up."""
-
-    right: Array
-    up: Array
-    vertical: Array
-
-    @property
-    def towards(self) -> Array:
-        """[3] unit vector from the scene to the viewer."""
-        return np.cross(self.right, self.up)
-
-    def plane(self, points: Array) -> Array:
-        """[..., 2] coordinates of world points [..., 3] in the picture [m]."""
-        return np.stack([points @ self.right, points @ self.up], axis=-1)
-
-
-def project(view: Projection, covariance: Array) -> tuple[Array, Array]:
-    """The ellipses of Gaussians of covariance [K, 3, 3] [m^2]: P Sigma P^T in the picture, P the view's two rows.
+def project(view: Array, covariance: Array) -> tuple[Array, Array]:
+    """The ellipses of Gaussians of covariance [K, 3, 3] [m^2] in the picture of a view [3, 3] (:func:`oblique_view`).
 
     Returns [K, 2] semi-axes of ``SIGMAS`` standard deviations, the longer first [m], and [K] the angle of the longer
-    one, from right towards up, in (-90, 90] [degrees].
+    one, from right towards up [degrees].
     """
-    P = np.stack([view.right, view.up])
-    flat = P @ covariance @ P.T
-    a, b, c = flat[:, 0, 0], (flat[:, 0, 1] + flat[:, 1, 0]) / 2, flat[:, 1, 1]
-    middle, spread = (a + c) / 2, np.hypot((a - c) / 2, b)
+    variances, axes = np.linalg.eigh(view[:2] @ covariance @ view[:2].T)
     # Rounding can leave the smaller eigenvalue of a line just below 0.
-    axes = SIGMAS * np.sqrt(np.maximum(np.stack([middle + spread, middle - spread], axis=-1), 0))
-    return axes, np.degrees(np.arctan2(2 * b, a - c) / 2)
+    semi_axes = SIGMAS * np.sqrt(np.maximum(variances[:, ::-1], 0))
+    return semi_axes, np.degrees(np.arctan2(axes[:, 1, 1], axes[:, 0, 1]))
 
 
-def oblique_view(T_world_cam: Array) -> Projection:
+def oblique_view(T_world_cam: Array) -> tuple[Array, Array]:
     """A view from behind the first of cameras [n, 4, 4], ``ELEVATION`` over the horizon.
 
     Data sets differ in which axis points up; a camera's own up (-y) is right on average.
+
+    Returns [3, 3] the unit vectors of the world that point right and up in the picture and towards the viewer, and [3]
+    the world's own up.
     """
     up = _unit(-T_world_cam[:, :3, 1].mean(0), np.array([0.0, 0.0, 1.0]))
     first = T_world_cam[0, :3, 2]
@@ -189,7 +161,8 @@ def oblique_view(T_world_cam: Array) -> Projection:
     fallback = np.eye(3)[np.argmin(np.abs(up))]
     forward = _unit(first - up * (first @ up), _unit(fallback - up * (fallback @ up), fallback))
     tilt = np.radians(ELEVATION)
-    return Projection(np.cross(forward, up), np.cos(tilt) * up + np.sin(tilt) * forward, up)
+    right, above = np.cross(forward, up), np.cos(tilt) * up + np.sin(tilt) * forward
+    return np.stack([right, above, np.cross(right, above)]), up
 
 
 def _unit(vector: Array, otherwise: Array) -> Array:

@@ -85,6 +85,13 @@ def name_lines(axes: Any) -> None:
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=TICK)
 
 
+def legend_below(figure: Any) -> None:
+    """The names of all lines, below the panels."""
+    named = {label: h for axes in figure.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    how: dict[str, Any] = {"ncols": len(named), "frameon": False, "fontsize": TICK}
+    figure.legend(list(named.values()), list(named), loc="outside lower center", **how)
+
+
 def save_figure(figure: Any, path: Path) -> None:
     """Write a figure, by its suffix (.svg or .png); the same figure gives the same bytes."""
     matplotlib = require_matplotlib()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
 
@@ -31,34 +31,18 @@ class Cell:
     remark: str = ""
 
     @classmethod
-    def of(cls, mean: Mean, decimals: int | None, *, signed: bool = False, remark: str = "") -> Cell:
-        """A mean with its interval, where there is one and it is at least .01 wide (of differences, any)."""
+    def of(cls, mean: Mean, quantity: Quantity, *, signed: bool = False) -> Cell:
+        """A mean with its interval, where there is one and it is at least .01 wide; of a difference (``signed``) any,
+        with "better" or "worse" where the interval leaves out 0."""
         if math.isnan(mean.value):
             return cls()
-        decimals = significant(mean.value) if decimals is None else decimals
+        decimals = significant(mean.value) if quantity.decimals is None else quantity.decimals
         wide = mean.half >= SMALL_INTERVAL or (signed and mean.half > 0)
+        remark = ""
+        if signed and quantity.better and abs(mean.value) > mean.half:
+            remark = "better" if (mean.value < 0) == (quantity.better == LOWER) else "worse"
         half = number(mean.half, decimals) if wide else ""
         return cls(number(mean.value, decimals, signed=signed), half, remark=remark)
-
-
-class Column(NamedTuple):
-    """A column's heading; neighbours of the same ``group`` share a heading above ("" = none)."""
-
-    group: str
-    name: str
-
-    @property
-    def label(self) -> str:
-        """The heading where there is none above: "Paper: NLL"."""
-        return f"{self.group}: {self.name}" if self.group else self.name
-
-
-class Line(NamedTuple):
-    """A row of a table: its block (rows that belong together), its label and its cells."""
-
-    block: int
-    label: str
-    cells: tuple[Cell, ...]
 
 
 @dataclass(frozen=True)
@@ -68,36 +52,47 @@ class Table:
     name: str  # of its files
     title: str
     first: str  # heading of the labels
-    columns: Sequence[Column]
-    lines: Sequence[Line]
+    # of Cell, by (block, label) and (group, heading): rows of a block belong together, neighbouring columns of a group
+    # share a heading above ("" = none)
+    cells: pd.DataFrame
     notes: Sequence[str] = ()
 
     @property
-    def blocks(self) -> Iterator[list[Line]]:
-        """The rows by block."""
-        return (list(lines) for _, lines in groupby(self.lines, key=lambda line: line.block))
+    def labels(self) -> list[str]:
+        """The labels of the rows."""
+        return [label for _, label in self.cells.index]
+
+    @property
+    def headings(self) -> list[str]:
+        """The headings of the columns in one line: "Paper: NLL"."""
+        return [f"{group}: {name}" if group else name for group, name in self.cells.columns]
 
     @property
     def groups(self) -> list[tuple[str, int]]:
         """Headings over neighbouring columns, and the number of columns below each; [] without any heading."""
-        spans = [(name, len(list(of))) for name, of in groupby(self.columns, key=lambda column: column.group)]
+        spans = [(name, len(list(of))) for name, of in groupby(group for group, _ in self.cells.columns)]
         return spans if any(name for name, _ in spans) else []
 
     @property
     def is_empty(self) -> bool:
-        """True if the table has no line, or only dashes."""
-        return not any(cell.value for line in self.lines for cell in line.cells)
+        """True if the table has no row, or only dashes."""
+        return not any(cell.value for cell in self.cells.to_numpy().flat)
 
 
-def number(value: float, decimals: int | None, *, signed: bool = False) -> str:
-    """A number as printed: never "-0.00", and large ones with an exponent; decimals None = three significant digits."""
+def frame_of(lines: Sequence[tuple[int, str, Sequence[Cell]]], columns: Sequence[tuple[str, str]]) -> pd.DataFrame:
+    """``Table.cells`` from the block, the label and the cells of each row, and the group and heading of each column."""
+    index = pd.MultiIndex.from_tuples([line[:2] for line in lines], names=("block", "label"))
+    heads = pd.MultiIndex.from_tuples(columns, names=("group", "heading"))
+    return pd.DataFrame([list(cells) for *_, cells in lines], index, heads, dtype=object)
+
+
+def number(value: float, decimals: int, *, signed: bool = False) -> str:
+    """A number as printed: never "-0.00", and large ones with an exponent."""
     sign = "+" if signed else ""
-    if decimals is None:
-        decimals = significant(value)
     if abs(value) >= 1e6:
         return f"{value:{sign}.2e}"
     text = f"{value:{sign}.{decimals}f}"
-    return text.replace("-", "+" if signed else "") if float(text) == 0 else text
+    return text.replace("-", sign) if float(text) == 0 else text
 
 
 def significant(value: float) -> int:
@@ -105,12 +100,10 @@ def significant(value: float) -> int:
     return max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
 
 
-def mark_best(cells: Sequence[Cell], quantity: Quantity | None) -> list[Cell]:
+def mark_best(cells: Sequence[Cell], quantity: Quantity) -> list[Cell]:
     """Bold where a cell prints the best value of its block; none where all print the same, or there is one alone."""
-    if quantity is None or quantity.better is None:
-        return list(cells)
     printed = [float(cell.value) for cell in cells if cell.value]
-    if len(set(printed)) < 2:
+    if not quantity.better or len(set(printed)) < 2:
         return list(cells)
     best = min(printed) if quantity.better == LOWER else max(printed)
     return [replace(cell, bold=bool(cell.value) and float(cell.value) == best) for cell in cells]
@@ -121,8 +114,9 @@ def mark_best(cells: Sequence[Cell], quantity: Quantity | None) -> list[Cell]:
 
 def markdown(table: Table) -> str:
     """The table under its title, with its notes below."""
-    rows = [[table.first, *(column.label for column in table.columns)], ["---", *("---:" for _ in table.columns)]]
-    rows += [[markdown_text(line.label), *map(_markdown_cell, line.cells)] for line in table.lines]
+    rows = [[table.first, *table.headings], ["---", *["---:"] * len(table.headings)]]
+    cells = table.cells.map(_markdown_cell).to_numpy().tolist()
+    rows += [[markdown_text(label), *line] for label, line in zip(table.labels, cells, strict=True)]
     body = "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
     notes = "\n".join(f"- {markdown_text(note)}" for note in table.notes)
     return "\n\n".join(filter(None, (f"### {markdown_text(table.title)}", body, notes))) + "\n"
@@ -139,9 +133,7 @@ def markdown_text(text: str) -> str:
 
 
 def _markdown_cell(cell: Cell) -> str:
-    if not cell.value:
-        return DASH
-    value = cell.value.replace("<", "&lt;")
+    value = cell.value.replace("<", "&lt;") or DASH
     value = f"**{value}**" if cell.bold else value
     value = f"{value} ± {cell.half}" if cell.half else value
     return f"{value} ({cell.remark})" if cell.remark else value
@@ -149,58 +141,48 @@ def _markdown_cell(cell: Cell) -> str:
 
 # ---- LaTeX ----
 
-_LATEX = {
+_LATEX = str.maketrans({
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", "–": "--", "°": r"$^\circ$", "²": "$^2$",
     "³": "$^3$", "₀": "$_0$", "₁": "$_1$", "α": r"$\alpha$", "δ": r"$\delta$", "η": r"$\eta$", "μ": r"$\mu$",
     "π": r"$\pi$", "σ": r"$\sigma$", "<": "$<$", ">": "$>$", "Δ": r"$\Delta$", "*": "$^*$",
     "↓": r"$\downarrow$", "↑": r"$\uparrow$", "×": r"$\times$",
-}  # fmt: skip
+})  # fmt: skip
 
 
 def latex(table: Table) -> str:
     """The table for booktabs, with title and notes as its caption."""
-    heads: Any = [(latex_text(column.group), _latex_name(column.name)) for column in table.columns]
-    heads = pd.MultiIndex.from_tuples(heads) if table.groups else [name for _, name in heads]
-    frame = pd.DataFrame(
-        [[_latex_cell(cell) for cell in line.cells] for line in table.lines],
-        index=[latex_text(line.label) for line in table.lines],
-        columns=heads,
-    )
-    frame.columns.names = [*[""] * (frame.columns.nlevels - 1), latex_text(table.first)]
-    caption = latex_text(" ".join([f"{table.title}.", *table.notes]))
+    frame = table.cells.map(_latex_cell)
+    frame.index = pd.Index([label.translate(_LATEX) for label in table.labels])
+    heads: Any = [(group.translate(_LATEX), _latex_heading(name)) for group, name in table.cells.columns]
+    frame.columns = pd.MultiIndex.from_tuples(heads) if table.groups else pd.Index([name for _, name in heads])
+    frame.columns.names = [*[""] * (frame.columns.nlevels - 1), table.first.translate(_LATEX)]
+    caption = " ".join([f"{table.title}.", *table.notes]).translate(_LATEX)
     label = "tab:" + re.sub(r"[^A-Za-z0-9-]+", "-", table.name)
     how = {"caption": caption, "label": label, "position": "t", "multicolumn_format": "c"}
-    lines = frame.to_latex(column_format="l" + "c" * len(table.columns), **how).splitlines()
+    lines = frame.to_latex(column_format="l" + "c" * len(heads), **how).splitlines()
     lines.insert(1, r"\centering")
     at = lines.index(r"\midrule") + 1
-    for block in [*table.blocks][:-1]:
-        at += len(block) + 1
-        lines.insert(at - 1, r"\addlinespace")
+    blocks = [block for block, _ in table.cells.index]
+    for n in reversed(range(1, len(blocks))):  # a space between blocks
+        if blocks[n] != blocks[n - 1]:
+            lines.insert(at + n, r"\addlinespace")
     return "\n".join([r"% needs \usepackage{booktabs}", *lines, ""])
 
 
-def latex_text(text: str) -> str:
-    """Plain text as LaTeX; "UfM*" gets its star as an exponent."""
-    return "".join(_LATEX.get(character, character) for character in text)
-
-
-def _latex_name(name: str) -> str:
+def _latex_heading(name: str) -> str:
     """A heading as LaTeX: the letter behind "_" becomes an index."""
     first, *rest = name.split("_")
-    return latex_text(first) + "".join(
-        f"$_{{{latex_text(part[0]).strip('$')}}}${latex_text(part[1:])}" for part in rest
-    )
+    indices = (f"$_{{{part[0].translate(_LATEX).strip('$')}}}${part[1:].translate(_LATEX)}" for part in rest)
+    return first.translate(_LATEX) + "".join(indices)
 
 
 def _latex_cell(cell: Cell) -> str:
-    if not cell.value:
-        return "--"
-    if cell.value[0].isalpha():  # words instead of a number
-        return latex_text(cell.value)
+    if not cell.value or cell.value[0].isalpha():  # words instead of a number
+        return (cell.value or DASH).translate(_LATEX)
     value = rf"\mathbf{{{cell.value}}}" if cell.bold else cell.value
     text = f"${value} \\pm {cell.half}$" if cell.half else f"${value}$"
-    return f"{text} ({latex_text(cell.remark)})" if cell.remark else text
+    return f"{text} ({cell.remark.translate(_LATEX)})" if cell.remark else text
 
 
 # ---- CSV ----
@@ -210,13 +192,11 @@ def table_csv(tables: Iterable[Table]) -> str:
     """Tables below each other: title, label, and for each column its value and, where any has one, its half-width."""
     frames = []
     for table in tables:
-        columns: dict[str, list[str]] = {
-            "table": [table.title] * len(table.lines), table.first: [line.label for line in table.lines],
-        }  # fmt: skip
-        for column, cells in zip(table.columns, zip(*(line.cells for line in table.lines), strict=True), strict=True):
-            columns[column.label] = [cell.value for cell in cells]
+        columns: dict[str, Any] = {"table": table.title, table.first: table.labels}
+        for heading, cells in zip(table.headings, table.cells.to_numpy().T, strict=True):
+            columns[heading] = [cell.value for cell in cells]
             if any(cell.half for cell in cells):
-                columns[f"{column.label} ±"] = [cell.half for cell in cells]
+                columns[f"{heading} ±"] = [cell.half for cell in cells]
         frames.append(pd.DataFrame(columns, dtype=object))
     return pd.concat(frames).map(csv_text).to_csv(index=False, lineterminator="\n")
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
 
@@ -14,13 +15,10 @@ from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.efficiency import efficiency_tables
 from ufmstar_torch.eval.report.means import (
     MIN_SEQUENCES,
-    Mean,
     difference,
-    has_variance,
     mean_of,
     mean_over,
-    references,
-    value_of,
+    reference_row,
 )
 from ufmstar_torch.eval.report.names import (
     DIFFERENCES,
@@ -30,83 +28,140 @@ from ufmstar_torch.eval.report.names import (
     MEMORY,
     MIXTURE,
     Quantity,
+    count,
     own_quantities,
     row_labels,
     shared_words,
 )
-from ufmstar_torch.eval.report.paper import PaperTable, paper_table_of
-from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, csv_text, latex, mark_best, markdown, table_csv
+from ufmstar_torch.eval.report.paper import paper_table_of
+from ufmstar_torch.eval.report.table import Cell, Table, csv_text, frame_of, latex, mark_best, markdown, table_csv
 from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.eval.suite.record import Record
 
-METHOD = "Method"
+OURS, PAPER = "Ours", "Paper"
 _PAPER_COLUMNS = {quantity.key: quantity for quantity in (*MAIN, ENERGY, MEMORY)}
-_REMARKS = {True: "better", False: "worse", None: ""}
+_SEQUENCES = Quantity("", "sequences", 0)
+Records = Mapping[Row, Sequence[Record]]
+# Cells by row, by the heading above the column ("" = none) and its quantity.
+Columns = dict[tuple[str, Quantity], dict[Row, Cell]]
 
 
 def main_table(results: Results, dataset: str | None = None) -> Table:
     """The paper's columns, over the sequences of a data set or (None) of all; where the suite is the paper's, with the
-    paper's own figures beside ours."""
-    return _means(results, dataset, MAIN, "main", paper_table_of(results.suite))
+    paper's own figures beside ours, and energy and memory where they were measured."""
+    records, quoted, efficiency = _records(results, dataset), paper_table_of(results.suite), results.efficiency
+    group = OURS if quoted else ""
+    own = own_quantities(key for record in results.records for key in record.figures)
+    columns, notes = _means(records, [*MAIN, *own], group), _notes(results, records)
+    costs = _costs(efficiency, records, group) if efficiency else {}
+    if efficiency and any(cell.value for cells in costs.values() for cell in cells.values()):
+        columns |= costs
+        notes.append(_cost_note(efficiency))
+    if quoted:
+        theirs = {row: quoted.rows.get(row.method.name, {}) for row in plain_rows(records)}
+        for key in quoted.columns:
+            quantity = replace(_PAPER_COLUMNS[key], better="")
+            columns[PAPER, quantity] = {row: cells[key] for row, cells in theirs.items() if key in cells}
+        notes.append(f"The paper's own figures are of {quoted.network} on {quoted.measured_on}.")
+    return _table("main", f"{results.title}, {_where(results, dataset)}", records, columns, notes)
 
 
 def extra_table(results: Results, dataset: str | None = None) -> Table:
     """Figures beyond the paper's tables: errors in metres, ranking, pixels without a figure, times."""
+    records = _records(results, dataset)
     mixture = MIXTURE if any(MIXTURE[0].key in record.figures for record in results.records) else ()
-    return _means(results, dataset, (*EXTRA, *mixture), "extra")
+    columns, notes = _means(records, (*EXTRA, *mixture)), _notes(results, records)
+    return _table("extra", f"{results.title}, {_where(results, dataset)}", records, columns, notes)
 
 
 def sequence_tables(results: Results, dataset: str) -> list[Table]:
     """The paper's columns for each sequence of a data set: no intervals, since it is one."""
     tables = []
-    for name, sequence in results.sequences(dataset):
-        records = {row: listed for row in results.rows if (listed := results.of(row, name, sequence))}
-        counts = (value_of(listed[0], "frames.done") for listed in records.values())
-        frames = max((int(count) for count in counts if count == count), default=0)
-        title = f"{name}, {sequence}" + (f": {frames} frames" if frames else "")
-        tables.append(_table(f"{name}-{sequence}", title, records, _figures(records, MAIN)))
+    for _, sequence in results.sequences(dataset):
+        records = _records(results, dataset, sequence)
+        frames = max(int(listed[0].frames.get("done", 0)) for listed in records.values())
+        title = f"{dataset}, {sequence}" + (f": {frames} frames" if frames else "")
+        tables.append(_table(f"{dataset}-{sequence}", title, records, _means(records, MAIN)))
     return tables
 
 
 def difference_table(results: Results, dataset: str | None = None) -> Table:
-    """Row less reference, in pairs on the same sequences; a remark where the interval leaves out 0."""
+    """Rows less UfM* of the same base, in pairs on the same sequences; a remark where the interval leaves out 0."""
     lines, labels = [], row_labels(results.rows)
-    for row in sorted(results.rows, key=lambda row: results.bases.index(row.method.base)):
-        listed = results.of(row, dataset)
-        for reference in references(results, row) if has_variance(listed) else ():
-            means = [difference(listed, results.of(reference, dataset), q) for q in DIFFERENCES]
-            if count := max(mean.sequences for mean in means):
-                figures = [
-                    Cell.of(mean, q.decimals, signed=True, remark=_REMARKS[mean.better(q)])
-                    for mean, q in zip(means, DIFFERENCES, strict=True)
-                ]
-                block = results.bases.index(row.method.base)
-                lines.append(Line(block, f"{labels[row]} – {labels[reference]}", (Cell(str(count)), *figures)))
-    columns = [Column("", "sequences"), *(Column("", f"Δ {q.heading}") for q in DIFFERENCES)]
+    for block, base in enumerate(results.bases):
+        ours = reference_row(results, base)
+        if ours is None:
+            continue
+        for row in (row for row in results.rows if row.method.base == base and row != ours):
+            means = {q: difference(results.of(row, dataset), results.of(ours, dataset), q) for q in DIFFERENCES}
+            if pairs := max(mean.sequences for mean in means.values()):
+                cells = (Cell.of(mean, q, signed=True) for q, mean in means.items())
+                lines.append((block, f"{labels[row]} – {labels[ours]}", (Cell(str(pairs)), *cells)))
+    columns = [("", "sequences"), *(("", f"Δ {q.heading}") for q in DIFFERENCES)]
     note = (
-        "Mean over sequences of row – reference on the same sequence, with its 95 % confidence interval (from "
+        "Mean over sequences of row – UfM* on the same sequence, with its 95 % confidence interval (from "
         f"{MIN_SEQUENCES} sequences on); better and worse: beyond the interval."
     )
     title = f"{results.title}, paired differences, {_where(results, dataset)}"
-    return Table("differences", title, "Row – reference", columns, lines, (note,))
+    return Table("differences", title, "Row – UfM*", frame_of(lines, columns), (note,))
 
 
-class _Figures(NamedTuple):
-    """A column: its heading, its cells by row, and the figure by which the best of a block is marked."""
-
-    head: Column
-    cells: Mapping[Row, Cell]
-    quantity: Quantity | None = None
+def _records(results: Results, dataset: str | None, sequence: str | None = None) -> Records:
+    return {row: listed for row in results.rows if (listed := results.of(row, dataset, sequence))}
 
 
-def _means(
-    results: Results, dataset: str | None, quantities: Sequence[Quantity], name: str, quoted: PaperTable | None = None
-) -> Table:
-    """A table of means over the sequences of one data set, or of all; the paper's columns last."""
-    records = {row: listed for row in results.rows if (listed := results.of(row, dataset))}
-    group = "Ours" if quoted else ""
-    own = own_quantities(key for r in results.records for key in r.figures) if name == "main" else []
-    columns = _figures(records, [*quantities, *own], group)
+def _means(records: Records, quantities: Iterable[Quantity], group: str = "") -> Columns:
+    """A column for each quantity, of the means over the sequences."""
+    return {(group, q): {row: Cell.of(mean_of(listed, q), q) for row, listed in records.items()} for q in quantities}
+
+
+def _costs(efficiency: Mapping[str, Any], records: Records, group: str) -> Columns:
+    """Energy and memory of the rows' uncertainty: energy over the sequences that were measured, memory over all of
+    them; dashes where nothing was measured."""
+    measured = {line["row"]: line for line in efficiency.get("rows", ())}
+    energy, memory = {}, {}
+    for row, listed in records.items():
+        if row.label in measured:
+            where = {(record.dataset, record.sequence) for record in listed}
+            spent = [one for one in efficiency.get("sequences", ()) if (one["dataset"], one["sequence"]) in where]
+            joules = mean_over(v for one in spent if (v := one["energy_mj"].get(row.label)) is not None)
+            network = measured[row.label]["memory"].get("network_uncertainty_bytes")
+            sizes = () if network is None else (network + (r.state.get("bytes_mean") or 0.0) for r in listed)
+            energy[row] = Cell.of(joules, ENERGY)
+            memory[row] = Cell.of(mean_over(1e-6 * size for size in sizes), MEMORY)
+    return {(group, ENERGY): energy, (group, MEMORY): memory}
+
+
+def _table(name: str, title: str, records: Records, columns: Columns, notes: Sequence[str] = ()) -> Table:
+    """Rows by base, the best of each in bold unless rows are of different sequences; one block where every base has a
+    single row, as in table 4."""
+    alike = len({frozenset((r.dataset, r.sequence) for r in listed) for listed in records.values()}) == 1
+    if not alike:
+        group = next(iter(columns))[0]
+        columns = {(group, _SEQUENCES): {row: Cell(str(len(listed))) for row, listed in records.items()}} | columns
+        notes = [*notes, "The rows are means over different sequences, so none is marked as the best."]
+    labels = row_labels(records)
+    bases = [row.method.base for row in labels]
+    together = len(set(bases)) == len(bases)
+    lines = []
+    for block, (_, of_base) in enumerate(groupby(labels, key=lambda row: None if together else row.method.base)):
+        rows = list(of_base)
+        by_column = [[cells.get(row, Cell()) for row in rows] for cells in columns.values()]
+        if alike:
+            by_column = [mark_best(cells, q) for (_, q), cells in zip(columns, by_column, strict=True)]
+        lines += [(block, labels[row], cells) for row, *cells in zip(rows, *by_column, strict=True)]
+    return Table(name, title, "Method", frame_of(lines, [(group, q.heading) for group, q in columns]), notes)
+
+
+def _where(results: Results, dataset: str | None) -> str:
+    sequences = count(len(results.sequences(dataset)), "sequence")
+    if dataset is not None or len(results.datasets) == 1:
+        return f"{sequences} of {dataset or results.datasets[0]}"
+    return f"{sequences} of {len(results.datasets)} data sets ({', '.join(results.datasets)})"
+
+
+def _notes(results: Results, records: Records) -> list[str]:
+    """Networks, preparation of the images and intervals."""
     networks: dict[str, list[str]] = {}
     for base in results.bases:
         networks.setdefault(results.network(base) or "", []).append(base)
@@ -114,80 +169,12 @@ def _means(
     notes = [f"Network: {next(iter(networks))}." if len(networks) == 1 else f"Networks: {several}."]
     if words := shared_words(records):
         notes.append(f"Images of all rows: {words}, resized to the networks' input.")
-    notes.append(_interval_note(max(map(len, records.values()))))
-    costs = _costs(results.efficiency, records, group) if name == "main" and results.efficiency else []
-    if any(cell.value for column in costs for cell in column.cells.values()):
-        columns += costs
-        notes.append(_cost_note(results.efficiency or {}))
-    if len({frozenset((r.dataset, r.sequence) for r in listed) for listed in records.values()}) > 1:
-        counts = {row: Cell(str(len(listed))) for row, listed in records.items()}
-        columns = [_Figures(Column(group, "sequences"), counts), *(c._replace(quantity=None) for c in columns)]
-        notes.append("The rows are means over different sequences, so none is marked as the best.")
-    if quoted:
-        theirs = {row: quoted.rows.get(row.method.name, {}) for row in plain_rows(records)}
-        for key in quoted.columns:
-            cells = {row: cells[key] for row, cells in theirs.items() if key in cells}
-            columns.append(_Figures(Column("Paper", _PAPER_COLUMNS[key].label), cells))
-        notes.append(f"The paper's own figures are of {quoted.network} on {quoted.measured_on}.")
-    return _table(name, f"{results.title}, {_where(results, dataset)}", records, columns, notes)
-
-
-def _figures(
-    records: Mapping[Row, Sequence[Record]], quantities: Sequence[Quantity], group: str = ""
-) -> list[_Figures]:
-    return [_column(q, group, {row: mean_of(listed, q) for row, listed in records.items()}) for q in quantities]
-
-
-def _column(quantity: Quantity, group: str, means: Mapping[Row, Mean]) -> _Figures:
-    cells = {row: Cell.of(mean, quantity.decimals) for row, mean in means.items()}
-    return _Figures(Column(group, quantity.heading), cells, quantity)
-
-
-def _costs(efficiency: Mapping[str, Any], records: Mapping[Row, Sequence[Record]], group: str) -> list[_Figures]:
-    """Energy and memory of the rows' uncertainty: energy over the sequences that were measured, memory over all of
-    them; dashes where nothing was measured."""
-    measured_rows = {line["row"]: line for line in efficiency.get("rows", ())}
-    energy, memory = {}, {}
-    for row, listed in records.items():
-        if row.label in measured_rows:
-            where = {(record.dataset, record.sequence) for record in listed}
-            measured = (one for one in efficiency.get("sequences", ()) if (one["dataset"], one["sequence"]) in where)
-            energy[row] = mean_over(v for one in measured if (v := one["energy_mj"].get(row.label)) is not None)
-            network = measured_rows[row.label]["memory"].get("network_uncertainty_bytes")
-            sizes = () if network is None else (network + (r.state.get("bytes_mean") or 0.0) for r in listed)
-            memory[row] = mean_over(1e-6 * size for size in sizes)
-    return [_column(ENERGY, group, energy), _column(MEMORY, group, memory)]
-
-
-def _table(name: str, title: str, rows: Iterable[Row], columns: Sequence[_Figures], notes: Sequence[str] = ()) -> Table:
-    """Rows by base, the best of each in bold; one block where every base has a single row, as in table 4."""
-    labels = row_labels(rows)
-    bases = [row.method.base for row in labels]
-    together = len(set(bases)) == len(bases)
-    lines = []
-    for block, (_, group) in enumerate(groupby(labels, key=lambda row: None if together else row.method.base)):
-        of_block = list(group)
-        marked = [mark_best([c.cells.get(row, Cell()) for row in of_block], c.quantity) for c in columns]
-        for row, cells in zip(of_block, zip(*marked, strict=True), strict=True):
-            lines.append(Line(block, labels[row], cells))
-    return Table(name, title, METHOD, [column.head for column in columns], lines, notes)
-
-
-def _where(results: Results, dataset: str | None) -> str:
-    count = len(results.sequences(dataset))
-    sequences = f"{count} sequence{'s' if count > 1 else ''}"
-    if dataset is not None or len(results.datasets) == 1:
-        return f"{sequences} of {dataset or results.datasets[0]}"
-    return f"{sequences} of {len(results.datasets)} data sets ({', '.join(results.datasets)})"
-
-
-def _interval_note(most: int) -> str:
+    most = max(map(len, records.values()))
     if most < MIN_SEQUENCES:
-        number = "One sequence" if most == 1 else f"{most} sequences, fewer than {MIN_SEQUENCES}"
-        return f"{number}: no confidence intervals."
-    return (
-        "Means over sequences, each counting the same, with 95 % confidence intervals (those below 0.01 are left out)."
-    )
+        few = "One sequence" if most == 1 else f"{most} sequences, fewer than {MIN_SEQUENCES}"
+        return [*notes, f"{few}: no confidence intervals."]
+    intervals = "with 95 % confidence intervals (those below 0.01 are left out)"
+    return [*notes, f"Means over sequences, each counting the same, {intervals}."]
 
 
 def _cost_note(efficiency: Mapping[str, Any]) -> str:
@@ -205,7 +192,7 @@ def write_tables(results: Results) -> list[Path]:
     """Write ``tables/NAME.md``, ``.tex`` and ``.csv``: those of :func:`overview`, ``sequences-DATASET`` for single
     sequences, and ``efficiency`` with the paper's table 2 below ours where it was measured; their paths."""
     files: dict[str, list[Table]] = {}
-    for tables in overview(results).values():
+    for tables in overview(results):
         for dataset, table in tables.items():
             files[table.name if dataset is None else f"{table.name}-{dataset}"] = [table]
     for dataset in results.datasets:
@@ -226,13 +213,12 @@ def write_tables(results: Results) -> list[Path]:
     return written
 
 
-def overview(results: Results) -> dict[str, dict[str | None, Table]]:
-    """The main table, paired differences and further figures by title: over all sequences (None) and, where there are
+def overview(results: Results) -> list[dict[str | None, Table]]:
+    """The main table, paired differences and further figures: each over all sequences (None) and, where there are
     several data sets, over those of each, as far as they are not empty."""
-    each = results.datasets if len(results.datasets) > 1 else ()
-    makers = {"Main table": main_table, "Paired differences": difference_table, "Further figures": extra_table}
-    made = {title: {over: make(results, over) for over in (None, *each)} for title, make in makers.items()}
-    return {title: {k: table for k, table in tables.items() if not table.is_empty} for title, tables in made.items()}
+    over = (None, *(results.datasets if len(results.datasets) > 1 else ()))
+    made = [{d: make(results, d) for d in over} for make in (main_table, difference_table, extra_table)]
+    return [{d: table for d, table in tables.items() if not table.is_empty} for tables in made]
 
 
 def write_tidy(results: Results) -> Path:
@@ -243,11 +229,7 @@ def write_tidy(results: Results) -> Path:
         names = ("suite", "dataset", "sequence", "network", "method")
         about = {name: getattr(record, name) for name in names} | {"figure": "", "value": None} | dict(record.setting)
         plain = {name: csv_text(value) if isinstance(value, str) else value for name, value in about.items()}
-        groups = {f"{name}.": getattr(record, name) for name in ("frames", "state", "ms")}
-        figures = dict(record.figures)
-        for group, values in groups.items():
-            figures |= {f"{group}{key}": value for key, value in values.items() if isinstance(value, int | float)}
-        lines += [{**plain, "figure": csv_text(key), "value": value} for key, value in figures.items()]
+        lines += [{**plain, "figure": csv_text(key), "value": value} for key, value in record.values.items()]
     table = pd.DataFrame(lines, dtype=object).to_csv(index=False, lineterminator="\n")
     return _write_text(results.out / "results.csv", table)
 

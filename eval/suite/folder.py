@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FAILED, CACHE = "failed.json", "cache"
 # Files of a report; --overwrite removes them.
 _REPORT: tuple[str, ...] = ("efficiency.json", "results.csv", "report.html")
-_REPORT += ("tables/*.md", "tables/*.tex", "figures/*.png", "figures/*.svg", "figures/*.json")
+_REPORT += ("tables/*.md", "tables/*.tex", "tables/*.csv", "figures/*.png", "figures/*.svg", "figures/*.json")
 _OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz", "room/*.npz")
 
 

@@ -45,6 +45,12 @@ class Record:
         """Its row of the table. Raises ValueError: there is no such row."""
         return row_from({"method": self.method, "setting": self.setting})
 
+    @cached_property
+    def values(self) -> dict[str, float | None]:
+        """All its numbers by name: the figures, "frames.done", "state.bytes_mean", "ms.network" and the like."""
+        counts = {f"{group}.{key}": v for group in ("frames", "state", "ms") for key, v in getattr(self, group).items()}
+        return {**self.figures, **{name: v for name, v in counts.items() if isinstance(v, int | float)}}
+
     def save(self, path: Path) -> None:
         """Write it as JSON, whole or not at all."""
         write_json_atomic(path, {"format": FORMAT, **asdict(self)})
