@@ -21,7 +21,6 @@ from ufmstar_torch.eval.bench.networks import (
     weight_bytes,
 )
 from ufmstar_torch.eval.bench.parts import MultiviewStep
-from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
@@ -39,9 +38,9 @@ def step_memory(name, size, K):
     """The bytes that the table counts for the multiview step of a row after one frame."""
     step = MultiviewStep(Row(Method.parse(name)), torch.device("cpu"))
     depth, variance, K = torch.full((1, *size), 2.0), torch.full((1, *size), 0.01), torch.tensor([K]).double()
-    prediction = DepthPrediction(depth, aleatoric_variance=variance)
+    prediction = DepthPrediction(depth, aleatoric_variance=variance, intrinsics=K)
     frame = Frame(0, "0", None, None, np.eye(4), K[0].numpy())
-    step(None, frame, Predicted(prediction, K), first=True)
+    step(None, frame, prediction, first=True)
     return step.memory()
 
 

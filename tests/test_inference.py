@@ -63,7 +63,7 @@ def frame(height: int = 60, width: int = 80) -> Frame:
 
 def predicted(model: str, file: Path, inference: Inference) -> tuple[Tensor, dict[str, Any]]:
     source = network_source(model, [file], inference=inference)
-    return source.one(frame(), 0).maps.depth[0], {**source.runtime, "identity": source.identity}
+    return source.one(frame(), 0).depth[0], {**source.runtime, "identity": source.identity}
 
 
 def test_onnx_weights_run_in_onnx_runtime_and_agree_with_torch(weights: Path) -> None:

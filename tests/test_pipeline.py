@@ -117,7 +117,7 @@ def test_the_preprocessed_intrinsics_reach_the_networks_that_take_them(mode):
     source = NetworkSource(NetworksInTurn(ByFocal(), preprocess=half), torch.device("cpu"), {})
     picture = (x[0] * 255).byte()
     frame = Frame(0, "0", picture.permute(1, 2, 0).numpy(), None, POSES[0].numpy(), K.numpy())
-    depth = source.one(frame, 0).maps.depth
+    depth = source.one(frame, 0).depth
     torch.testing.assert_close(depth.reshape(H // 2, W // 2), ByFocal()(*half(picture[None], K[None].float())).depth[0])
 
 

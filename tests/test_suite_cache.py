@@ -11,7 +11,7 @@ import torch
 from layouts import truncate, write_generic, write_image
 from tiny_suite import CPU, base_network, evaluate, row, same
 
-from ufmstar_torch.eval.engine.predictions import CacheError, Predicted, PredictionCache, frame_digest, sequence_digest
+from ufmstar_torch.eval.engine.predictions import CacheError, PredictionCache, frame_digest, sequence_digest
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -33,7 +33,7 @@ def maps(seed=0):
     depth, a, e = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(seed)).unbind()
     depth[0, 0], a[1, 1], e[2, 2] = torch.nan, torch.inf, -0.0
     K = torch.arange(9.0, dtype=torch.float64).reshape(1, 3, 3) / 7
-    return Predicted(DepthPrediction(depth[None], a[None], e[None]), K)
+    return DepthPrediction(depth[None], a[None], e[None], intrinsics=K)
 
 
 class Counted(PredictionCache):
@@ -51,13 +51,13 @@ class Counted(PredictionCache):
 @pytest.mark.parametrize("left_out", [(), ("aleatoric_variance",), ("aleatoric_variance", "epistemic_variance")])
 def test_what_is_stored_is_read_bit_for_bit(tmp_path, left_out):
     cache, whole = Counted(tmp_path / "new" / "cache"), maps()
-    written = whole._replace(maps=replace(whole.maps, **dict.fromkeys(left_out)))
+    written = replace(whole, **dict.fromkeys(left_out))
     assert cache.load(PATH, CONTENT, CPU) is None
     cache.store(PATH, CONTENT, written)
     read = cache.load(PATH, CONTENT, CPU)
     assert (cache.hits, cache.misses) == (1, 1)
     for name in ("depth", "aleatoric_variance", "epistemic_variance"):
-        one, other = getattr(read.maps, name), getattr(written.maps, name)
+        one, other = getattr(read, name), getattr(written, name)
         assert one is other is None or torch.equal(one.view(torch.int32), other.view(torch.int32))
     assert torch.equal(read.intrinsics, written.intrinsics)
     assert read.ms is None

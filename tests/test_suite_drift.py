@@ -15,7 +15,6 @@ from tiny_suite import row
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.judge import references
 from ufmstar_torch.eval.engine.maps import own_depth
-from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting, default_of, setting_from
@@ -141,7 +140,7 @@ class Poses:
 
     def update(self, predicted, T_world_cam, anchors=None):
         self.given.append(T_world_cam.numpy())
-        depth = predicted.maps.depth
+        depth = predicted.depth
         return {"depth": depth, "variance": None, "valid": depth > 0}
 
 
@@ -149,7 +148,7 @@ def test_a_row_sees_drift_and_noise_on_top_of_it():
     setting = Setting(rotation_drift=0.5, translation_drift=0.02, translation_noise=0.1, seed=3)
     poses = Poses()
     runner = RowRunner("drift", own_depth(), poses, setting=setting)
-    one = Predicted(DepthPrediction(torch.ones(1, 2, 2)), torch.eye(3, dtype=torch.float64)[None])
+    one = DepthPrediction(torch.ones(1, 2, 2), intrinsics=torch.eye(3, dtype=torch.float64)[None])
     for i in range(0, 20, 4):
         frame = Frame(i, str(i), None, None, WALK[i], np.eye(3))
         result = runner.update(frame, one, None)

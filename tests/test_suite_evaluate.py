@@ -22,7 +22,6 @@ from ufmstar_torch.models import load_trained
 from ufmstar_torch.models.dropout import set_sampling
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.networks_in_turn import combine
-from ufmstar_torch.prediction import DepthPrediction
 
 SKIP = UfMStarConfig(on_bad_frame="skip")
 FRAMES = 5
@@ -155,15 +154,15 @@ def test_samples_depend_on_the_frame_and_their_number_alone(network_files, netwo
     network = networks["mc_dropout"]
     frames = [sequence[i] for i in range(3)]
     requested = [(2, 1), (0, 0), (1, 2), (0, 1), (2, 0), (2, 1), (0, 0)]
-    first = {key: network.one(frames[key[0]], key[1]).maps.depth for key in requested}
+    first = {key: network.one(frames[key[0]], key[1]).depth for key in requested}
     other = base_network(network_files["mc_dropout"], samples=3)
     for key in reversed(requested):
-        assert torch.equal(other.one(frames[key[0]], key[1]).maps.depth, first[key])
+        assert torch.equal(other.one(frames[key[0]], key[1]).depth, first[key])
     assert not torch.equal(first[0, 0], first[0, 1])
     of_run = network_source("trained", [network_files["mc_dropout"].partition(":")[2]], mode="full", samples=3)
-    assert torch.equal(of_run.one(frames[2], 1).maps.depth, first[2, 1]), "ufmstar run draws the same"
+    assert torch.equal(of_run.one(frames[2], 1).depth, first[2, 1]), "ufmstar run draws the same"
     same_image = replace(frames[0], index=1)
-    assert not torch.equal(network.one(same_image, 0).maps.depth, first[0, 0]), "each frame has its own draw"
+    assert not torch.equal(network.one(same_image, 0).depth, first[0, 0]), "each frame has its own draw"
 
 
 def test_mc_dropout_equals_seeded_passes_by_hand(network_files, networks, sequence):
@@ -344,9 +343,9 @@ def test_pixels_that_a_row_leaves_out_are_counted(sequence):
 
     def with_holes(frame, n):
         predicted = whole(frame, n)
-        depth = predicted.maps.depth.clone()
+        depth = predicted.depth.clone()
         depth[:, :12], depth[:, 12:24] = torch.nan, 0.0
-        return predicted._replace(maps=DepthPrediction(depth))
+        return replace(predicted, depth=depth)
 
     holes.one = with_holes
     outcome = evaluate(sequence, [row("DepthOnly"), row("UfM*-DepthOnly")], {"depth_only": holes})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +20,6 @@ import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import Gaussians, ufm_star_config
 from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences.frame import Frame
@@ -203,8 +203,8 @@ def test_a_in_h_agrees_with_the_oracle():
     depths, poses, K = scenes.sequence(3, 30, 40, 0.05)
     for i, (depth, T) in enumerate(zip(depths[:2], poses[:2], strict=True)):
         a = 0.01 * (1 + i) * depth**2
-        maps = DepthPrediction(torch.tensor(depth)[None], torch.tensor(a)[None])
-        answer = estimator.update(Predicted(maps, torch.tensor(K)[None]), torch.tensor(T))
+        maps = DepthPrediction(torch.tensor(depth)[None], torch.tensor(a)[None], intrinsics=torch.tensor(K)[None])
+        answer = estimator.update(maps, torch.tensor(T))
         _, M = judge.step(depth, T, K, features=a[None])
         A = oracle.aleatoric_in_h(judge.mixture_cam, depth, depth > 0, K, a, prior_weight=1.0)
         np.testing.assert_allclose(answer["aleatoric"][0].numpy(), A, rtol=1e-5)
@@ -216,7 +216,7 @@ def test_a_in_h_agrees_with_the_oracle():
     assert sampled.query(torch.zeros(1, 2, 3)).features.shape == (1, 2, 1)
     assert np.nanmax(np.abs(A - a)) > 0.01, "the mixture's average is not the pixel's own"
     with pytest.raises(ValueError, match="aleatoric must be given with config"):
-        estimator.update(Predicted(DepthPrediction(maps.depth), torch.tensor(K)[None]), torch.tensor(T))
+        estimator.update(replace(maps, aleatoric_variance=None), torch.tensor(T))
 
 
 def test_a_in_h_is_a_row_of_its_own():

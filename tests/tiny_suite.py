@@ -16,7 +16,6 @@ from layouts import write_generic
 from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
 from ufmstar_torch.eval.engine.judge import RowFigures
 from ufmstar_torch.eval.engine.load import NetworkChoice
-from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.method import Method
@@ -108,10 +107,10 @@ def evaluate(sequence, rows, networks, store=None, *, sinks=(), progress=lambda 
 
 def unbatched(source, frame, n=0):
     """A source's prediction for a frame without the leading dimension."""
-    maps, K, _ = source.one(frame, n)
+    maps = source.one(frame, n)
     own = {"aleatoric": maps.aleatoric_variance, "epistemic": maps.epistemic_variance}
     own = {name: None if value is None else value[0] for name, value in own.items()}
-    return SimpleNamespace(depth=maps.depth[0], intrinsics=K[0], size=tuple(maps.depth.shape[1:]), **own)
+    return SimpleNamespace(depth=maps.depth[0], intrinsics=maps.K[0], size=maps.size, **own)
 
 
 def same(one, other):
@@ -143,8 +142,8 @@ class Biased:
 
     def one(self, frame, n):
         depth = np.where(frame.depth > 2, 1.4, 1.0) * frame.depth
-        maps = DepthPrediction(torch.from_numpy(depth).float()[None])
-        return Predicted(maps, torch.from_numpy(frame.intrinsics)[None])
+        K = torch.from_numpy(frame.intrinsics)[None]
+        return DepthPrediction(torch.from_numpy(depth).float()[None], intrinsics=K)
 
 
 # ---- evaluations ----

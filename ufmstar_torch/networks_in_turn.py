@@ -7,6 +7,7 @@ stochastic network, or by a single one; or, for comparison, by all of them at on
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, Self
 
 import torch
@@ -74,7 +75,8 @@ class NetworksInTurn(nn.Module):
         return (image, intrinsics) if self.preprocess is None else self.preprocess(image, intrinsics)
 
     def member(self, x: Tensor, intrinsics: Tensor, n: int) -> DepthPrediction:
-        """One inference of member ``n``, or sample ``n`` of a single network, on what :meth:`prepare` returned.
+        """One inference of member ``n``, or sample ``n`` of a single network, on what :meth:`prepare` returned; the
+        prediction has its intrinsics.
 
         Raises:
             TypeError: the network takes no uint8, or as :meth:`as_prediction`.
@@ -85,7 +87,7 @@ class NetworksInTurn(nn.Module):
             if x.is_floating_point():
                 raise
             raise TypeError(f"network {n} does not take an image of {x.dtype}: give floats in [0, 1]") from error
-        return self.as_prediction(result, x)
+        return replace(self.as_prediction(result, x), intrinsics=intrinsics)
 
     def as_prediction(self, result: Any, x: Tensor) -> DepthPrediction:
         """The prediction in a network's result for ``x`` [B, 3, H, W]; a class may accept more networks.
@@ -151,7 +153,7 @@ def combine(predictions: Sequence[DepthPrediction]) -> DepthPrediction:
 
     depth = mean d_n; A = mean A_n (None unless every member has one); E = the variance of d_n between
     the members, 1/N sum d_n^2 - (mean d_n)^2, plus the mean of their own E_n where every member has one; the mean
-    confidence where every member has one.
+    confidence where every member has one; the first member's intrinsics, and the sum of the times if all are known.
 
     Raises:
         ValueError: no prediction.
@@ -159,13 +161,18 @@ def combine(predictions: Sequence[DepthPrediction]) -> DepthPrediction:
     if not predictions:
         raise ValueError("predictions must not be empty")
     depth = torch.stack([p.depth for p in predictions])
-    aleatoric = [p.aleatoric_variance for p in predictions if p.aleatoric_variance is not None]
-    confidence = [p.confidence for p in predictions if p.confidence is not None]
-    stated = [p.epistemic_variance for p in predictions if p.epistemic_variance is not None]
-    between = depth.var(0, correction=0)
+    between, stated = depth.var(0, correction=0), _mean([p.epistemic_variance for p in predictions])
+    times = [p.ms for p in predictions if p.ms is not None]
     return DepthPrediction(
         depth.mean(0),
-        torch.stack(aleatoric).mean(0) if len(aleatoric) == len(depth) else None,
-        between + torch.stack(stated).mean(0) if len(stated) == len(depth) else between,
-        torch.stack(confidence).mean(0) if len(confidence) == len(depth) else None,
+        _mean([p.aleatoric_variance for p in predictions]),
+        between if stated is None else between + stated,
+        _mean([p.confidence for p in predictions]),
+        predictions[0].intrinsics,
+        sum(times) if len(times) == len(predictions) else None,
     )
+
+
+def _mean(maps: Sequence[Tensor | None]) -> Tensor | None:
+    known = [value for value in maps if value is not None]
+    return torch.stack(known).mean(0) if len(known) == len(maps) else None

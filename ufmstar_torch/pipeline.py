@@ -29,19 +29,22 @@ class UncertainPrediction:
     Attributes:
         prediction: the network's output (for "full": the predictive mean, mean A and E over the members).
         ufm: the output of UfM*; ``ufm.variance`` [m^2] is the answer.
-        intrinsics: [B, 3, 3] of the predicted depth map [px].
         member: index of the network that was run, or None if all were.
     """
 
     prediction: DepthPrediction
     ufm: UfMStarOutput
-    intrinsics: Tensor
     member: int | None
 
     @property
     def depth(self) -> Tensor:
         """[B, H, W] [m]."""
         return self.prediction.depth
+
+    @property
+    def intrinsics(self) -> Tensor:
+        """[B, 3, 3] of the depth map [px]."""
+        return self.prediction.K
 
     @property
     def variance(self) -> Tensor:
@@ -65,7 +68,7 @@ class _Predicted:
 
     Attributes:
         image, pose, intrinsics: of the image, as tensors.
-        prediction, map_intrinsics, member: as in :class:`UncertainPrediction`.
+        prediction, member: as in :class:`UncertainPrediction`.
         features: [B, F, H, W] for UfM*, or None.
         ready: when the values have arrived; None = they are there for whatever is queued on their device.
     """
@@ -74,7 +77,6 @@ class _Predicted:
     pose: Tensor
     intrinsics: Tensor
     prediction: DepthPrediction
-    map_intrinsics: Tensor
     member: int | None
     features: Tensor | None
     ready: torch.cuda.Event | None
@@ -284,9 +286,9 @@ class UncertainDepth(NetworksInTurn):
         predicted = self._predicted(image, pose, intrinsics, features)
         sample: dict[str, Any] = {"pixels": pixels, "fraction": fraction, "seed": seed, "average": average}
         with self._anchored(predicted, anchors) as found:
-            p, K = predicted.prediction, predicted.map_intrinsics
+            p = predicted.prediction
             mean = self.ufm.mean_uncertainty(
-                p.depth, predicted.pose, K, p.aleatoric_variance, p.epistemic_variance, valid, anchors=found,
+                p.depth, predicted.pose, p.K, p.aleatoric_variance, p.epistemic_variance, valid, anchors=found,
                 confidence=self._confidence(p), features=predicted.features, **sample,
             )  # fmt: skip
         self._undo(mean.statistics)
@@ -301,11 +303,11 @@ class UncertainDepth(NetworksInTurn):
     def _fused(
         self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None
     ) -> UncertainPrediction:
-        prediction, K = predicted.prediction, predicted.map_intrinsics
+        p = predicted.prediction
         with self._anchored(predicted, anchors) as found:
-            ufm = self.update(prediction, predicted.pose, K, valid, features=predicted.features, anchors=found)
+            ufm = self.update(p, predicted.pose, p.K, valid, features=predicted.features, anchors=found)
         self._undo(ufm.statistics)
-        return UncertainPrediction(prediction, ufm, K, predicted.member)
+        return UncertainPrediction(p, ufm, predicted.member)
 
     @contextmanager
     def _anchored(self, predicted: _Predicted, anchors: Anchors | None) -> Iterator[Anchors | None]:
@@ -326,7 +328,7 @@ class UncertainDepth(NetworksInTurn):
             anchors = self.landmarks.update(predicted.image, predicted.pose, K, config.rotation_tolerance, skip=skip)
         try:
             moved = anchors is not None and self.preprocess not in (None, in_unit_range)
-            yield require_anchors(anchors).moved(K, predicted.map_intrinsics) if moved else anchors
+            yield require_anchors(anchors).moved(K, predicted.prediction.K) if moved else anchors
         except BaseException:
             if self.landmarks is not None:
                 self.landmarks.undo()
@@ -358,10 +360,10 @@ class UncertainDepth(NetworksInTurn):
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
         H = None if features is None else as_tensor("features", features)
         own = (prediction.aleatoric_variance, prediction.epistemic_variance, prediction.confidence)
-        (depth, *maps, K_there, H), ready = _copied((prediction.depth, *own, K, H), self.multiview_device)
+        (depth, a, e, confidence, K_there, H), ready = _copied((prediction.depth, *own, K, H), self.multiview_device)
         assert depth is not None
-        assert K_there is not None
-        return _Predicted(picture, T, K_image, DepthPrediction(depth, *maps), K_there, member, H, ready)
+        there = DepthPrediction(depth, a, e, confidence, K_there)
+        return _Predicted(picture, T, K_image, there, member, H, ready)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """The networks move; UfM* stays on its own device, if it has one."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -24,6 +24,8 @@ class DepthPrediction:
         epistemic_variance: [B, H, W] learned model variance E [m^2], or None.
         confidence: [B, H, W] a map of any unit that ranks the pixels by quality, or None; its meaning in metres is
             learnt from anchors (``ufmstar_torch.confidence``).
+        intrinsics: [B, 3, 3] of the depth map [px]; None as a network returns it: those of the network's input.
+        ms: time of the inference, or of all of them together [ms]; None = not measured.
 
     Raises:
         TypeError: something else than tensors and arrays.
@@ -34,6 +36,8 @@ class DepthPrediction:
     aleatoric_variance: Tensor | None = None
     epistemic_variance: Tensor | None = None
     confidence: Tensor | None = None
+    intrinsics: Tensor | None = None
+    ms: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("depth", *_OPTIONAL):
@@ -50,10 +54,21 @@ class DepthPrediction:
                     f"{name} must have the depth's shape {tuple(self.depth.shape)}, got {tuple(value.shape)}"
                 )
 
-    def mapped(self, function: Callable[[Tensor], Tensor]) -> DepthPrediction:
-        """With a function applied to every map."""
-        maps = {name: function(value) for name in _OPTIONAL if (value := getattr(self, name)) is not None}
-        return DepthPrediction(function(self.depth), **maps)
+    def to(self, to: torch.device | torch.dtype) -> DepthPrediction:
+        """The prediction with its maps on a device, or of a dtype; the intrinsics stay where they are."""
+        maps = {name: value.to(to) for name in ("depth", *_OPTIONAL) if (value := getattr(self, name)) is not None}
+        return replace(self, **maps)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width [px]."""
+        return self.depth.shape[1], self.depth.shape[2]
+
+    @property
+    def K(self) -> Tensor:
+        """[B, 3, 3] the intrinsics [px], of a prediction that has them."""
+        assert self.intrinsics is not None
+        return self.intrinsics
 
     @property
     def variance(self) -> Tensor | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -21,7 +22,6 @@ from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.timing import StagedStep
 from ufmstar_torch.eval.engine.clock import synchronize
 from ufmstar_torch.eval.engine.estimators import Answer, Gaussians, Pointwise, make_estimator
-from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
@@ -42,7 +42,9 @@ class MultiviewStep:
         anchors = ANCHORS[row.setting.anchors]
         self._landmarks = None if anchors is None else StreamLandmarks(landmark_source(anchors))
 
-    def __call__(self, image: Tensor | None, frame: Frame, predicted: Predicted, *, first: bool = False) -> Answer:
+    def __call__(
+        self, image: Tensor | None, frame: Frame, prediction: DepthPrediction, *, first: bool = False
+    ) -> Answer:
         """Move a frame's maps to the device, track landmarks in its ``image`` [1, 3, H, W], and run the step; the
         ``first`` one begins with an empty state."""
         if first:
@@ -54,8 +56,8 @@ class MultiviewStep:
         if self._landmarks is not None:
             K = torch.from_numpy(frame.intrinsics)
             anchors = self._landmarks.update(image, T, K, UfMStarConfig.rotation_tolerance)
-            anchors = anchors.moved(K, predicted.intrinsics).to(self._device)
-        return self.estimator.update(predicted.to(self._device), T, anchors)
+            anchors = anchors.moved(K, prediction.K).to(self._device)
+        return self.estimator.update(prediction.to(self._device), T, anchors)
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points or components, with what anchors add; bytes of the map for smoothing."""
@@ -136,7 +138,7 @@ def time_parts(
         inputs = {}
         for row in rows:
             base, K = row.method.base, prepared[row.method.base][1].cpu().double()
-            inputs[row.label] = image, frame, Predicted(maps[base, inference_of(row)], K)
+            inputs[row.label] = image, frame, replace(maps[base, inference_of(row)], intrinsics=K)
         multiview: dict[Part, Callable[[], Any]] = {
             (label, MULTIVIEW): partial(step, *inputs[label], first=turn == 0) for label, step in steps.items()
         }

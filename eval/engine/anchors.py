@@ -19,12 +19,12 @@ from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, Landmark
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.tracker import Landmarks, TrackerConfig
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.engine.predictions import Predicted
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRUTH, Setting
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.sequences.options import resolve
+from ufmstar_torch.prediction import DepthPrediction
 
 # Anchors of ground truth in a frame, about as many as a tracker finds, and their standard deviation as a share of the
 # depth: a range sensor's. Their depths are exact.
@@ -83,7 +83,11 @@ class AnchorSource:
         self._setting, self.tracks = setting, tracks
 
     def of(
-        self, frame: Frame, T_world_cam: NDArray[np.float64], predicted: Predicted, truth: NDArray[np.float32] | None
+        self,
+        frame: Frame,
+        T_world_cam: NDArray[np.float64],
+        prediction: DepthPrediction,
+        truth: NDArray[np.float32] | None,
     ) -> tuple[Landmarks, Anchors | None, float | None]:
         """The landmarks of the next frame, in the pixels of the image (of ground truth: of the depth map); the same as
         anchors [1, N] in the pixels of the depth map, None without an image; and the time that they took [ms].
@@ -91,12 +95,12 @@ class AnchorSource:
         Args:
             frame: its image is tracked in.
             T_world_cam: [4, 4] the pose that the row sees [m].
-            predicted: has the camera of the anchors' pixels.
+            prediction: has the camera of the anchors' pixels.
             truth: [h, w] ground truth at its pixels [m], 0 = none, or None.
         """
-        device, K = predicted.maps.depth.device, predicted.intrinsics[0]
+        device, K = prediction.depth.device, prediction.K[0]
         if self.tracks is None:
-            depth = np.zeros(predicted.size, np.float32) if truth is None else truth
+            depth = np.zeros(prediction.size, np.float32) if truth is None else truth
             drawn = self._sampled(depth, frame.index)
             values = (torch.from_numpy(part)[None] for part in (drawn.pixel, drawn.depth, drawn.variance))
             return drawn, Anchors(*values).to(device), None

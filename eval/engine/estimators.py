@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
+from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured
@@ -41,11 +41,11 @@ class Estimator(ABC):
     module: nn.Module = nn.Identity()
 
     @abstractmethod
-    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
+    def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
         """Process the next frame: "depth", "variance", "valid" and others of ``RowResult``.
 
         Args:
-            predicted: maps on the estimator's device.
+            prediction: maps [1, h, w] on the estimator's device, with intrinsics.
             T_world_cam: [4, 4] float64 camera-to-world [m], on the CPU.
             anchors: [1, N] of the frame in the map's pixels; None = none.
         """
@@ -107,8 +107,8 @@ class Alone(Estimator):
     def __init__(self, *, uses_variances: bool = True) -> None:
         self._uses_variances = uses_variances
 
-    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
-        used = _used(predicted, self._uses_variances)
+    def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
+        used = _used(prediction, self._uses_variances)
         a, e, variance = used.aleatoric_variance, used.epistemic_variance, used.variance
         valid = (used.depth > 0) & used.depth.isfinite()
         for part in (a, e):
@@ -124,10 +124,10 @@ class Pointwise(Estimator):
         self.ufm = UfM(max_points)
         self._uses_variances = uses_variances
 
-    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
-        used = _used(predicted, self._uses_variances)
+    def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
+        used = _used(prediction, self._uses_variances)
         a, e = used.aleatoric_variance, used.epistemic_variance
-        out = self.ufm(used.depth, T_world_cam, predicted.intrinsics, a, e)
+        out = self.ufm(used.depth, T_world_cam, prediction.K, a, e)
         return {"depth": used.depth, "variance": out.variance, "valid": out.valid, "aleatoric": a, "epistemic": e}
 
     def state(self) -> dict[str, Tensor]:
@@ -157,9 +157,9 @@ class Gaussians(Estimator):
         self.module = self.ufm = self.model.ufm
         self._setting, self._uses_variances, self._anchors = setting, uses_variances, 0
 
-    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
-        used = _used(predicted, self._uses_variances)
-        out = self.model.update(used, T_world_cam, predicted.intrinsics, anchors=anchors)
+    def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
+        used = _used(prediction, self._uses_variances)
+        out = self.model.update(used, T_world_cam, prediction.K, anchors=anchors)
         anchors_used = out.statistics.anchors_used
         self._anchors = 0 if anchors_used is None else int(anchors_used[0])
         answer = {name: getattr(out, name) for name in _OF_OUTPUT} | {"confidence": used.confidence}
@@ -182,7 +182,6 @@ class Gaussians(Estimator):
         return memory if self.ufm.config.anchors is None else memory | {"anchors": self._anchors}
 
 
-def _used(predicted: Predicted, uses_variances: bool) -> DepthPrediction:
+def _used(prediction: DepthPrediction, uses_variances: bool) -> DepthPrediction:
     """The prediction, without A and E unless the row uses them."""
-    maps = predicted.maps
-    return maps if uses_variances else DepthPrediction(maps.depth, confidence=maps.confidence)
+    return prediction if uses_variances else replace(prediction, aleatoric_variance=None, epistemic_variance=None)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
+from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.setting import CROP
 from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
@@ -49,7 +49,7 @@ class MapSource(DepthSource):
             raise ValueError(f'preprocess = "{CROP}" goes with networks: maps exist already')
         return self
 
-    def one(self, frame: Frame, n: int) -> Predicted:
+    def one(self, frame: Frame, n: int) -> DepthPrediction:
         """The frame's map, resized by taking the nearest pixel; no network runs. Raises FrameError: it has none, or it
         cannot be read."""
         depth, variance, K = self._read(frame)
@@ -59,7 +59,8 @@ class MapSource(DepthSource):
             depth = resample_nearest(depth, before, K, self._size)
             variance = None if variance is None else resample_nearest(variance, before, K, self._size)
         aleatoric = None if variance is None else torch.from_numpy(variance)[None]
-        return Predicted(DepthPrediction(torch.from_numpy(depth)[None], aleatoric), torch.from_numpy(K)[None].double())
+        camera = torch.from_numpy(K)[None].double()
+        return DepthPrediction(torch.from_numpy(depth)[None], aleatoric, intrinsics=camera)
 
 
 def folder_source(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, cast
 from weakref import WeakKeyDictionary
 
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.eval.engine.clock import StageTimer
-from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
+from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.setting import CROP, OF_NETWORK, RESIZE
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
@@ -22,6 +23,7 @@ from ufmstar_torch.models.inference import BF16, runtime_of
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.networks_in_turn import NetworksInTurn
+from ufmstar_torch.prediction import DepthPrediction
 
 # Sample n of frame i is seeded by i + 1,000,003 n: another seed for every pair as long as a sequence has fewer
 # frames than that, and below 2^32, the largest seed of torch's generator on the CPU.
@@ -87,7 +89,7 @@ class NetworkSource(DepthSource):
         """See :class:`DepthSource`."""
         return self._turns.turn(position)
 
-    def one(self, frame: Frame, n: int) -> Predicted:
+    def one(self, frame: Frame, n: int) -> DepthPrediction:
         """One inference, of member (or sample) n. Raises FrameError: the frame has no image."""
         with torch.no_grad():
             x, K = self._input(frame)
@@ -95,7 +97,7 @@ class NetworkSource(DepthSource):
             reduced = self._precision == BF16
             with self._timer.stage("network"), torch.autocast(self._device.type, torch.bfloat16, enabled=reduced):
                 maps = self._turns.member(x, K, n)
-        made = Predicted(maps, K.cpu().double(), self._timer.take()["network"])
+        made = replace(maps, intrinsics=K.cpu().double(), ms=self._timer.take()["network"])
         return made.to(torch.float32) if reduced else made
 
     def prepare(self, frame: Frame) -> None:

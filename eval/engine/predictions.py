@@ -8,11 +8,10 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.atomic import write_atomic
@@ -22,30 +21,14 @@ from ufmstar_torch.networks_in_turn import combine
 from ufmstar_torch.prediction import DepthPrediction
 
 _SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
-# Names of the maps in a file, and in a ``DepthPrediction``.
-_MAPS = {
+# Names of the arrays in a file, and of the tensors of a ``DepthPrediction``.
+_FIELDS = {
     "depth": "depth",
     "aleatoric": "aleatoric_variance",
     "epistemic": "epistemic_variance",
     "confidence": "confidence",
+    "intrinsics": "intrinsics",
 }
-
-
-class Predicted(NamedTuple):
-    """The prediction for one frame, with the camera of its depth map."""
-
-    maps: DepthPrediction  # [1, h, w]
-    intrinsics: Tensor  # [1, 3, 3] float64 of the maps [px], on the CPU
-    ms: float | None = None  # of the inference, or of all of them together [ms]; None where no network ran
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(h, w)."""
-        return self.maps.depth.shape[1], self.maps.depth.shape[2]
-
-    def to(self, to: torch.device | torch.dtype) -> Predicted:
-        """Return the prediction with its maps on a device, or of a type."""
-        return self._replace(maps=self.maps.mapped(lambda value: value.to(to)))
 
 
 class DepthSource(ABC):
@@ -93,8 +76,9 @@ class DepthSource(ABC):
         """In another thread, what can be done before a network runs."""
 
     @abstractmethod
-    def one(self, frame: Frame, n: int) -> Predicted:
-        """One timed inference, of member (or sample) n. Raises FrameError: the frame has nothing to predict from."""
+    def one(self, frame: Frame, n: int) -> DepthPrediction:
+        """One timed inference, of member (or sample) n: maps [1, h, w], and their intrinsics [1, 3, 3] in float64 on
+        the CPU. Raises FrameError: the frame has nothing to predict from."""
 
 
 class CacheError(Exception):
@@ -114,7 +98,7 @@ class PredictionCache:
         # Tried by writing: permissions say nothing about file systems that are mounted read-only.
         self._write(Path(".writable"), lambda opened: opened.write(b""))
 
-    def load(self, path: Path, content: str, device: torch.device) -> Predicted | None:
+    def load(self, path: Path, content: str, device: torch.device) -> DepthPrediction | None:
         """The prediction bit for bit as it was stored, or None where it has to be made: there is no file, it belongs to
         another image of that name, was cut off or changed, or cannot be read."""
         try:
@@ -123,15 +107,13 @@ class PredictionCache:
             return None
         if bytes(arrays.pop("content")).decode() != content:
             return None
-        K = torch.from_numpy(arrays.pop("intrinsics"))
-        maps = {_MAPS[name]: torch.from_numpy(value)[None].to(device) for name, value in arrays.items()}
-        return Predicted(DepthPrediction(**maps), K[None])
+        tensors: dict[str, Any] = {_FIELDS[name]: torch.from_numpy(value)[None] for name, value in arrays.items()}
+        return DepthPrediction(**tensors).to(device)
 
-    def store(self, path: Path, content: str, predicted: Predicted) -> None:
+    def store(self, path: Path, content: str, prediction: DepthPrediction) -> None:
         """Keep a prediction. Raises CacheError: it cannot be written."""
-        named = {name: getattr(predicted.maps, field) for name, field in _MAPS.items()}
+        named = {name: getattr(prediction, field) for name, field in _FIELDS.items()}
         arrays = {name: value[0].cpu().numpy() for name, value in named.items() if value is not None}
-        arrays["intrinsics"] = predicted.intrinsics[0].numpy()
         arrays["content"] = np.frombuffer(content.encode(), np.uint8)
         self._write(path, lambda opened: np.savez(opened, allow_pickle=False, **arrays))
 
@@ -155,10 +137,10 @@ class FramePredictions:
         self.frame, self._device, self._store, self._sequence = frame, device, store, sequence
         self._content = "" if store is None else frame_digest(frame)
         # By source: predictions by member ("0", "1", ... or "all"), and single inferences.
-        self._cached: dict[tuple[object, str], Predicted] = {}
-        self._inferences: dict[tuple[object, int], Predicted] = {}
+        self._cached: dict[tuple[object, str], DepthPrediction] = {}
+        self._inferences: dict[tuple[object, int], DepthPrediction] = {}
 
-    def of(self, source: DepthSource, position: int, every: bool) -> Predicted:
+    def of(self, source: DepthSource, position: int, every: bool) -> DepthPrediction:
         """The prediction for a row that has used ``position`` images before: of all members, or of the one in turn.
         Raises FrameError: the frame has nothing to predict from."""
         combined = every and source.passes > 1
@@ -172,17 +154,13 @@ class FramePredictions:
         if found is None:
             members = range(source.passes) if combined else [int(member)]
             made = [self._inference(source, n) for n in members]
-            times = [one.ms for one in made if one.ms is not None]
-            found = made[0]
-            if combined:
-                ms = sum(times) if len(times) == len(made) else None
-                found = Predicted(combine([one.maps for one in made]), made[0].intrinsics, ms)
+            found = combine(made) if combined else made[0]
             if store is not None:
                 store.store(path, self._content, found)
         self._cached[key] = found
         return found
 
-    def _inference(self, source: DepthSource, n: int) -> Predicted:
+    def _inference(self, source: DepthSource, n: int) -> DepthPrediction:
         """Member (or sample) n, computed once for all rows."""
         key = (source.digest or source, n)
         if key not in self._inferences:

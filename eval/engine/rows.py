@@ -15,12 +15,13 @@ from ufmstar_torch.anchors.tracker import Landmarks
 from ufmstar_torch.eval.engine.anchors import AnchorSource
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.estimators import Estimator
-from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
+from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.frame import FRAME_FAULTS
 from ufmstar_torch.output import FrameStatistics
+from ufmstar_torch.prediction import DepthPrediction
 
 # Prefixes of the tensors of a row's state.
 _IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drift."
@@ -109,20 +110,20 @@ class RowRunner:
         self._timer = StageTimer(device or torch.device("cpu"))
         self._drift = Drift(setting)
 
-    def update(self, frame: Frame, predicted: Predicted, truth: NDArray[np.float32] | None) -> RowResult:
+    def update(self, frame: Frame, prediction: DepthPrediction, truth: NDArray[np.float32] | None) -> RowResult:
         """Process the next frame. Its ground truth [h, w] is only for anchors that are drawn from it. Raises
         FrameError: the row skips frames with faults, and the pose or the intrinsics have one."""
         T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
         landmarks, anchors, tracking_ms = (
-            (None, None, None) if self.anchors is None else self.anchors.of(frame, T, predicted, truth)
+            (None, None, None) if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
         )
         member = self.source.turn(self.images) if self.source.networks and not self.every else None
         with self._timer.stage("uncertainty"):
-            answer = self.estimator.update(predicted, torch.from_numpy(T), anchors)
+            answer = self.estimator.update(prediction, torch.from_numpy(T), anchors)
             answer = {name: value[0].cpu() if isinstance(value, Tensor) else value for name, value in answer.items()}
-        times = {"network": predicted.ms, "anchors": tracking_ms, **self._timer.take()}
+        times = {"network": prediction.ms, "anchors": tracking_ms, **self._timer.take()}
         self.images += 1
-        statistics, network_variance = answer.get("statistics"), predicted.maps.variance
+        statistics, network_variance = answer.get("statistics"), prediction.variance
         if self._skips_faults and statistics is not None and int(statistics.fault[0]):
             if self._tracks is not None:
                 self._tracks.undo()
@@ -130,7 +131,7 @@ class RowRunner:
         return RowResult(
             **answer,
             network_variance=None if network_variance is None else network_variance[0].cpu(),
-            intrinsics=predicted.intrinsics[0].numpy(),
+            intrinsics=prediction.K[0].numpy(),
             truth=truth,
             T_world_cam=T,
             member=member,

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.clock import StageTimer
-from ufmstar_torch.eval.engine.predictions import FramePredictions, Predicted, PredictionCache, sequence_digest
+from ufmstar_torch.eval.engine.predictions import FramePredictions, PredictionCache, sequence_digest
 from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
 from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
+from ufmstar_torch.prediction import DepthPrediction
 
 
 class Stopped(Exception):
@@ -164,16 +165,16 @@ class FrameStream:
                 row.source.prepare(frame)
 
 
-def _truths(frame: Frame, predictions: Mapping[str, Predicted]) -> dict[str, NDArray[np.float32] | None]:
+def _truths(frame: Frame, predictions: Mapping[str, DepthPrediction]) -> dict[str, NDArray[np.float32] | None]:
     """Ground truth at the pixels of every row's maps, once for every camera. Raises FrameError: the depth map has
     none."""
     computed: dict[tuple[object, ...], NDArray[np.float32] | None] = {}
     truths = {}
-    for key, predicted in predictions.items():
-        K = predicted.intrinsics[0].numpy()
-        camera = (predicted.size, K.tobytes())
+    for key, prediction in predictions.items():
+        K = prediction.K[0].numpy()
+        camera = (prediction.size, K.tobytes())
         if camera not in computed:
-            computed[camera] = truth_at(frame, K, predicted.size)
+            computed[camera] = truth_at(frame, K, prediction.size)
         truths[key] = computed[camera]
     return truths
 

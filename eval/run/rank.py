@@ -107,10 +107,10 @@ def require_part(job: RunJob, by: str) -> None:
         raise ValueError("--by anchored needs --anchors or --posterior")
     for index in job.indices if by in ("aleatoric", "epistemic") else ():
         try:
-            predicted = FramePredictions(job.sequence[index], job.device, None, "").of(job.source, 0, job.every).maps
+            prediction = FramePredictions(job.sequence[index], job.device, None, "").of(job.source, 0, job.every)
         except FrameError:
             continue
-        if {"aleatoric": predicted.aleatoric_variance, "epistemic": predicted.epistemic_variance}[by] is None:
+        if {"aleatoric": prediction.aleatoric_variance, "epistemic": prediction.epistemic_variance}[by] is None:
             source = "the network states" if job.source.networks else "the depth comes with"
             raise ValueError(f"--by {by}: {source} no {by} variance")
         return

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ufmstar_torch.eval.engine.predictions import DepthSource, Predicted
+from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.sequences.colmap import read_landmarks
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.prediction import DepthPrediction
 
 _MOST_FRAMES, _FEWEST_FRAMES = 24, 3
 _FEWEST_LANDMARKS = 10  # of a frame that counts
@@ -50,10 +51,10 @@ def network_scale(sequence: FrameSequence, source: DepthSource, indices: range) 
         entry = sequence.entries[indices[number]]
         points = landmarks.get(entry.name, np.zeros((0, 3)))
         try:
-            predicted = source.one(sequence[indices[number]], source.turn(turn))
+            prediction = source.one(sequence[indices[number]], source.turn(turn))
         except FrameError:  # counted when its turn comes
             continue
-        ratios = _ratios(points, entry.T_world_cam, predicted)
+        ratios = _ratios(points, entry.T_world_cam, prediction)
         if len(ratios) >= _FEWEST_LANDMARKS:
             medians.append(float(np.median(ratios)))
     if len(medians) < _FEWEST_FRAMES:
@@ -66,12 +67,12 @@ def network_scale(sequence: FrameSequence, source: DepthSource, indices: range) 
     return NetworkScale(metres, float(high - low) / 2 / metres, len(medians))
 
 
-def _ratios(points: np.ndarray, T_world_cam: np.ndarray, predicted: Predicted) -> np.ndarray:
+def _ratios(points: np.ndarray, T_world_cam: np.ndarray, prediction: DepthPrediction) -> np.ndarray:
     """[M] predicted depth over landmark's, of those in the map."""
     T_cam_world = np.linalg.inv(T_world_cam)
     in_camera = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
     in_camera = in_camera[in_camera[:, 2] > 0]
-    K, depth = predicted.intrinsics[0].numpy(), predicted.maps.depth[0].detach().float().cpu().numpy()
+    K, depth = prediction.K[0].numpy(), prediction.depth[0].detach().float().cpu().numpy()
     pixel = np.rint((in_camera @ K.T)[:, :2] / in_camera[:, 2:])
     inside = ((pixel >= 0) & (pixel < depth.shape[::-1])).all(axis=1)
     column, row = pixel[inside].astype(int).T
