@@ -47,23 +47,19 @@ class _Options:
     sequence: str = positional()
     output: _Output
     fps: float | None = None
-    rate: float = 30.0
+    rate: float = option(30.0, positive=True)
     names: tuple[str, ...] = ()
     networks: tuple[str, ...] = option((), repeat=True)
-    sizes: tuple[int, ...] = option((224, 518))
+    sizes: tuple[int, ...] = (224, 518)
     kind: str = option("numba", choices=("numba", "torch"))
-    long: int | None = option(None, const=1000)
+    long: int | None = option(None, const=1000, least=2)
     truth_scale: float | None = None
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
     changes: dict[str, Any] = fields_of(UfMStarConfig, "change.", without=("segment", "backend"), unset=True)
 
-    def __post_init__(self) -> None:
-        if self.rate <= 0:
-            raise ValueError(f"--rate must be positive, got {self.rate}")
 
-
-def _parse(line: str, **defaults: Any) -> _Options:
-    return parse(_Options, line.split(), "prog", defaults)
+def _parse(line: str) -> _Options:
+    return parse(_Options, line.split(), "prog")
 
 
 def test_defaults_and_required_ones():
@@ -87,12 +83,6 @@ def test_every_form():
     assert options.ufm["add_aleatoric"] is False
     assert options.changes == {"eta": 0.2}
     assert _parse("seq --out o --long 7 --truth-scale 1").long == 7
-
-
-def test_defaults_of_the_caller_go_behind_what_is_given():
-    assert _parse("seq --out o", rate=5.0).rate == 5.0
-    assert _parse("seq --out o --rate 6", rate=5.0).rate == 6.0
-    assert _parse("seq --out o", **{"ufm.segment.sparse": 2}).ufm["segment"]["sparse"] == 2
 
 
 def test_plain_values_are_flat():
@@ -120,6 +110,7 @@ def test_a_configuration_file(tmp_path):
         ("seq --out o --nope", "--nope"),
         ("seq --out o --rate x", "rate"),
         ("seq --out o --rate 0", "--rate must be positive, got 0.0"),
+        ("seq --out o --long 1", "--long must be at least 2, got 1"),
         ("seq --out o --kind other", "choose from 'numba', 'torch'"),
         ("seq --out o --ufm.nope 1", "--ufm.nope"),
         ("seq --out o --ufm.segment.sparse x", "sparse"),

@@ -12,7 +12,6 @@ from ufmstar_torch.eval.commands.opening import SequenceOptions
 from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
 from ufmstar_torch.eval.run.files import to_json
 from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of, require_layout
-from ufmstar_torch.eval.sequences.options import Options
 
 # With one of these the user means one sequence, whatever lies below its folder.
 _OF_ONE = ("trajectory", "images", "drive")
@@ -66,7 +65,6 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
     """
     path, opening = options.path, options.opening.given()
     require_layout(options.opening.layout, options.opening.plugin)
-    Options(**{name: value for name, value in opening.items() if name not in ("layout", "poses")})
     one = path.startswith("tour:") or any(name in opening for name in _OF_ONE)
     if not one:  # a folder that fits several layouts is one too, whose layout must be named
         fitting = layouts_of(Path(path), options.opening.plugin)

@@ -13,7 +13,7 @@ from typing import Any
 from ufmstar_torch import models
 from ufmstar_torch.eval.bench.onboard import GRAPH, PICTURE, run_onboard
 from ufmstar_torch.eval.commands import evaluate
-from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, reader, usage_errors
+from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, option, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars
 from ufmstar_torch.eval.run.files import to_json, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
@@ -46,7 +46,7 @@ class DemoOptions(MachineOptions):
     out: Path = Path("ufmstar_demo")
     overwrite: bool = False
     frames: int = 36
-    seed: int = 100_003
+    seed: int = option(100_003, least=0)
     weights: Path | None = None
     onboard: bool = False
     seconds: float = 120.0
@@ -54,8 +54,6 @@ class DemoOptions(MachineOptions):
     def __post_init__(self) -> None:
         if not 2 <= self.frames <= _WALK:
             raise ValueError(f"--frames must be 2 to {_WALK}, got {self.frames}")
-        if self.seed < 0:
-            raise ValueError(f"--seed must be at least 0, got {self.seed}")
         if not 1 <= self.seconds < float("inf"):
             raise ValueError(f"--seconds must be at least 1, got {self.seconds}")
         if self.onboard and self.device != "cpu":

@@ -20,7 +20,6 @@ from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
-from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
 from ufmstar_torch.eval.suite.shards import EvalOutcome, evaluate_suite
 from ufmstar_torch.eval.suite.work_items import Shard, find_work, read_names
@@ -54,7 +53,7 @@ class SuiteOptions:
     ufm_preset: str | None = option(None, choices=("paper", "default"))
     network: tuple[str, ...] = option((), repeat=True)
     spec: str | None = None
-    samples: int | None = None
+    samples: int | None = option(None, least=2)
     runtime: str = option("auto", choices=("auto", "torch", "onnx"))
     precision: str = option("float32", choices=("float32", "bf16"))
     recalibration: tuple[str, ...] = option((), repeat=True)
@@ -75,7 +74,7 @@ class DataOptions:
 
     root: tuple[str, ...] = option((), repeat=True)
     sequences: int | None = None
-    seed: int = 0
+    seed: int = option(0, least=0)
     sequence_list: str | None = None
     frames: str | None = None
 
@@ -98,7 +97,7 @@ class EvalOutputOptions:
     resume: bool = False
     overwrite: bool = False
     cache: str | None = None
-    examples: int = 3
+    examples: int = option(3, least=0)
     bins: str = option("ours", choices=("ours", "authors"))
     no_report: bool = False
 
@@ -122,7 +121,7 @@ class EvalOptions(MachineOptions):
         "ufmstar eval --suite NAME --root [DATASET=]DIR ... --network BASE=MODEL:FILE[,FILE...] ... --out OUT [options]"
     )
 
-    processes: int = 1
+    processes: int = option(1, least=1)
     shard: str | None = None
     dry_run: bool = False
     what: SuiteOptions
@@ -137,10 +136,8 @@ class EvalOptions(MachineOptions):
         for name in ("suite", "root", "network", "out"):
             if not values[name]:
                 raise ValueError(f"--{name} is missing; ufmstar eval --help, and --list for the suites")
-        least_of = {"processes": 1, "examples": 0, "seed": 0, "samples": 2}
-        for name, least in least_of.items():
-            if values[name] is not None and values[name] < least:
-                raise ValueError(f"--{name} must be at least {least}, got {values[name]}")
+        parse_slice(self.data.frames)
+        Shard.parse(self.shard or "1/1")
         if self.output.resume and self.output.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
         if self.shard and self.output.overwrite:
@@ -176,7 +173,6 @@ def job_from(options: EvalOptions) -> EvalJob:
         given = ", ".join(text.partition("=")[0] for text in what.network)
         raise ValueError(f"--network: every base once, but in a suite that measures time and energy, got {given}")
     opening = {name: value for name, value in options.opening.given().items() if name != "layout"}
-    Options(**{name: value for name, value in opening.items() if name != "poses"})  # raises for impossible values
     only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
     where: dict[str, Any] = {"layout": options.opening.layout, "plugin": options.opening.plugin}
     items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, **where)

@@ -37,15 +37,10 @@ class ExportOptions:
 
     out: Path = positional()
     to: str = option(choices=("depth", "cloud", "tum", "transforms", "mcap", "rrd"))
-    max_sigma: float = float("inf")
-    max_relative_sigma: float = float("inf")
-    voxel: float = 0.02
+    max_sigma: float = option(float("inf"), positive=True)
+    max_relative_sigma: float = option(float("inf"), positive=True)
+    voxel: float = option(0.02, positive=True)
     debug: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("max_sigma", "max_relative_sigma", "voxel"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"--{name.replace('_', '-')} must be positive, got {getattr(self, name)}")
 
 
 read = reader(ExportOptions, "ufmstar export")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import count, takewhile
 from pathlib import Path
 from time import monotonic
@@ -15,19 +15,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from ufmstar_torch.eval.commands.depth import NetworkOptions, UfMOptions
 from ufmstar_torch.eval.commands.opening import SequenceOptions
-from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, positional, usage_errors
-from ufmstar_torch.eval.commands.run import NetworkOptions, UfMOptions, read_ufm
+from ufmstar_torch.eval.commands.options import MachineOptions, option, positional, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars
 from ufmstar_torch.eval.engine.anchors import landmarks_of
-from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.eval.engine.realtime import RealTime
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.run.export import Gated
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
-from ufmstar_torch.eval.run.job import recalibration_of
 from ufmstar_torch.eval.run.machine import share_threads
 from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
 from ufmstar_torch.eval.sequences import live as sources
@@ -36,7 +35,6 @@ from ufmstar_torch.eval.sequences.live import LiveEvent
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
 from ufmstar_torch.models.checkpoints import read_tensors
-from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.pipeline import UncertainDepth
 
 _View = Callable[[LiveResult, dict[str, float]], None]
@@ -74,12 +72,12 @@ class LiveOptions(MachineOptions):
 
     source: str = positional()
     follow: bool = False
-    speed: float = 1.0
-    seconds: float = float("inf")
-    idle: float = float("inf")
-    max_wait: float = 0.2
+    speed: float = option(1.0, positive=True)
+    seconds: float = option(float("inf"), positive=True)
+    idle: float = option(float("inf"), positive=True)
+    max_wait: float = option(0.2, least=0)
     state: Path | None = None
-    save_every: float = 10.0
+    save_every: float = option(10.0, least=0)
     out: Path | None = None
     overwrite: bool = False
     view: bool = False
@@ -89,11 +87,7 @@ class LiveOptions(MachineOptions):
     uncertainty: UfMOptions
 
     def __post_init__(self) -> None:
-        _ = self.uncertainty.config  # checks the settings
-        for name in ("speed", "seconds", "idle"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"--{name} must be positive, got {getattr(self, name)}")
-        if self.network.model is None or not self.network.weights:
+        if self.network.model is None:
             raise ValueError("live needs a network: --model NAME --weights FILE")
         if self.overwrite and self.out is None:
             raise ValueError("--overwrite goes with --out")
@@ -101,9 +95,7 @@ class LiveOptions(MachineOptions):
             raise ValueError("--scale-from goes with ufmstar run, which sees the whole recording")
         if self.recorded:
             return
-        defaults = SequenceOptions()
-        used = {f.name for f in fields(defaults) if getattr(self.opening, f.name) != getattr(defaults, f.name)}
-        if wrong := sorted(used - set(_OF_LIVE)):
+        if wrong := sorted(self.opening.changed().keys() - set(_OF_LIVE)):
             raise ValueError(f"--{wrong[0].replace('_', '-')} goes with recordings, not with {self.source}")
         if self.source != _STANDARD_INPUT and (self.opening.trajectory is None or not self.opening.intrinsics):
             raise ValueError(f"{self.source} needs --trajectory FILE (lines may be added) and --intrinsics fx fy cx cy")
@@ -114,10 +106,7 @@ class LiveOptions(MachineOptions):
         return not (self.follow or self.source == _STANDARD_INPUT or self.source.isdecimal())
 
 
-def read(words: Sequence[str]) -> LiveOptions:
-    """The options of a command line; errors as :func:`read_ufm`."""
-    options: LiveOptions = read_ufm(LiveOptions, words, "ufmstar live", {})
-    return options
+read = reader(LiveOptions, "ufmstar live")
 
 
 def main(options: LiveOptions) -> int:
@@ -132,13 +121,15 @@ def main(options: LiveOptions) -> int:
         with usage_errors(ImportError, OSError, ValueError):
             if options.out is not None:
                 kind.earlier(options.out, resume=False, overwrite=options.overwrite)
+            given = parse_intrinsics(options.opening.intrinsics, "--intrinsics")
+            K = None if given is None else read_intrinsics(given)
             events = _events(options)
             model = _model(options)
             view = _view() if options.view else None
             if options.out is not None:
                 held.enter_context(OutputFolder.open(options.out, kind, started, overwrite=options.overwrite))
         times = RealTime(model)
-        statistics, failure = _run(options, model, events, times, view)
+        statistics, failure = _run(options, model, K, events, times, view)
         summary = times.summary(statistics)
         print(realtime_table(summary), file=sys.stderr if options.json else sys.stdout)
         ending = {"state": "failed", "reason": str(failure)} if failure else {"state": "finished"}
@@ -151,11 +142,15 @@ def main(options: LiveOptions) -> int:
 
 
 def _run(
-    options: LiveOptions, model: UncertainDepth, events: Iterator[LiveEvent], times: RealTime, view: _View | None
+    options: LiveOptions,
+    model: UncertainDepth,
+    K: NDArray[np.float64] | None,
+    events: Iterator[LiveEvent],
+    times: RealTime,
+    view: _View | None,
 ) -> tuple[LiveStatistics, Exception | None]:
     """Push the events until they end, the time is over, or a signal comes. Returns the counts, and what failed."""
-    ends, given = monotonic() + options.seconds, parse_intrinsics(options.opening.intrinsics, "--intrinsics")
-    K = None if given is None else read_intrinsics(given)
+    ends = monotonic() + options.seconds
 
     def on_result(result: LiveResult) -> None:
         times.take(result)
@@ -203,10 +198,7 @@ def _events(options: LiveOptions) -> Iterator[LiveEvent]:
 
 def _model(options: LiveOptions) -> UncertainDepth:
     """The networks with UfM*, compiled, in the state of ``--state``; errors as ``network_source``."""
-    chosen = options.network
-    own = {name: getattr(chosen, name) for name in ("model", "weights", "spec", "mode", "samples", "offload")}
-    inference = Inference(chosen.runtime, chosen.precision, options.threads)
-    source = network_source(**own, inference=inference, device=options.device)
+    chosen, source = options.network, options.network.load(options)
     config, anchors = options.uncertainty.config, options.uncertainty.anchors
     model = UncertainDepth(
         source.networks,
@@ -215,7 +207,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
         posterior=options.uncertainty.posterior,
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
         anchors=None if anchors is False else landmarks_of(anchors, None),
-        recalibration=recalibration_of(as_dict(options.uncertainty) | as_dict(chosen), config, source),
+        recalibration=options.uncertainty.fitted(chosen.weights, source),
     ).to(options.device)
     with Bars() as bars:
         dense = config.anchors is not None and anchors in (False, "dense")

@@ -7,6 +7,7 @@ from typing import Any
 
 from ufmstar_torch.eval.commands.options import option
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
 # Names in `open_sequence` of the options for ground truth.
@@ -64,10 +65,17 @@ class SequenceOptions:
     scans: int | None = None
     plugin: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        Options(**{name: value for name, value in self.given().items() if name not in ("layout", "poses")})
+
+    def changed(self) -> dict[str, Any]:
+        """The options that differ from their defaults."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
+
     def given(self) -> dict[str, Any]:
         """The arguments of ``open_sequence`` that differ from its defaults, as plain values. Raises ValueError:
         intrinsics are neither a file nor four numbers."""
-        changed = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
+        changed = self.changed()
         for name in ("intrinsics", "depth_intrinsics"):
             if name in changed:
                 changed[name] = parse_intrinsics(changed[name], f"--{name.replace('_', '-')}")

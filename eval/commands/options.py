@@ -86,8 +86,9 @@ def positional() -> Any:
 
 def option(default: Any = MISSING, **how: Any) -> Any:
     """A field whose form is not clear from its type; without a default, the option must be given. ``how`` has
-    ``choices``: the values that are allowed; ``const``: the value of the option without a word behind it; ``repeat``:
-    whether words of further occurrences are added (else they replace the earlier ones)."""
+    ``choices``: the values that are allowed; ``least``: the smallest one; ``positive``: True for numbers above 0;
+    ``const``: the value of the option without a word behind it; ``repeat``: whether words of further occurrences are
+    added (else they replace the earlier ones)."""
     return field(default=default, metadata=how)
 
 
@@ -112,24 +113,34 @@ def fields_of(config: type, prefix: str = "", **how: Any) -> Any:
     return field(default_factory=dict, metadata={"fields_of": _Fields(config, prefix, **how)})
 
 
-def parse(options: type[T], words: Sequence[str], prog: str, defaults: Mapping[str, Any] | None = None) -> T:
+def parse(options: type[T], words: Sequence[str], prog: str) -> T:
     """The options that a command line means.
 
     Args:
-        options: a dataclass; its ``USAGE``, if it has that attribute, replaces the generated usage line.
+        options: a dataclass. ``USAGE``, if it has that attribute, replaces the generated usage line; ``DEFAULTS`` are
+            other defaults than those of :func:`fields_of`, by name (``ufm.segment.sparse``). A group may have a method
+            ``presets``: further defaults, by name, that its values ask for.
         words: without the program's name.
         prog: name of the command, for messages.
-        defaults: other defaults than the dataclass's, by name (``ufm.segment.sparse``).
 
     Raises:
         ValueError: an unknown option, a value of the wrong kind, or what ``options`` itself refuses; one line.
     """
+    defaults: Mapping[str, Any] = getattr(options, "DEFAULTS", {})
+    parsed = _parse(options, words, prog, defaults)
+    presets: dict[str, Any] = {}
+    for group in vars(parsed).values():
+        presets |= group.presets() if hasattr(group, "presets") else {}
+    return _parse(options, words, prog, {**presets, **defaults}) if presets else parsed
+
+
+def _parse(options: type[T], words: Sequence[str], prog: str, defaults: Mapping[str, Any]) -> T:
     from jsonargparse import ArgumentError
 
     full = _HELP_ALL in words
     parser = parser_of(options, prog, full=full)
     words = ["--help"] if full else words
-    parser.set_defaults(dict(defaults or {}))
+    parser.set_defaults(dict(defaults))
     try:
         values = parser.parse_args(list(words)).as_dict()
     except (ArgumentError, TypeError) as error:  # TypeError: a list where a configuration file should have a mapping
@@ -315,6 +326,11 @@ def _build(options: type[T], values: Mapping[str, Any]) -> T:
             value = values[f.name]
             if value is not None and Path in (hint, *get_args(hint)):
                 value = Path(value)
+            least, name = f.metadata.get("least"), f.name.replace("_", "-")
+            if value is not None and least is not None and not value >= least:
+                raise ValueError(f"--{name} must be at least {least}, got {value}")
+            if value is not None and f.metadata.get("positive") and not value > 0:
+                raise ValueError(f"--{name} must be positive, got {value}")
             built[f.name] = tuple(value) if isinstance(value, list) else value
     return options(**built)
 

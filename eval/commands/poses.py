@@ -78,6 +78,8 @@ class PosesOptions:
 
     def __post_init__(self) -> None:
         parse_intrinsics(self.intrinsics, "--intrinsics")
+        parse_slice(self.frames)
+        Options(fps=self.fps, max_pose_gap=self.max_pose_gap)
         _ = self.known_length
         if self.length and self.trajectory:
             raise ValueError("--length and --trajectory contradict each other: give one of them")

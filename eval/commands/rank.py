@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from types import MappingProxyType
+from typing import Any, ClassVar
 
-from ufmstar_torch.eval.commands.opening import SequenceOptions
-from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, option, positional, usage_errors
-from ufmstar_torch.eval.commands.run import MapOptions, NetworkOptions, RunOptions, UfMOptions, job_from, read_ufm
+from ufmstar_torch.eval.commands.depth import OWN_DEPTH
+from ufmstar_torch.eval.commands.options import as_dict, option, positional, reader, usage_errors
+from ufmstar_torch.eval.commands.run import StreamOptions, job_from
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.progress import ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
@@ -27,11 +28,11 @@ _SHOWN = 10  # lines of the printed table
 
 
 @dataclass(frozen=True, kw_only=True)
-class RankOptions(MachineOptions):
+class RankOptions(StreamOptions):
     """Rank the images of sequences by their uncertainty: the most uncertain ones are to be labelled first.
 
     Writes scores.csv, a line per image, and a contact sheet of the least and the most certain images. Each sequence
-    starts with an empty state.
+    starts with an empty state. M is the frame's alone, at measured pixels (--ufm.ema_alpha 1, --ufm.unmeasured nan).
 
     Attributes:
         sequences: folders of sequences, video files, or tour:SEED, as for `ufmstar run`
@@ -40,45 +41,30 @@ class RankOptions(MachineOptions):
         diverse: rank only one of several images that show the same place from nearly the same side
         count: number of images to rank; default: all
         measured: smallest share of pixels seen in two views; images below it get no rank by total or disagreement
-        frames: START:STOP:STEP, which frames of each sequence
         overwrite: replace the ranking in --out
     """
 
     USAGE: ClassVar[str] = "ufmstar rank SEQUENCE... (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
 
+    DEFAULTS: ClassVar[Mapping[str, Any]] = MappingProxyType({"ufm.unmeasured": "nan", "ufm.ema_alpha": 1.0})
+
     sequences: tuple[str, ...] = positional()
     out: str
     by: str = option("total", choices=("total", "disagreement", "aleatoric", "epistemic", "anchored"))
     diverse: bool = False
-    count: int | None = None
+    count: int | None = option(None, least=1)
     measured: float = 0.5
-    frames: str | None = None
     overwrite: bool = False
-    opening: SequenceOptions
-    network: NetworkOptions
-    maps: MapOptions
-    uncertainty: UfMOptions
 
     def __post_init__(self) -> None:
-        _ = self.of(self.sequences[0])  # checks the options that it shares with a run
-        if self.count is not None and self.count < 1:
-            raise ValueError(f"--count must be at least 1, got {self.count}")
+        super().__post_init__()
         if not 0 <= self.measured <= 1:
             raise ValueError(f"--measured must be a share from 0 to 1, got {self.measured}")
-        if self.maps.depth not in (None, "self") and len(self.sequences) > 1:
+        if self.maps.depth not in (None, *OWN_DEPTH) and len(self.sequences) > 1:
             raise ValueError("--depth DIR goes with one sequence: rank each by itself")
 
-    def of(self, sequence: str) -> RunOptions:
-        """The options of a run of one sequence."""
-        shared = ("out", "frames", "device", "threads", "opening", "network", "maps", "uncertainty")
-        return RunOptions(sequence=sequence, **{name: getattr(self, name) for name in shared})
 
-
-def read(words: Sequence[str]) -> RankOptions:
-    """The options of a command line; errors as ``commands.run.read``. M is the frame's alone, at measured pixels."""
-    own = {"ufm.unmeasured": "nan", "ufm.ema_alpha": 1.0}
-    options: RankOptions = read_ufm(RankOptions, words, "ufmstar rank", own)
-    return options
+read = reader(RankOptions, "ufmstar rank")
 
 
 def main(options: RankOptions) -> int:
@@ -99,7 +85,7 @@ def _scores(options: RankOptions) -> ImageScores:
     with Bars() as bars, stop_signals(bars.say) as stop:
         for path in options.sequences:
             with usage_errors(ImportError, OSError, ValueError):
-                job = job_from(options.of(path), source)
+                job = job_from(options, path, source)
                 if source is None:
                     require_part(job, options.by)
             if source is None:

@@ -1,0 +1,185 @@
+"""The options of depth and of UfM*, which ``run``, ``rank`` and ``live`` share, and what they load."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ufmstar_torch.config import SPGFConfig, UfMStarConfig
+from ufmstar_torch.eval.commands.options import MachineOptions, fields_of, option
+from ufmstar_torch.eval.engine.load import network_source
+from ufmstar_torch.eval.engine.maps import MapSource, folder_source, own_depth
+from ufmstar_torch.eval.engine.networks import NetworkSource
+from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size
+from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+from ufmstar_torch.models.inference import Inference
+from ufmstar_torch.recalibrate import Recalibration, beside
+from ufmstar_torch.stateful import flat
+
+PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
+OWN_DEPTH = ("self", "ground-truth")
+# Of UfM*'s settings, those that are off by default.
+SECTIONS = ("anchors", "confidence", "posterior", "merge")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkOptions:
+    """Depth from networks.
+
+    Attributes:
+        model: kind of network: fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, litert, torchscript
+            or exported
+        weights: file (depth_anything, huggingface: directory); several are the members of an ensemble
+        mode: of an ensemble: one member per image in turn, or all on every image
+        samples: passes per image of an mc_dropout network in mode full; default: 10
+        offload: trained: keep the weights in host memory, only the member in turn on the device
+        spec: JSON file that declares what the weights do not say: inputs, outputs, an alignment
+        runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
+        precision: of the networks; bf16: torch's autocast
+    """
+
+    model: str | None = None
+    weights: tuple[str, ...] = ()
+    mode: str = option("alternate", choices=("alternate", "full"))
+    samples: int | None = option(None, least=2)
+    offload: bool = False
+    spec: str | None = None
+    runtime: str = option("auto", choices=("auto", "torch", "onnx"))
+    precision: str = option("float32", choices=("float32", "bf16"))
+
+    def __post_init__(self) -> None:
+        if self.model is not None and not self.weights:
+            raise ValueError(f"--model {self.model} needs --weights FILE")
+        for name in ("weights", "spec", "samples", "offload"):
+            if getattr(self, name) and self.model is None:
+                raise ValueError(f"--{name} goes with --model only")
+        for name in ("samples", "offload"):
+            if getattr(self, name) and self.model != "trained":
+                raise ValueError(f"--{name} goes with --model trained only")
+        if self.mode == "full" and len(self.weights) < 2 and self.model != "trained":
+            raise ValueError("--mode full needs several --weights")
+        if self.samples is not None and self.mode != "full":
+            raise ValueError("--samples goes with --mode full only")
+
+    def load(self, machine: MachineOptions) -> NetworkSource:
+        """The networks on a device; errors as ``network_source``."""
+        return network_source(
+            str(self.model),
+            self.weights,
+            spec=self.spec,
+            mode=self.mode,
+            samples=self.samples,
+            offload=self.offload,
+            inference=Inference(self.runtime, self.precision, machine.threads),
+            device=machine.device,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapOptions:
+    """Depth from files, instead of a network.
+
+    Attributes:
+        depth: folder of predicted maps (16-bit PNG, EXR, npy), or an earlier run's output; 'self': the sequence's own
+            depth
+        variance: folder of variance maps [m^2] that belong to them
+        depth_scale: metres per unit of the maps in the folder
+        map_intrinsics: of the maps, if they do not show the whole image: a file, or fx fy cx cy [px]
+        size: HxW [px], to which the maps are brought
+    """
+
+    depth: str | None = None
+    variance: str | None = None
+    depth_scale: float | None = None
+    map_intrinsics: tuple[str, ...] = ()
+    size: str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("variance", "depth_scale", "map_intrinsics", "size"):
+            if getattr(self, name) in (None, ()):
+                continue
+            if self.depth is None or (self.depth in OWN_DEPTH and name != "size"):
+                needed = "--depth" if self.depth is None else "--depth DIR"
+                raise ValueError(f"--{name.replace('_', '-')} goes with {needed} only")
+        parse_size(self.size)
+        parse_intrinsics(self.map_intrinsics, "--map-intrinsics")
+
+    def source(self, sequence: FrameSequence, indices: range) -> MapSource:
+        """The maps of the frames ``indices``. Raises NotADirectoryError, ValueError: there is no such folder, or maps
+        are missing or do not fit."""
+        size = parse_size(self.size)
+        if self.depth in OWN_DEPTH:
+            if len(sequence.without_depth) == len(sequence):
+                raise ValueError(f"--depth {self.depth}: the sequence {sequence.name!r} has no depth maps")
+            return own_depth(size)
+        K = parse_intrinsics(self.map_intrinsics, "--map-intrinsics")
+        how: dict[str, Any] = {"variance": self.variance, "scale": self.depth_scale, "intrinsics": K}
+        return folder_source(sequence, str(self.depth), **how, size=size, indices=indices)
+
+
+@dataclass(frozen=True, kw_only=True)
+class UfMOptions:
+    """UfM*.
+
+    Attributes:
+        preset: segmentation thresholds of the authors' code for a kind of recording; single --ufm.segment.* take
+            precedence
+        ufm_preset: paper: the paper's own settings (UfMStarConfig.paper), default: ours; --preset and single --ufm.*
+            take precedence
+        anchors: depths that show the error on which all views agree (docs/anchors.md). Without a word, or with corners:
+            corners tracked in the images; dense: a depth in every cell of the image, searched in earlier images; FILE:
+            landmarks, a line x y z sigma [m] each, in the world of the poses
+        posterior: also a depth that anchors correct, with its variance (docs/results/posterior.md); --anchors chooses
+            the anchors, default: dense
+        scale_from: network: its scale for COLMAP poses without one; anchors then show shape only
+        recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
+    """
+
+    preset: str | None = option(None, choices=PRESETS)
+    ufm_preset: str | None = option(None, choices=("paper", "default"))
+    anchors: bool | str = option(False, const=True)
+    posterior: bool = False
+    scale_from: str | None = option(None, choices=("network",))
+    recalibration: str | None = None
+    ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
+
+    def __post_init__(self) -> None:
+        _ = self.config  # checks the settings
+
+    @property
+    def config(self) -> UfMStarConfig:
+        """The configuration. Raises ValueError: settings of anchors or posterior without them."""
+        sections: dict[str, Any] = {}
+        for name, used in (("anchors", self.anchors or self.posterior), ("posterior", self.posterior)):
+            if self.ufm[name] is not None and not used:
+                raise ValueError(f"--ufm.{name}.* needs --{name}")
+            sections[name] = (self.ufm[name] or {}) if used else None
+        return UfMStarConfig.from_dict(self.ufm | sections)
+
+    def presets(self) -> dict[str, Any]:
+        """The settings of ``ufm_preset`` and ``preset``, by the names of the options."""
+        defaults: dict[str, Any] = {}
+        if self.ufm_preset == "paper":
+            changed = flat(UfMStarConfig.paper().to_dict()) | {"on_bad_frame": "skip"}
+            defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in SECTIONS}
+        if self.preset is not None:
+            preset = SPGFConfig.preset(self.preset).to_dict()
+            defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
+        return defaults
+
+    def fitted(self, weights: tuple[str, ...], source: DepthSource) -> Recalibration | None:
+        """The recalibration of the option, or of the file beside the weights; None: there is neither. Raises
+        FileNotFoundError: the named file does not exist; ValueError: it is no recalibration, or was fitted under other
+        settings or to another network."""
+        name = self.recalibration
+        if name == "none" or (name is None and not (weights and beside(weights[0]).is_file())):
+            return None
+        file = beside(weights[0]) if name is None else Path(name)
+        try:
+            recalibration = Recalibration.from_json(file)
+            recalibration.require(self.config, ", ".join(one["name"] for one in source.identity.get("files", ())))
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
+        return recalibration
