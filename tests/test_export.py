@@ -99,7 +99,7 @@ def test_merging_weighs_by_the_inverse_variance(tmp_path):
         maps = (np.float32([[depth]]), np.float32([[sigma]]))
         return Gated("0", 0, None, np.eye(4), np.eye(3), *maps)
 
-    export_cloud(iter([frame(2.1, 0.1), frame(2.4, 0.2), frame(np.nan, np.nan)]), tmp_path, 1.0, None)
+    export_cloud(iter([frame(2.1, 0.1), frame(2.4, 0.2), frame(np.nan, np.nan)]), tmp_path, 1.0)
     (point,) = read_ply(tmp_path / "export" / "cloud.ply")
     w = np.array([100, 25])
     np.testing.assert_allclose(point["z"], (w * [2.1, 2.4]).sum() / w.sum(), rtol=1e-6)
@@ -164,7 +164,7 @@ def test_a_bag_without_the_recording_has_the_maps_own_pixels(finished, tmp_path)
     from ufmstar_torch.eval.run.export_bag import export_bag
 
     out, _, truth = finished
-    export_bag(gated_frames(out, np.inf, np.inf), tmp_path, None)
+    export_bag(gated_frames(out, np.inf, np.inf), tmp_path)
     with pytest.raises(ValueError, match="has no topic of colour images, but /camera/camera_info"):
         open_sequence(tmp_path / "export" / "bag")
     _, info = next(Bag(tmp_path / "export" / "bag").messages(["/camera/camera_info"]))
@@ -177,17 +177,17 @@ def test_a_bag_that_cannot_be_written_leaves_the_one_before(finished, tmp_path):
 
     frames, folder = list(gated_frames(finished[0], np.inf, np.inf))[:2], tmp_path / "export" / "bag"
     for _ in range(2):
-        export_bag(iter(frames), tmp_path, None)
+        export_bag(iter(frames), tmp_path)
     for seconds in (np.nan, np.inf, 1e12):
         with pytest.raises(ValueError, match=f"{frames[1].name}: a bag's times are within 0 to"):
-            export_bag(iter([frames[0], replace(frames[1], timestamp=seconds)]), tmp_path, None)
+            export_bag(iter([frames[0], replace(frames[1], timestamp=seconds)]), tmp_path)
     assert len(list(Bag(folder).messages(["/tf"]))) == 2
     assert [path.name for path in folder.parent.iterdir()] == ["bag"]
     (tmp_path / "linked").mkdir()
     (tmp_path / "linked" / "export").mkdir()
     (tmp_path / "linked" / "export" / "bag").symlink_to(folder)
     with pytest.raises(ValueError, match="is no folder of an earlier export"):
-        export_bag(iter(frames), tmp_path / "linked", None)
+        export_bag(iter(frames), tmp_path / "linked")
 
 
 def test_a_rerun_recording(finished):

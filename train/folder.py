@@ -19,7 +19,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder
+from ufmstar_torch.eval.run.folder import FolderKind, output_folder
 from ufmstar_torch.train.member import WEIGHTS
 from ufmstar_torch.train.settings import Job
 
@@ -38,9 +38,9 @@ def identity(job: Job) -> dict[str, Any]:
 
 @contextmanager
 def open_folder(job: Job, *, resume: bool = False, overwrite: bool = False) -> Iterator[None]:
-    """Prepare the folder ``job.settings.out`` and hold it; see ``OutputFolder.open``."""
+    """Prepare the folder ``job.settings.out`` and hold it; see ``output_folder``."""
     content = {"identity": identity(job)}
-    with OutputFolder.open(job.settings.out, TRAINING, content, resume=resume, overwrite=overwrite):
+    with output_folder(job.settings.out, TRAINING, content, resume=resume, overwrite=overwrite):
         yield
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,6 +14,11 @@ from ufmstar_torch.eval.run.export_bag import export_bag
 from ufmstar_torch.eval.run.rerun_log import export_rerun
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.open import open_sequence
+
+_EXPORTERS: dict[str, Callable[..., str]] = {
+    "depth": export.export_depth, "cloud": export.export_cloud, "tum": export.export_trajectory,
+    "transforms": export.export_transforms, "mcap": export_bag, "rrd": export_rerun,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +41,7 @@ class ExportOptions:
     USAGE: ClassVar[str] = "ufmstar export OUT --to depth|cloud|tum|transforms|mcap|rrd [options]"
 
     out: Path = positional()
-    to: str = option(choices=("depth", "cloud", "tum", "transforms", "mcap", "rrd"))
+    to: str = option(choices=tuple(_EXPORTERS))
     max_sigma: float = option(float("inf"), positive=True)
     max_relative_sigma: float = option(float("inf"), positive=True)
     voxel: float = option(0.02, positive=True)
@@ -48,30 +53,19 @@ read = reader(ExportOptions, "ufmstar export")
 
 def main(options: ExportOptions) -> int:
     """Export, and print what was written; the exit code."""
-    out = options.out
+    out, to = options.out, options.to
     with usage_errors(FileNotFoundError, ValueError):
         frames = export.gated_frames(out, options.max_sigma, options.max_relative_sigma)
-        if options.to == "depth":
-            print(export.export_depth(frames, out))
-        elif options.to == "tum":
-            print(export.export_trajectory(frames, out))
-        elif options.to == "transforms":
-            print(export.export_transforms(frames, out, _sequence(out)))
-        else:
-            print(_with_images(options, frames))
+        if to not in ("depth", "tum"):
+            try:
+                frames = export.with_images(frames, _sequence(out))
+            except (OSError, ValueError) as error:
+                if to == "transforms":
+                    raise
+                print(f"no colours: {error}")
+        how = {"voxel": options.voxel} if to == "cloud" else {}
+        print(_EXPORTERS[to](frames, out, **how))
     return 0
-
-
-def _with_images(options: ExportOptions, frames: Iterator[export.Gated]) -> str:
-    """Export to a format that has the recording's images where they can be read; what was written."""
-    try:
-        sequence: FrameSequence | None = _sequence(options.out)
-    except (OSError, ValueError) as error:
-        print(f"no colours: {error}")
-        sequence = None
-    if options.to == "cloud":
-        return export.export_cloud(frames, options.out, options.voxel, sequence)
-    return (export_bag if options.to == "mcap" else export_rerun)(frames, options.out, sequence)
 
 
 def _sequence(out: Path) -> FrameSequence:

@@ -26,7 +26,7 @@ from ufmstar_torch.eval.engine.realtime import RealTime
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.run.export import Gated
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
+from ufmstar_torch.eval.run.folder import FolderKind, output_folder, remover
 from ufmstar_torch.eval.run.machine import share_threads
 from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
 from ufmstar_torch.eval.sequences import live as sources
@@ -127,7 +127,7 @@ def main(options: LiveOptions) -> int:
             model = _model(options)
             view = _view() if options.view else None
             if options.out is not None:
-                held.enter_context(OutputFolder.open(options.out, kind, started, overwrite=options.overwrite))
+                held.enter_context(output_folder(options.out, kind, started, overwrite=options.overwrite))
         times = RealTime(model)
         statistics, failure = _run(options, model, K, events, times, view)
         summary = times.summary(statistics)
@@ -240,9 +240,8 @@ def _view() -> _View:
             torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std)
         )
         camera = (result.T_world_cam, out.intrinsics[0].cpu().double().numpy())
-        frame = Gated(f"{result.stamp:.6f}", next(numbers), result.stamp, *camera, depth, sigma)
-        plots = {name: value for name, value in about.items() if name != "stamp"}
-        log.add(frame, np.asarray(result.image), None, plots)
+        named = (f"{result.stamp:.6f}", next(numbers), result.stamp)
+        log.add(Gated(*named, *camera, depth, sigma, figures=about, image=np.asarray(result.image)))
 
     return show
 

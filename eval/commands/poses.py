@@ -21,7 +21,7 @@ from ufmstar_torch.eval.reconstruct.reconstruct import (
     scale_model,
 )  # fmt: skip
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, OutputFolder
+from ufmstar_torch.eval.run.folder import FolderError, output_folder
 from ufmstar_torch.eval.run.machine import available_cores
 from ufmstar_torch.eval.sequences.frame import check_intrinsics, parse_slice
 from ufmstar_torch.eval.sequences.generic import INTRINSICS, open_images
@@ -109,7 +109,7 @@ def main(options: PosesOptions) -> int:
     require_pycolmap()
     with usage_errors(FolderError, FileNotFoundError, ValueError):
         images, size = _images(options)
-        with OutputFolder.open(options.out, POSES, {}, overwrite=options.overwrite):
+        with output_folder(options.out, POSES, {}, overwrite=options.overwrite):
             found = _reconstruct(options, images, size)
     _report(found, options.out)
     return 0

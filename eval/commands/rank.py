@@ -15,7 +15,7 @@ from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.progress import ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder, remover
 from ufmstar_torch.eval.run.machine import share_threads
 from ufmstar_torch.eval.run.panels import contact_sheet
 from ufmstar_torch.eval.run.pictures import SHEET
@@ -75,8 +75,8 @@ def main(options: RankOptions) -> int:
     with usage_errors(FolderError):
         kind.earlier(Path(options.out), resume=False, overwrite=options.overwrite)
         scores = _scores(options)
-        OutputFolder.open(Path(options.out), kind, {}, overwrite=options.overwrite).close()
-    return _write(options, scores)
+        with output_folder(Path(options.out), kind, {}, overwrite=options.overwrite):
+            return _write(options, scores)
 
 
 def _scores(options: RankOptions) -> ImageScores:

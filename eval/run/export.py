@@ -7,8 +7,9 @@ whose sigma is beyond a limit, is left out.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ from ufmstar_torch.eval.run.colours import known_where
 from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
 from ufmstar_torch.eval.run.gaussians import vertex_table, write_ply
 from ufmstar_torch.eval.run.writers import encode_length_png, fitting_unit, frame_file, read_frame
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
+from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS
 
@@ -32,16 +34,35 @@ _FOLD = 4_000_000  # points that are held until they are merged
 
 @dataclass(frozen=True, eq=False)
 class Gated:
-    """A frame of a run: its name, time [s], camera and maps [h, w]; depth and sigma [m] are NaN where left out."""
+    """A frame of a run: its name, camera and maps [h, w]; depth and sigma [m] are NaN where left out."""
 
     name: str
     index: int  # in the sequence
-    timestamp: float | None
+    timestamp: float | None  # [s]
     T_world_cam: NDArray[np.float64]  # [4, 4] [m]
-    intrinsics: NDArray[np.float64]  # [3, 3] [px]
+    intrinsics: NDArray[np.float64]  # [3, 3] of the maps [px]
     depth: NDArray[np.float32]
     sigma: NDArray[np.float32]
     anchors: NDArray[np.float32] | None = None  # [N, 4] u, v [px], depth and its standard deviation [m]
+    figures: Mapping[str, Any] = field(default_factory=dict)  # by name, as in frames.jsonl
+    image: NDArray[np.uint8] | None = None  # [H, W, 3] RGB of the recording
+    image_intrinsics: NDArray[np.float64] | None = None  # [3, 3] of the image [px]
+
+    def at_image(self) -> Gated:
+        """The frame with maps at the pixels of its image, NaN where they do not show what the image shows; itself
+        without an image."""
+        if self.image is None or self.image_intrinsics is None:
+            return self
+        K, size = self.image_intrinsics, (self.image.shape[0], self.image.shape[1])
+        depth, sigma = (resample_nearest(values, self.intrinsics, K, size) for values in (self.depth, self.sigma))
+        known = depth > 0
+        return replace(self, intrinsics=K, depth=known_where(known, depth), sigma=known_where(known, sigma))
+
+    def points(self) -> tuple[NDArray[np.float64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """[P, 3] the points of the pixels that are kept, in the camera's axes [m], and these pixels' rows and
+        columns."""
+        v, u = np.nonzero(np.isfinite(self.depth))
+        return points_of(u, v, self.depth[v, u], self.intrinsics), (v, u)
 
 
 def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
@@ -68,11 +89,18 @@ def _gated(out: Path, done: list[dict], max_sigma: float, max_relative_sigma: fl
             sigma = np.sqrt(variance)
             kept = maps["valid"] & (depth > 0) & np.isfinite(depth)
             kept &= (sigma <= max_sigma) & (sigma <= max_relative_sigma * depth)
-        nothing = np.float32(np.nan)
-        depth, sigma = np.where(kept, depth, nothing), np.where(kept, sigma, nothing)
-        camera = (maps["T_world_cam"], maps["intrinsics"])
-        about = (record["name"], record["index"], record.get("timestamp"))
-        yield Gated(*about, *camera, depth, sigma, maps.get("anchors"))
+        about = (record["name"], record["index"], record.get("timestamp"), maps["T_world_cam"], maps["intrinsics"])
+        yield Gated(*about, known_where(kept, depth), known_where(kept, sigma), maps.get("anchors"), record)
+
+
+def with_images(frames: Iterator[Gated], sequence: FrameSequence) -> Iterator[Gated]:
+    """The frames with the images of their recording, where they can be read."""
+    for frame in frames:
+        if frame.index < len(sequence) and sequence.names[frame.index] == frame.name:
+            with suppress(FrameError):
+                recorded = sequence[frame.index]
+                frame = replace(frame, image=recorded.image, image_intrinsics=recorded.intrinsics)
+        yield frame
 
 
 def export_depth(frames: Iterator[Gated], out: Path) -> str:
@@ -100,16 +128,18 @@ def export_trajectory(frames: Iterator[Gated], out: Path) -> str:
     return f"{file}: {len(lines) - 1} poses"
 
 
-def export_cloud(frames: Iterator[Gated], out: Path, voxel: float, sequence: FrameSequence | None) -> str:
-    """cloud.ply: x y z and sigma [m], and red green blue where the images can be read.
+def export_cloud(frames: Iterator[Gated], out: Path, voxel: float) -> str:
+    """cloud.ply: x y z and sigma [m], and red green blue where images can be read.
 
     A point is the mean of the pixels in a voxel of that side [m], weighted by 1/sigma^2. Its sigma is
     sqrt(n / sum 1/sigma^2): a network's views err alike, so that it does not shrink with their number n.
     """
     keys, sums = np.zeros(0, np.int64), np.zeros((0, 8))
     waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+    coloured = False
     for frame in frames:
-        waiting.append(_voxels(frame, voxel, image_of(frame, sequence)))
+        coloured |= frame.image is not None
+        waiting.append(_voxels(frame, voxel))
         if sum(len(part) for part, _ in waiting) > _FOLD:
             keys, sums = _merged([(keys, sums), *waiting])
             waiting = []
@@ -117,7 +147,7 @@ def export_cloud(frames: Iterator[Gated], out: Path, voxel: float, sequence: Fra
     weight, count = sums[:, :1], sums[:, 7:]
     position, colour, sigma = sums[:, 1:4] / weight, sums[:, 4:7] / weight, np.sqrt(count / weight)
     kinds, columns = dict.fromkeys(("x", "y", "z", "sigma"), "<f4"), [position, sigma]
-    if sequence is not None:
+    if coloured:
         kinds |= dict.fromkeys(("red", "green", "blue"), "|u1")
         columns.append(np.rint(colour))
     file = export_folder(out) / "cloud.ply"
@@ -125,36 +155,28 @@ def export_cloud(frames: Iterator[Gated], out: Path, voxel: float, sequence: Fra
     return f"{file}: {len(keys)} points"
 
 
-def export_transforms(frames: Iterator[Gated], out: Path, sequence: FrameSequence) -> str:
-    """transforms.json with images as they are, and depth and sigma at their pixels (16 bits, 0 = left out)."""
+def export_transforms(frames: Iterator[Gated], out: Path) -> str:
+    """transforms.json with images as they are, and depth and sigma at their pixels (16 bits, 0 = left out). Frames
+    whose image cannot be read are left out."""
     import cv2
 
     folder, unit, listed = export_folder(out, "transforms"), None, []
     for name in ("images", "depth", "sigma"):
         export_folder(out, "transforms", name)
     for frame in frames:
-        image = image_of(frame, sequence)
-        if image is None or image.image is None:
+        if frame.image is None:
             continue
-        K, size = image.intrinsics, (image.image.shape[0], image.image.shape[1])
-        depth, sigma = (resample_nearest(values, frame.intrinsics, K, size) for values in (frame.depth, frame.sigma))
-        known = depth > 0  # the image may show more than the maps, where they are 0
-        depth, sigma = known_where(known, depth), known_where(known, sigma)
-        unit = unit or fitting_unit(depth)
+        seen = frame.at_image()
+        unit = unit or fitting_unit(seen.depth)
         entry: dict[str, Any] = {"file_path": f"images/{frame.name}.png"}
-        for kind, values in (("depth", depth), ("sigma", sigma)):
+        for kind, values in (("depth", seen.depth), ("sigma", seen.sigma)):
             write_bytes_atomic(folder / kind / f"{frame.name}.png", encode_length_png(values, unit, kind))
             entry[f"{kind}_file_path"] = f"{kind}/{frame.name}.png"
-        png = cv2.imencode(".png", image.image[..., ::-1])[1].tobytes()
+        png = cv2.imencode(".png", frame.image[..., ::-1])[1].tobytes()
         write_bytes_atomic(folder / entry["file_path"], png)
-        camera = {
-            "fl_x": K[0, 0],
-            "fl_y": K[1, 1],
-            "cx": K[0, 2] + 0.5,
-            "cy": K[1, 2] + 0.5,
-            "w": size[1],
-            "h": size[0],
-        }
+        fx, fy, cx, cy = pinhole_values(seen.intrinsics)
+        height, width = seen.depth.shape
+        camera = {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "w": width, "h": height}
         listed.append(entry | camera | {"transform_matrix": CONVENTIONS["opengl"].convert(frame.T_world_cam)})
     plain = {"camera_model": "OPENCV", "depth_unit_scale_factor": unit, "frames": listed}
     write_json_atomic(folder / "transforms.json", plain)
@@ -169,26 +191,21 @@ def run_settings(out: Path) -> dict[str, Any]:
         raise ValueError(f"{out}/summary.json is not that of a run: {error}") from error
 
 
-def points_in_camera(frame: Gated) -> tuple[NDArray[np.float64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """[P, 3] the points of the pixels that are kept, in the camera's axes [m], and those pixels' rows and columns."""
-    v, u = np.nonzero(np.isfinite(frame.depth))
-    return points_of(u, v, frame.depth[v, u], frame.intrinsics), (v, u)
-
-
 def points_of(u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any], K: NDArray[np.float64]) -> NDArray[np.float64]:
     """[P, 3] in the camera's axes [m] of pixels u, v [px] with a depth [m]."""
     z, y = depth.astype(np.float64), (v - K[1, 2]) / K[1, 1]
     return np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1)
 
 
-def _voxels(frame: Gated, voxel: float, image: Frame | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _voxels(frame: Gated, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """[P] the number of each pixel's voxel, and [P, 8] its weight w, w x, w y, w z, w r, w g, w b, and 1."""
-    in_camera, (v, u) = points_in_camera(frame)
+    in_camera, (v, u) = frame.points()
     sigma, K, T = np.maximum(frame.sigma[v, u], _LEAST_SIGMA), frame.intrinsics, frame.T_world_cam
     points = in_camera @ T[:3, :3].T + T[:3, 3]
     colour = np.zeros((len(points), 3))
-    if image is not None and image.image is not None:
-        colour = resample_nearest(image.image, image.intrinsics, K, frame.depth.shape)[v, u].astype(np.float64)
+    if frame.image is not None and frame.image_intrinsics is not None:
+        seen = resample_nearest(frame.image, frame.image_intrinsics, K, (frame.depth.shape[0], frame.depth.shape[1]))
+        colour = seen[v, u].astype(np.float64)
     weight = 1 / np.square(sigma.astype(np.float64))[:, None]
     number = np.floor(points / voxel)
     near = (np.abs(number) < _HALF).all(axis=1)
@@ -203,16 +220,6 @@ def _merged(
     keys, index = np.unique(np.concatenate([part[0] for part in parts]), return_inverse=True)
     columns = np.concatenate([part[1] for part in parts]).T
     return keys, np.stack([np.bincount(index, column, len(keys)) for column in columns], axis=-1)
-
-
-def image_of(frame: Gated, sequence: FrameSequence | None) -> Frame | None:
-    """The frame of the recording; None where it cannot be read."""
-    if sequence is None or frame.index >= len(sequence) or sequence.names[frame.index] != frame.name:
-        return None
-    try:
-        return sequence[frame.index]
-    except FrameError:
-        return None
 
 
 def export_folder(out: Path, *names: str) -> Path:

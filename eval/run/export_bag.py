@@ -16,10 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.eval.run.colours import known_where
-from ufmstar_torch.eval.run.export import Gated, export_folder, image_of, points_in_camera
-from ufmstar_torch.eval.sequences.frame import FrameSequence
-from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
+from ufmstar_torch.eval.run.export import Gated, export_folder
 from ufmstar_torch.optional import optional
 
 WORLD, CAMERA = "world", "camera"
@@ -30,7 +27,7 @@ _LATEST = 2.0**31 - 1  # [s], of builtin_interfaces/Time
 _FLOAT32 = 7  # of sensor_msgs/PointField
 
 
-def export_bag(frames: Iterator[Gated], out: Path, sequence: FrameSequence | None) -> str:
+def export_bag(frames: Iterator[Gated], out: Path) -> str:
     """OUT/export/bag: of each frame the image (where the recording can be read), camera info, depth and sigma (32FC1,
     [m]), its points in the camera's axes with their variance [m^2], and the camera's pose in tf. An earlier bag is
     replaced when the new one is whole. Raises ModuleNotFoundError: rosbags is not installed; ValueError: a frame's time
@@ -42,16 +39,14 @@ def export_bag(frames: Iterator[Gated], out: Path, sequence: FrameSequence | Non
         raise ValueError(f"{folder} is no folder of an earlier export: move it away")
     ros = _Messages(stores.get_typestore(stores.Stores.ROS2_HUMBLE))
     with TemporaryDirectory(dir=folder.parent, prefix=".bag") as new:
-        count = _write_bag(rosbag2, ros, Path(new) / "bag", frames, sequence)
+        count = _write_bag(rosbag2, ros, Path(new) / "bag", frames)
         if folder.exists():
             shutil.rmtree(folder)
         (Path(new) / "bag").rename(folder)
     return f"{folder}: {count} frames"
 
 
-def _write_bag(
-    rosbag2: Any, ros: _Messages, folder: Path, frames: Iterator[Gated], sequence: FrameSequence | None
-) -> int:
+def _write_bag(rosbag2: Any, ros: _Messages, folder: Path, frames: Iterator[Gated]) -> int:
     """Write the bag into a new folder; the number of frames."""
     count = 0
     with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
@@ -63,27 +58,25 @@ def _write_bag(
             if not seconds < _LATEST:
                 raise ValueError(f"{frame.name}: a bag's times are within 0 to 2^31 s, got {seconds}")
             stamp = round(max(0.0, seconds) * 1e9)
-            for topic, message in _of_frame(ros, stamp, frame, sequence).items():
+            for topic, message in _of_frame(ros, stamp, frame).items():
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=ros.store)
                 writer.write(connections[topic], stamp, ros.store.serialize_cdr(message, message.__msgtype__))
     return count
 
 
-def _of_frame(ros: _Messages, stamp: int, frame: Gated, sequence: FrameSequence | None) -> dict[str, Any]:
+def _of_frame(ros: _Messages, stamp: int, frame: Gated) -> dict[str, Any]:
     """A frame's messages by topic."""
-    image, K, depth, sigma = image_of(frame, sequence), frame.intrinsics, frame.depth, frame.sigma
-    messages = {TF: ros.tf(stamp, frame.T_world_cam)}
-    if image is not None and image.image is not None:
-        K, size = image.intrinsics, (image.image.shape[0], image.image.shape[1])
-        maps = (resample_nearest(values, frame.intrinsics, K, size) for values in (depth, sigma))
-        depth, sigma = (known_where(values > 0, values) for values in maps)
-        messages[IMAGE] = ros.image(stamp, image.image, "rgb8")
-    messages[INFO] = ros.info(stamp, K, depth.shape)
-    messages[DEPTH], messages[SIGMA] = (ros.image(stamp, values, "32FC1") for values in (depth, sigma))
-    points, (v, u) = points_in_camera(frame)
-    messages[CLOUD] = ros.cloud(stamp, np.column_stack([points, np.square(frame.sigma[v, u])]))
-    return messages
+    seen, (points, (v, u)) = frame.at_image(), frame.points()
+    image = {} if frame.image is None else {IMAGE: ros.image(stamp, frame.image, "rgb8")}
+    return {
+        TF: ros.tf(stamp, frame.T_world_cam),
+        **image,
+        INFO: ros.info(stamp, seen.intrinsics, seen.depth.shape),
+        DEPTH: ros.image(stamp, seen.depth, "32FC1"),
+        SIGMA: ros.image(stamp, seen.sigma, "32FC1"),
+        CLOUD: ros.cloud(stamp, np.column_stack([points, np.square(frame.sigma[v, u])])),
+    }
 
 
 class _Messages:
@@ -106,19 +99,12 @@ class _Messages:
         return self._make("sensor_msgs/msg/Image", header=self._header(stamp), **size, **how)
 
     def info(self, stamp: int, K: NDArray[np.float64], size: tuple[int, ...]) -> Any:
-        zero = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+        region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
+        roi = self._make("sensor_msgs/msg/RegionOfInterest", **region, do_rectify=False)
         P = np.hstack([K, np.zeros((3, 1))]).ravel()
-        how: dict[str, Any] = {
-            "d": np.zeros(5),
-            "k": K.ravel().copy(),
-            "r": np.eye(3).ravel(),
-            "p": P,
-            "binning_x": 0,
-            "binning_y": 0,
-        }
-        how |= {"height": size[0], "width": size[1], "distortion_model": "plumb_bob"}
-        roi = self._make("sensor_msgs/msg/RegionOfInterest", **zero)
-        return self._make("sensor_msgs/msg/CameraInfo", header=self._header(stamp), roi=roi, **how)
+        camera = {"d": np.zeros(5), "k": K.ravel().copy(), "r": np.eye(3).ravel(), "p": P, "roi": roi}
+        how = {"height": size[0], "width": size[1], "distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0}
+        return self._make("sensor_msgs/msg/CameraInfo", header=self._header(stamp), **camera, **how)
 
     def cloud(self, stamp: int, points: NDArray[Any]) -> Any:
         data = np.ascontiguousarray(points, dtype="<f4")

@@ -9,11 +9,11 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from ufmstar_torch.eval.run.files import remove_temporaries, to_json, write_json_atomic
 
@@ -45,9 +45,6 @@ class FolderKind:
     # at the end.
     format: int | None = None
     lock: str | None = None  # path of the lock file below the folder; None = no lock
-    # "life" = one process holds the lock until it closes the folder; "opening" = only while it opens the folder, since
-    # several processes work in it.
-    held: Literal["life", "opening"] = "life"
     wait: float = 0.0  # longest time [s] to wait for the lock
     allowed: tuple[str, ...] = ()  # entries that may exist in a folder before its manifest does
     # glob patterns below the folder of temporary files of a killed process.
@@ -56,12 +53,6 @@ class FolderKind:
     identity: Callable[[Manifest, Manifest], Manifest] = lambda manifest, _: manifest["identity"]
     # of (the manifest in the folder, the new one): the manifest from then on.
     merge: Callable[[Manifest, Manifest], Manifest] = lambda then, _: then
-
-    def new_manifest(self, content: Manifest) -> dict[str, Any]:
-        """The manifest of new work, as plain values."""
-        own = {"state": _UNFINISHED} if self.format is None else {"format": self.format}
-        plain: dict[str, Any] = to_json({"program": self.program, **own, **content})
-        return plain
 
     def read_manifest(self, out: Path) -> dict[str, Any]:
         """The manifest of a folder. Raises FolderError: it is damaged, or of another program or format."""
@@ -107,65 +98,51 @@ class FolderKind:
         return [path for path in entries if path not in own and not path.name.startswith(f".{manifest.name}.")]
 
 
-class OutputFolder:
-    """An output folder of a program, at ``path``; ``resumed`` if it contained earlier work that continues. Use ``with
-    OutputFolder.open(...)``, or close it."""
+@contextmanager
+def output_folder(
+    out: Path, kind: FolderKind, content: Manifest, *, resume: bool = False, overwrite: bool = False
+) -> Iterator[bool]:
+    """Prepare a folder for new work, or to ``resume`` or ``overwrite`` earlier work, and hold its lock.
 
-    def __init__(self, path: Path, *, resumed: bool, held: ExitStack) -> None:
-        self.path, self.resumed, self._held = path, resumed, held
+    Args:
+        out: created if missing.
+        kind: of the folder.
+        content: of the manifest, beside program and format.
 
-    @classmethod
-    def open(
-        cls, out: Path, kind: FolderKind, content: Manifest, *, resume: bool = False, overwrite: bool = False
-    ) -> OutputFolder:
-        """Prepare a folder for new work, or to ``resume`` or ``overwrite`` earlier work.
+    Yields:
+        True if the folder contains earlier work that continues.
 
-        Args:
-            out: created if missing.
-            kind: of the folder.
-            content: of the manifest, beside program and format.
-
-        Raises:
-            FolderError: as :meth:`FolderKind.earlier`; or the earlier work was started with other values (the message
-                names them), or another process holds the folder.
-            OSError: the folder cannot be made or locked.
-        """
-        kind.earlier(out, resume=resume, overwrite=overwrite)
-        (out / kind.manifest).parent.mkdir(parents=True, exist_ok=True)
-        with ExitStack() as held:
-            if kind.lock is not None:
-                lock = hold(out / kind.lock, wait=kind.wait)
-                if lock is None:
-                    preparing = f"another process is preparing it for over {kind.wait:g} s"
-                    busy = preparing if kind.held == "opening" else f"another {kind.noun} is writing there now"
-                    raise FolderError(f"--out {out}: {busy}")
-                held.callback(lock.release)
-            # Checked again: another process may have made the folder while this one waited.
-            resumed = kind.earlier(out, resume=resume, overwrite=overwrite) and resume
-            for pattern in kind.temporary:
-                remove_temporaries(out.glob(pattern))
-            manifest = kind.new_manifest(content)
-            if resumed:
-                earlier = kind.read_manifest(out)
-                changed = differences(kind.identity(earlier, manifest), kind.identity(manifest, earlier))
-                if changed:
-                    raise FolderError(f"--resume: the {kind.noun} in {out} was started with other input: {changed}")
-                manifest = dict(kind.merge(earlier, manifest))
-            else:
-                kind.clear(out)
-            if not resumed or manifest != earlier:
-                write_json_atomic(out / kind.manifest, manifest)
-            return cls(out, resumed=resumed, held=held.pop_all() if kind.held == "life" else ExitStack())
-
-    def close(self) -> None:
-        """Release the lock."""
-        self._held.close()
-
-    def __enter__(self) -> OutputFolder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    Raises:
+        FolderError: as :meth:`FolderKind.earlier`; or the earlier work was started with other values (the message
+            names them), or another process holds the folder.
+        OSError: the folder cannot be made or locked.
+    """
+    kind.earlier(out, resume=resume, overwrite=overwrite)
+    (out / kind.manifest).parent.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as held:
+        if kind.lock is not None:
+            lock = hold(out / kind.lock, wait=kind.wait)
+            if lock is None:
+                for_long = f" for over {kind.wait:g} s" if kind.wait else ""
+                raise FolderError(f"--out {out}: another {kind.noun} is writing there now{for_long}")
+            held.callback(lock.release)
+        # Checked again: another process may have made the folder while this one waited.
+        resumed = kind.earlier(out, resume=resume, overwrite=overwrite) and resume
+        for pattern in kind.temporary:
+            remove_temporaries(out.glob(pattern))
+        started = {"state": _UNFINISHED} if kind.format is None else {"format": kind.format}
+        manifest: dict[str, Any] = to_json({"program": kind.program, **started, **content})
+        if resumed:
+            earlier = kind.read_manifest(out)
+            changed = differences(kind.identity(earlier, manifest), kind.identity(manifest, earlier))
+            if changed:
+                raise FolderError(f"--resume: the {kind.noun} in {out} was started with other input: {changed}")
+            manifest = dict(kind.merge(earlier, manifest))
+        else:
+            kind.clear(out)
+        if not resumed or manifest != earlier:
+            write_json_atomic(out / kind.manifest, manifest)
+        yield resumed
 
 
 def remover(*patterns: str) -> Callable[[Path], None]:

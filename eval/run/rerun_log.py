@@ -10,7 +10,7 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import monotonic, sleep
@@ -23,15 +23,16 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
-from ufmstar_torch.eval.run.export import Gated, export_folder, image_of, points_in_camera, points_of
+from ufmstar_torch.eval.run.export import Gated, export_folder, points_of
 from ufmstar_torch.eval.run.gaussians import RADIUS, Components
 from ufmstar_torch.eval.run.writers import fitting_unit
-from ufmstar_torch.eval.sequences.frame import FrameSequence
-from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.optional import optional
 
 WORLD, CAMERA = "world", "world/camera"
+# Of a finished run, and of one that goes on.
+_PLOTS = ("mean_sigma", "mean_disagreement", "mean_network_sigma", "mean_anchored", "mean_bias", "components")
+_PLOTS += ("latency_ms", "depth_m", "sigma_m", "dropped", "skipped")
 _JPEG = 80  # quality
 _POINTS = 4000  # of a frame, coloured by sigma
 _LOCAL = "127.0.0.1"
@@ -52,14 +53,8 @@ class RerunLog:
         self._unit: float | None = None
         stream.log(WORLD, self._rr.ViewCoordinates.RDF, static=True)
 
-    def add(
-        self,
-        frame: Gated,
-        image: NDArray[np.uint8] | None,
-        K_image: NDArray[np.float64] | None,
-        plots: Mapping[str, float],
-    ) -> None:
-        """Log a frame with its image [H, W, 3] RGB and that one's K_image [3, 3] [px], and numbers by name."""
+    def add(self, frame: Gated) -> None:
+        """Log a frame with its image, and plot its numbers."""
         rr, log, T = self._rr, self._stream.log, frame.T_world_cam
         if self.scale is None:
             self.scale = ColourScale(*robust_range([frame.sigma], from_zero=True), ERROR_MAP)
@@ -68,24 +63,25 @@ class RerunLog:
         if frame.timestamp is not None:
             self._stream.set_time("time", duration=frame.timestamp)
         log(CAMERA, rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-        if image is not None:
-            if K_image is not None:
-                size = [image.shape[1], image.shape[0]]
-                log(f"{CAMERA}/image", rr.Pinhole(image_from_camera=K_image, resolution=size))
-            log(f"{CAMERA}/image/rgb", rr.Image(image).compress(jpeg_quality=_JPEG))
+        if frame.image is not None:
+            if frame.image_intrinsics is not None:
+                size = [frame.image.shape[1], frame.image.shape[0]]
+                log(f"{CAMERA}/image", rr.Pinhole(image_from_camera=frame.image_intrinsics, resolution=size))
+            log(f"{CAMERA}/image/rgb", rr.Image(frame.image).compress(jpeg_quality=_JPEG))
         size = [frame.depth.shape[1], frame.depth.shape[0]]
         log(f"{CAMERA}/maps", rr.Pinhole(image_from_camera=frame.intrinsics, resolution=size))
         counts = np.nan_to_num(np.rint(frame.depth / self._unit), nan=0).clip(0, 65535).astype(np.uint16)
         log(f"{CAMERA}/maps/depth", rr.DepthImage(counts, meter=1 / self._unit))
         log(f"{CAMERA}/maps/sigma", rr.Image(self.scale.rgb(frame.sigma)).compress(jpeg_quality=_JPEG))
-        points, (v, u) = points_in_camera(frame)
+        points, (v, u) = frame.points()
         some = slice(None, None, max(1, len(points) // _POINTS))
         colours = self.scale.rgb(frame.sigma[v, u][some])
         log(f"{CAMERA}/points", rr.Points3D(points[some], colors=colours, radii=rr.Radius.ui_points(2)))
         if frame.anchors is not None:
             self._add_anchors(frame, frame.anchors)
-        for name, value in plots.items():
-            log(f"plots/{name}", rr.Scalars(value))
+        for name in _PLOTS:
+            if isinstance(value := frame.figures.get(name), int | float):
+                log(f"plots/{name}", rr.Scalars(value))
 
     def _add_anchors(self, frame: Gated, anchors: NDArray[np.float32]) -> None:
         """Anchors [N, 4], and lines from them to the depth of their pixels, coloured by the distance as sigma is."""
@@ -149,15 +145,11 @@ def _listens(port: int) -> bool:
     return True
 
 
-_PLOTS = ("mean_sigma", "mean_disagreement", "mean_network_sigma", "mean_anchored", "mean_bias", "components")
-
-
-def export_rerun(frames: Iterator[Gated], out: Path, sequence: FrameSequence | None) -> str:
+def export_rerun(frames: Iterator[Gated], out: Path) -> str:
     """OUT/export/run.rrd; an earlier one is replaced when the new one is whole. Raises ModuleNotFoundError: rerun-sdk
     is not installed."""
     rr, count = rerun(), 0
     file = export_folder(out) / "run.rrd"
-    records = {record["name"]: record for record in read_records((out / RECORDS).read_bytes(), out / RECORDS)}
     with TemporaryDirectory(dir=file.parent, prefix=".rrd") as new:
         with rr.RecordingStream("ufmstar") as stream:
             stream.save(Path(new) / file.name, default_blueprint=blueprint())
@@ -165,10 +157,7 @@ def export_rerun(frames: Iterator[Gated], out: Path, sequence: FrameSequence | N
             _log_gaussians(rr, stream, out / "mixture.npz")
             for frame in frames:
                 count += 1
-                image, record = image_of(frame, sequence), records[frame.name]
-                pixels, K = (None, None) if image is None else (image.image, image.intrinsics)
-                plots = {name: value for name in _PLOTS if isinstance(value := record.get(name), int | float)}
-                log.add(frame, pixels, K, plots)
+                log.add(frame)
             stream.flush()
         (Path(new) / file.name).replace(file)
     return f"{file}: {count} frames; sigma is coloured from 0 to {log.scale.high if log.scale else 0:.3g} m"

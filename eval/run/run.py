@@ -15,11 +15,12 @@ from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.engine.writer_thread import WriterThread
 from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.run.folder import output_folder
 from ufmstar_torch.eval.run.gaussians import write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.pictures import Finished, common_columns, draw_sheet, draw_video
 from ufmstar_torch.eval.run.recorder import FrameRecorder
-from ufmstar_torch.eval.run.run_folder import RunFolder
+from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
 from ufmstar_torch.eval.run.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
 from ufmstar_torch.stream_warnings import LOGGER
 
@@ -42,11 +43,13 @@ def run(
     run as KeyboardInterrupt does.
 
     Raises:
-        FolderError: the folder cannot be used (``OutputFolder.open``).
+        FolderError: the folder cannot be used (``output_folder``).
         OSError: the summary cannot be written.
         Exception: whatever else the network or UfM* raise, after the summary was written.
     """
-    with RunFolder.open(out, job.identity(), resume=resume, overwrite=overwrite) as folder:
+    path, identity = Path(out), {"identity": job.identity()}
+    how = {"resume": resume, "overwrite": overwrite}
+    with output_folder(path, RUN, identity, **how) as resumed, RunFolder(path, resumed) as folder:
         for text in write_summary(job, folder, *GOING_ON)["warnings"]:
             LOGGER.warning("%s", text)
         ending, outputs = (FAILED, "an error in the program"), {}

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.files import to_json, write_atomic
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, remover
 from ufmstar_torch.eval.run.writers import FRAMES, PNGS, frame_file
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
 from ufmstar_torch.models.checkpoints import read_tensors
@@ -63,27 +63,17 @@ class Checkpoint:
 
 
 class RunFolder:
-    """The output folder of a new or continued run. Use ``with RunFolder.open(...)``. ``checkpoint`` is that after the
-    last finished frame (on disk it may be some seconds older), ``records`` the lines of frames.jsonl up to there."""
+    """The output folder of a new or ``resumed`` run, for use with ``with``. ``checkpoint`` is that after the last
+    finished frame (on disk it may be some seconds older), ``records`` the lines of frames.jsonl up to there. Raises
+    FolderError: the checkpoint cannot be read."""
 
-    def __init__(self, folder: OutputFolder) -> None:
-        self.path, self._folder = folder.path, folder
-        self.checkpoint, self.records = _load(folder.path) if folder.resumed else (Checkpoint(), [])
+    def __init__(self, path: Path, resumed: bool) -> None:
+        self.path = path
+        self.checkpoint, self.records = _load(path) if resumed else (Checkpoint(), [])
         (self.path / FRAMES).mkdir(exist_ok=True)
         lines = b"".join(_line(record) for record in self.records)
         write_atomic(self.path / RECORDS, lambda file: file.write(lines))
         self._stored, self._stored_at = self.checkpoint, monotonic()
-
-    @classmethod
-    def open(cls, path: str | Path, identity: Mapping[str, Any], *, resume: bool, overwrite: bool) -> RunFolder:
-        """Prepare the folder; see ``OutputFolder.open``. ``identity`` holds plain values that must be those of the run
-        that is to be continued. Raises FolderError also where its checkpoint cannot be read."""
-        folder = OutputFolder.open(Path(path), RUN, {"identity": identity}, resume=resume, overwrite=overwrite)
-        try:
-            return cls(folder)
-        except BaseException:
-            folder.close()
-            raise
 
     def __enter__(self) -> RunFolder:
         return self
@@ -91,7 +81,6 @@ class RunFolder:
     def __exit__(self, *_: object) -> None:
         with suppress(OSError):  # a full disk: the run continues from the earlier checkpoint
             self.store()
-        self._folder.close()
 
     def add(self, record: Mapping[str, Any], checkpoint: Checkpoint) -> None:
         """Record a frame whose files are written, and store the checkpoint if the last one is old. Raises OSError."""

@@ -22,7 +22,7 @@ from ufmstar_torch.eval.engine.judge import RowFigures
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.metrics.packed_sums import pack
 from ufmstar_torch.eval.run.files import remove_temporaries, write_atomic, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, hold, remover
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, hold, output_folder, remover
 from ufmstar_torch.eval.suite.record import FORMAT, Record
 from ufmstar_torch.eval.suite.work_items import ALL, Shard, WorkItem
 
@@ -46,11 +46,11 @@ class EvalFolder:
     def open(
         cls, out: Path, about: Mapping[str, Any], *, shard: Shard = ALL, resume: bool = False, overwrite: bool = False
     ) -> EvalFolder:
-        """Make the folder, or continue in it; see ``OutputFolder.open``. When continuing, rows, sequences and networks
+        """Make the folder, or continue in it; see ``output_folder``. When continuing, rows, sequences and networks
         of ``about`` (eval.json) are added to those of the earlier evaluation; suite, settings and the networks of the
         same base must be the same. The cache of predictions is never removed. Raises FolderError also where another
         process evaluates the same shard, or any shard of a folder that is to be overwritten."""
-        with OutputFolder.open(out, EVALUATION, about, resume=resume, overwrite=overwrite):
+        with output_folder(out, EVALUATION, about, resume=resume, overwrite=overwrite):  # others work there too
             lock = hold(out / f"eval-{shard.index}-of-{shard.count}.lock")
         if lock is None:
             raise FolderError(f"--out {out}: another process is evaluating shard {shard} there now")
@@ -184,7 +184,6 @@ EVALUATION = FolderKind(
     manifest="eval.json",
     format=FORMAT,
     lock="eval.lock",
-    held="opening",
     wait=60.0,
     clear=_clear,
     allowed=(CACHE,),
