@@ -125,7 +125,7 @@ def test_pictures_and_mixture(path, tmp_path):
 
     out = tmp_path / "out"
     summary = run(network_job(path, video=True, sheet=True, frames=slice(0, 4)), out)
-    made = {"mixture.ply", "mixture.npz", "curves.json", "contact_sheet.png", "preview.mp4"}
+    made = {"mixture.ply", "mixture.npz", "contact_sheet.png", "preview.mp4"}
     assert summary["outputs"] == dict.fromkeys(made)
     assert all((out / name).is_file() for name in made)
     video = cv2.VideoCapture(str(out / "preview.mp4"))

@@ -68,10 +68,6 @@ class RunMetrics(FrameSink):
         """delta1, nll, ece_delta, ece_q, spearman, ... by name; without ground truth nothing."""
         return {name: metrics.compute() for name, metrics in self._metrics.items()}
 
-    def curves(self) -> dict[str, dict[str, Any]]:
-        """Calibration and sparsification curves and the entropy histogram, by name."""
-        return {name: metrics.curves() for name, metrics in self._metrics.items()}
-
     def take(self, result: FrameResult) -> None:
         """Add a frame."""
         started, row = perf_counter(), result.rows.get(self._key)

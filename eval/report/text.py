@@ -12,7 +12,7 @@ from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.table import markdown
 from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.eval.report.write import Report
-from ufmstar_torch.eval.run.summary import NEAR_ZERO
+from ufmstar_torch.eval.run.frame_record import NEAR_ZERO
 
 # [nats] A mean NLL above it is that of a few pixels: sigma = .25 d of a room makes about 1.
 NLL_OF_FEW = 100.0

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ufmstar_torch.anchors.landmarks import LandmarkSource
 from ufmstar_torch.anchors.tracker import LandmarkTracker
@@ -21,12 +22,23 @@ from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.setting import CORNERS, Setting
-from ufmstar_torch.eval.run.run_folder import Checkpoint
 from ufmstar_torch.eval.run.scale import NetworkScale
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.plugins import load_plugins
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The state of a run after a frame."""
+
+    position: int = 0  # number of frames handled, skipped ones included
+    unit: float | None = None  # of the depth PNGs [m per count]; None: no frame is written yet
+    state: dict[str, Tensor] = field(default_factory=dict)  # of the run's row: UfM*, alternation, tracks
+    metrics: dict[str, dict[str, Tensor]] = field(default_factory=dict)  # sums of the metrics, by name
+    # {"first", "frames", "seconds"} of every start of the program.
+    sessions: list[dict[str, float]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)

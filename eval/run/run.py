@@ -14,14 +14,12 @@ from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.engine.writer_thread import WriterThread
-from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.run.folder import output_folder
 from ufmstar_torch.eval.run.gaussians import write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.pictures import Finished, common_columns, draw_sheet, draw_video
-from ufmstar_torch.eval.run.recorder import FrameRecorder
 from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
-from ufmstar_torch.eval.run.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
+from ufmstar_torch.eval.run.summary import FAILED, FINISHED, INTERRUPTED, write_summary
 from ufmstar_torch.stream_warnings import LOGGER
 
 
@@ -49,8 +47,9 @@ def run(
     """
     path, identity = Path(out), {"identity": job.identity()}
     how = {"resume": resume, "overwrite": overwrite}
-    with output_folder(path, RUN, identity, **how) as resumed, RunFolder(path, resumed) as folder:
-        for text in write_summary(job, folder, *GOING_ON)["warnings"]:
+    with output_folder(path, RUN, identity, **how) as resumed, RunFolder(job, path, resumed) as folder:
+        no_end = "no orderly end: the program was killed, or is still running"
+        for text in write_summary(job, folder, INTERRUPTED, no_end)["warnings"]:
             LOGGER.warning("%s", text)
         ending, outputs = (FAILED, "an error in the program"), {}
         try:
@@ -72,9 +71,9 @@ def run(
 def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
     """The frames that are left."""
     warm_up_job(job, progress)
-    row, metrics = job.row(folder.checkpoint), job.metrics(folder.checkpoint)
-    stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=folder.checkpoint.position)
-    with WriterThread([metrics, FrameRecorder(job, folder, metrics)]) as writer:
+    row, position = job.row(folder.checkpoint), folder.checkpoint.position
+    stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=position)
+    with WriterThread([folder.metrics, folder]) as writer:
         stream.drive([writer, ProgressSink(progress, _skipped(folder))], stop=stop)
 
 
@@ -105,15 +104,14 @@ def _counts(folder: RunFolder, job: RunJob) -> str:
 def _outputs(
     job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]
 ) -> dict[str, str | None]:
-    """Mixture, curves and pictures of all finished frames: by file, None if made, else why not."""
+    """Mixture and pictures of all finished frames: by file, None if made, else why not."""
     done = [record for record in folder.records if record["state"] == "done"]
     if not done:
         return {}
     ufm = job.ufm(folder.checkpoint)
     write_mixture_ply(folder.path / "mixture.ply", ufm.mixture, T_world_first=ufm.T_world_first)
     write_mixture_npz(folder.path / "mixture.npz", ufm.mixture, T_world_first=ufm.T_world_first)
-    write_json_atomic(folder.path / "curves.json", job.metrics(folder.checkpoint).curves())
-    made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "mixture.npz", "curves.json"))
+    made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "mixture.npz"))
     with_error = any(record["ground_truth"] for record in done) and not job.source.is_truth
     finished = Finished(folder.path, job.sequence, done, with_error)
     try:

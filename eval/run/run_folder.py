@@ -14,23 +14,25 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
-from time import monotonic
+from time import monotonic, perf_counter
 from typing import Any
 
 import torch
-from torch import Tensor
 
+from ufmstar_torch.eval.engine.judge import UFM
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.files import to_json, write_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, remover
-from ufmstar_torch.eval.run.writers import FRAMES, PNGS, frame_file
+from ufmstar_torch.eval.run.frame_record import camera_of, frame_record, maps_of
+from ufmstar_torch.eval.run.job import Checkpoint, RunJob
+from ufmstar_torch.eval.run.writers import FRAMES, PNGS, frame_file, write_frame, write_pngs
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
 from ufmstar_torch.models.checkpoints import read_tensors
 
 # Outputs that are made from the finished frames.
-_MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "mixture.npz", "curves.json")
+_MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "mixture.npz")
 CHECKPOINT_EVERY = 2.0  # [s]
 RUN = FolderKind(
     program="ufmstar run",
@@ -50,30 +52,26 @@ RUN = FolderKind(
 )
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """The state of a run after a frame."""
+class RunFolder(FrameSink):
+    """The output folder of a new or ``resumed`` job, a sink that writes every frame; for use with ``with``.
 
-    position: int = 0  # number of frames handled, skipped ones included
-    unit: float | None = None  # of the depth PNGs [m per count]; None: no frame is written yet
-    state: dict[str, Tensor] = field(default_factory=dict)  # of the run's row: UfM*, alternation, tracks
-    metrics: dict[str, dict[str, Tensor]] = field(default_factory=dict)  # sums of the metrics, by name
-    # {"first", "frames", "seconds"} of every start of the program.
-    sessions: list[dict[str, float]] = field(default_factory=list)
+    Attributes:
+        checkpoint: the state after the last finished frame; on disk it may be some seconds older.
+        records: the lines of frames.jsonl up to there.
+        metrics: of the frames up to there; a sink before this one.
 
+    Raises:
+        FolderError: the checkpoint cannot be read.
+    """
 
-class RunFolder:
-    """The output folder of a new or ``resumed`` run, for use with ``with``. ``checkpoint`` is that after the last
-    finished frame (on disk it may be some seconds older), ``records`` the lines of frames.jsonl up to there. Raises
-    FolderError: the checkpoint cannot be read."""
-
-    def __init__(self, path: Path, resumed: bool) -> None:
+    def __init__(self, job: RunJob, path: Path, resumed: bool) -> None:
         self.path = path
         self.checkpoint, self.records = _load(path) if resumed else (Checkpoint(), [])
+        self.metrics = job.metrics(self.checkpoint)
         (self.path / FRAMES).mkdir(exist_ok=True)
         lines = b"".join(_line(record) for record in self.records)
         write_atomic(self.path / RECORDS, lambda file: file.write(lines))
-        self._stored, self._stored_at = self.checkpoint, monotonic()
+        self._stored, self._stored_at, self._saving = self.checkpoint, monotonic(), 0.0
 
     def __enter__(self) -> RunFolder:
         return self
@@ -82,16 +80,34 @@ class RunFolder:
         with suppress(OSError):  # a full disk: the run continues from the earlier checkpoint
             self.store()
 
-    def add(self, record: Mapping[str, Any], checkpoint: Checkpoint) -> None:
-        """Record a frame whose files are written, and store the checkpoint if the last one is old. Raises OSError."""
-        line = _line(record)
+    def begin(self, stream: FrameStream) -> None:
+        """Start the clock of this session."""
+        self._earlier, self._first, self._started = list(self.checkpoint.sessions), stream.position, monotonic()
+
+    def take(self, result: FrameResult) -> None:
+        """Write and record a frame, and store the checkpoint if the last one is old. Raises OSError."""
+        started, unit, name = perf_counter(), self.checkpoint.unit, result.name
+        if (row := result.rows.get(UFM)) is not None:
+            camera = camera_of(result.frame, row)
+            written = write_frame(frame_file(self.path, name), row.valid, camera, **maps_of(row))
+            unit = write_pngs(self.path, name, written, unit)
+        done = perf_counter()
+        line = _line(frame_record(result, UFM, 1000 * (done - started), self._saving))
         with (self.path / RECORDS).open("ab") as file:
             file.write(line)
         # Through JSON, so that this run and one that is continued compute with the same numbers.
         self.records.append(json.loads(line))
-        self.checkpoint = checkpoint
+        frames, seconds = result.number + 1 - self._first, monotonic() - self._started
+        sessions = [*self._earlier, {"first": self._first, "frames": frames, "seconds": seconds}]
+        state = dict(result.state[UFM])
+        self.checkpoint = Checkpoint(result.number + 1, unit, state, self.metrics.sums(), sessions)
         if monotonic() - self._stored_at >= CHECKPOINT_EVERY:
             self.store()
+        self._saving = 1000 * (perf_counter() - done)
+
+    def end(self) -> None:
+        """Store the last state before pictures are drawn."""
+        self.store()
 
     def store(self) -> None:
         """Write the checkpoint to disk, atomically. Raises OSError; the earlier one stays."""

@@ -22,13 +22,8 @@ from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.stream_warnings import hardly_compared
 
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
-# [m] A sigma below it claims more than any depth network can measure.
-NEAR_ZERO = 1e-3
+Records = Sequence[Mapping[str, Any]]
 STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "save")
-
-
-# State and reason of an unfinished run.
-GOING_ON = INTERRUPTED, "no orderly end: the program was killed, or is still running"
 
 
 def write_summary(
@@ -60,7 +55,6 @@ def write_summary(
         "uncertainty": _uncertainty(done),
         "anchors": _anchors(done),
         "mixture": _mixture(done, job.ufm(checkpoint).mixture),
-        "rotation_deviation_max": max((record["rotation_deviation"] for record in done), default=None),
         "time": _time(done, checkpoint.sessions),
         "outputs": outputs or {},
         "settings": job.settings,
@@ -74,7 +68,7 @@ def write_summary(
     return plain
 
 
-def _depth_fit(job: RunJob, folder: RunFolder, done: Sequence[Mapping[str, Any]]) -> DepthFit | None:
+def _depth_fit(job: RunJob, folder: RunFolder, done: Records) -> DepthFit | None:
     """The maps of finished frames beside the depth of corners tracked in their images."""
     records, sequence = {record["index"]: record for record in done}, job.sequence
 
@@ -93,7 +87,7 @@ def _depth_fit(job: RunJob, folder: RunFolder, done: Sequence[Mapping[str, Any]]
     return depth_fit(job.sequence, job.corners, depth_at)
 
 
-def _warnings(job: RunJob, depth: DepthFit | None, done: Sequence[Mapping[str, Any]]) -> list[str]:
+def _warnings(job: RunJob, depth: DepthFit | None, done: Records) -> list[str]:
     """Likely mistakes in what the run was given, each in a line."""
     fits = [fit.problem for fit in (job.image_fit, depth) if fit is not None]
     if done:
@@ -104,7 +98,7 @@ def _warnings(job: RunJob, depth: DepthFit | None, done: Sequence[Mapping[str, A
     return [text for text in fits if text]
 
 
-def _posterior(done: Sequence[Mapping[str, Any]], figures: Mapping[str, float] | None) -> dict[str, Any]:
+def _posterior(done: Records, figures: Mapping[str, float] | None) -> dict[str, Any]:
     """The posterior's metrics, and the last frame's figures of held-out anchors."""
     records = [record["posterior"] for record in done if "posterior" in record]
     if not records:
@@ -114,13 +108,10 @@ def _posterior(done: Sequence[Mapping[str, Any]], figures: Mapping[str, float] |
 
 
 def _sequence(sequence: FrameSequence) -> dict[str, Any]:
+    names = ("name", "layout", "image_size", "intrinsics", "depth_intrinsics")
     return {
-        "name": sequence.name,
-        "layout": sequence.layout,
+        **{name: getattr(sequence, name) for name in names},
         "frames": len(sequence),
-        "image_size": sequence.image_size,
-        "intrinsics": sequence.intrinsics,
-        "depth_intrinsics": sequence.depth_intrinsics,
         "without_depth": len(sequence.without_depth),
         "left_out": dict(Counter(frame.reason for frame in sequence.skipped)),
     }
@@ -135,7 +126,7 @@ def _scale(job: RunJob) -> dict[str, Any]:
     return {"scale_from": "network", "scale": scale, "anchors_show": "shape only"}
 
 
-def _frames(records: Sequence[Mapping[str, Any]], selected: int) -> dict[str, Any]:
+def _frames(records: Records, selected: int) -> dict[str, Any]:
     skipped = [record for record in records if record["state"] == "skipped"]
     return {
         "selected": selected,
@@ -146,7 +137,7 @@ def _frames(records: Sequence[Mapping[str, Any]], selected: int) -> dict[str, An
     }
 
 
-def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _uncertainty(done: Records) -> dict[str, Any]:
     """Means over all valid pixels of all frames. With perfect depth, they are the method's floor."""
     pixels = sum(record["valid_pixels"] for record in done)
     return {
@@ -162,7 +153,7 @@ def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _anchors(done: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+def _anchors(done: Records) -> dict[str, Any] | None:
     """Means over all frames of the anchors' figures; None without anchors."""
     records = [record["anchors"] for record in done if "anchors" in record]
     if not records:
@@ -181,14 +172,14 @@ def _anchors(done: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     }
 
 
-def _pixel_mean(done: Sequence[Mapping[str, Any]], key: str) -> float | None:
+def _pixel_mean(done: Records, key: str) -> float | None:
     """Mean over pixels; a frame without a valid pixel has no mean of its own."""
     known = [(record[key], record["valid_pixels"]) for record in done if record[key] is not None]
     pixels = sum(count for _, count in known)
     return sum(mean * count for mean, count in known) / pixels if pixels else None
 
 
-def _mixture(done: Sequence[Mapping[str, Any]], mixture: GaussianMixture) -> dict[str, Any]:
+def _mixture(done: Records, mixture: GaussianMixture) -> dict[str, Any]:
     last = done[-1]["components"] if done else 0
     counts = {key: sum(record[key] for record in done) for key in ("segments", "matched", "pairs", "new", "dropped")}
     size = mixture.bytes_per_component()
@@ -201,17 +192,15 @@ def _mixture(done: Sequence[Mapping[str, Any]], mixture: GaussianMixture) -> dic
     }
 
 
-def _time(done: Sequence[Mapping[str, Any]], sessions: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+def _time(done: Records, sessions: Sequence[Mapping[str, float]]) -> dict[str, Any]:
     """Medians by stage; "frame" is the time from a frame to the next, which is shorter than the sum of the stages:
     frames are read ahead and written behind in threads. The rate is that of the median frame: the first one also loads
     libraries and compiled kernels."""
-    seconds = sum(session["seconds"] for session in sessions)
     stages = {stage: [record["ms"][stage] for record in done if stage in record["ms"]] for stage in STAGES}
     total = median(record["ms"]["cycle"] for record in done) if done else None
     return {
         "median_ms": {stage: median(times) if times else None for stage, times in stages.items()} | {"frame": total},
         "frames_per_second": 1000 / total if total else None,
-        "frames_per_second_with_start": len(done) / seconds if seconds else None,
-        "wall_seconds": seconds,
+        "wall_seconds": sum(session["seconds"] for session in sessions),
         "sessions": list(sessions),
     }

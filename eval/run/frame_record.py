@@ -1,23 +1,16 @@
-"""The sink of ``ufmstar run``: writes every frame's maps and record, and now and then a checkpoint and the summary."""
+"""The record of a frame of ``ufmstar run``: a line of frames.jsonl, and the arrays of its file."""
 
 from __future__ import annotations
 
 import math
-from time import perf_counter
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.rows import RowResult
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
-from ufmstar_torch.eval.run.job import RunJob
-from ufmstar_torch.eval.run.run_folder import Checkpoint, RunFolder
-from ufmstar_torch.eval.run.summary import GOING_ON, NEAR_ZERO, write_summary
-from ufmstar_torch.eval.run.writers import frame_file, write_frame, write_pngs
+from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.sequences.frame import Frame
 
 _MAPS = (
@@ -25,55 +18,37 @@ _MAPS = (
     "posterior_depth", "posterior_variance", "posterior_inlier_variance", "posterior_outlier",
 )  # fmt: skip
 _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured", "single_view")
-_SUMMARY_EVERY = 30.0  # [s] between two summaries of an unfinished run
+# [m] A sigma below it claims more than any depth network can measure.
+NEAR_ZERO = 1e-3
 
 
-class FrameRecorder(FrameSink):
-    """Writes every frame's maps, adds its record to the run's folder, and hands the folder a checkpoint."""
+def maps_of(row: RowResult) -> dict[str, Tensor | None]:
+    """The maps that are written of a frame, by name; None: the row has none."""
+    return {name: getattr(row, name) for name in _MAPS}
 
-    def __init__(self, job: RunJob, folder: RunFolder, metrics: RunMetrics) -> None:
-        self._job, self._folder, self._metrics = job, folder, metrics
-        self._earlier, self._unit = list(folder.checkpoint.sessions), folder.checkpoint.unit
-        self._saving = 0.0
 
-    def begin(self, stream: FrameStream) -> None:
-        """Start the clock of this session."""
-        self._first, self._started = stream.position, perf_counter()
-        self._summarised = self._started
+def camera_of(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]:
+    """Pose and intrinsics of the maps and, with anchors, these [N, 4]: u, v in the maps [px], depth and its standard
+    deviation [m]."""
+    camera: dict[str, NDArray[Any]] = {"T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
+    if row.landmarks is None or frame is None:
+        return camera
+    anchors = row.landmarks.anchors(frame.intrinsics, torch.from_numpy(row.intrinsics))
+    columns = (anchors.pixel[0], anchors.depth[0, :, None], anchors.variance[0, :, None].sqrt())
+    return camera | {"anchors": torch.cat(columns, dim=1).float().numpy()}
 
-    def take(self, result: FrameResult) -> None:
-        """Write and record a frame. Raises OSError."""
-        record, frames = self._record(result), result.number + 1 - self._first
-        session = {"first": self._first, "frames": frames, "seconds": perf_counter() - self._started}
-        sessions, state = [*self._earlier, session], dict(result.state[UFM])
-        checkpoint = Checkpoint(result.number + 1, self._unit, state, self._metrics.sums(), sessions)
-        before = perf_counter()
-        self._folder.add(record, checkpoint)
-        after = perf_counter()
-        self._saving = 1000 * (after - before)
-        if after - self._summarised > _SUMMARY_EVERY:
-            write_summary(self._job, self._folder, *GOING_ON)
-            self._summarised = perf_counter()
 
-    def end(self) -> None:
-        """Store the last state before pictures are drawn."""
-        self._folder.store()
-
-    def _record(self, result: FrameResult) -> dict[str, Any]:
-        """The frame's line of frames.jsonl, once its maps are written."""
-        about: dict[str, Any] = {"index": result.index, "name": result.name}
-        if result.frame is not None and result.frame.timestamp is not None:
-            about["timestamp"] = result.frame.timestamp
-        if UFM not in result.rows:
-            return {**about, "state": "skipped", "reason": result.skipped[UFM]}
-        row, before = result.rows[UFM], perf_counter()
-        maps = {name: getattr(row, name) for name in _MAPS}
-        camera: dict[str, NDArray[Any]] = {"T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
-        camera |= _anchor_array(result.frame, row)
-        written = write_frame(frame_file(self._folder.path, result.name), row.valid, camera, **maps)
-        self._unit = write_pngs(self._folder.path, result.name, written, self._unit)
-        times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
-        return {**about, "state": "done", **_figures(row), **times, **_anchor_figures(row)}
+def frame_record(result: FrameResult, key: str, writing: float, saving: float) -> dict[str, Any]:
+    """The line of frames.jsonl of a frame: state, figures and times [ms] of the row ``key``, or why it was skipped.
+    ``writing`` and ``saving`` are the times of its files and of the checkpoint before [ms]."""
+    about: dict[str, Any] = {"index": result.index, "name": result.name}
+    if result.frame is not None and result.frame.timestamp is not None:
+        about["timestamp"] = result.frame.timestamp
+    if key not in result.rows:
+        return {**about, "state": "skipped", "reason": result.skipped[key]}
+    row = result.rows[key]
+    times = {"ms": _times(result, row, writing, saving)}
+    return {**about, "state": "done", **_figures(row), **times, **_anchor_figures(row)}
 
 
 def _figures(row: RowResult) -> dict[str, Any]:
@@ -89,7 +64,6 @@ def _figures(row: RowResult) -> dict[str, Any]:
         "T_world_cam": row.T_world_cam,
         "member": row.member,
         **{count: int(getattr(statistics, count)[0]) for count in _COUNTS},
-        "rotation_deviation": float(statistics.rotation_deviation[0]),
         "mean_disagreement": _mean(row.disagreement, valid),
         "mean_sigma": _mean(std, valid),
         "mean_network_sigma": None if network_variance is None else _mean(network_variance.sqrt(), valid),
@@ -139,15 +113,6 @@ def _anchor_figures(row: RowResult) -> dict[str, Any]:
         "mean_bias": _mean(row.bias, row.valid),
         **_posterior_figures(row),
     }
-
-
-def _anchor_array(frame: Frame | None, row: RowResult) -> dict[str, NDArray[np.float32]]:
-    """With anchors: [N, 4] their u, v in the maps [px], depth and its standard deviation [m]."""
-    if row.landmarks is None or frame is None:
-        return {}
-    anchors = row.landmarks.anchors(frame.intrinsics, torch.from_numpy(row.intrinsics))
-    columns = (anchors.pixel[0], anchors.depth[0, :, None], anchors.variance[0, :, None].sqrt())
-    return {"anchors": torch.cat(columns, dim=1).float().numpy()}
 
 
 def _posterior_figures(row: RowResult) -> dict[str, Any]:
