@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -22,20 +23,16 @@ _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "vali
 NEAR_ZERO = 1e-3
 
 
-def maps_of(row: RowResult) -> dict[str, Tensor | None]:
-    """The maps that are written of a frame, by name; None: the row has none."""
-    return {name: getattr(row, name) for name in _MAPS}
-
-
-def camera_of(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]:
-    """Pose and intrinsics of the maps and, with anchors, these [N, 4]: u, v in the maps [px], depth and its standard
-    deviation [m]."""
-    camera: dict[str, NDArray[Any]] = {"T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
+def frame_arrays(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]:
+    """The arrays that are written of a frame, by name: maps, pose, intrinsics and anchors (``writers``)."""
+    maps = {name: value for name in _MAPS if (value := getattr(row, name)) is not None}
+    arrays = {name: value.cpu().numpy().astype(np.float32, copy=False) for name, value in maps.items()}
+    arrays |= {"valid": row.valid.cpu().numpy(), "T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
     if row.landmarks is None or frame is None:
-        return camera
+        return arrays
     anchors = row.landmarks.anchors(frame.intrinsics, torch.from_numpy(row.intrinsics))
     columns = (anchors.pixel[0], anchors.depth[0, :, None], anchors.variance[0, :, None].sqrt())
-    return camera | {"anchors": torch.cat(columns, dim=1).float().numpy()}
+    return arrays | {"anchors": torch.cat(columns, dim=1).float().numpy()}
 
 
 def frame_record(result: FrameResult, key: str, writing: float, saving: float) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.files import to_json, write_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, remover
-from ufmstar_torch.eval.run.frame_record import camera_of, frame_record, maps_of
+from ufmstar_torch.eval.run.frame_record import frame_arrays, frame_record
 from ufmstar_torch.eval.run.job import Checkpoint, RunJob
 from ufmstar_torch.eval.run.writers import FRAMES, PNGS, frame_file, write_frame, write_pngs
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
@@ -88,9 +88,9 @@ class RunFolder(FrameSink):
         """Write and record a frame, and store the checkpoint if the last one is old. Raises OSError."""
         started, unit, name = perf_counter(), self.checkpoint.unit, result.name
         if (row := result.rows.get(UFM)) is not None:
-            camera = camera_of(result.frame, row)
-            written = write_frame(frame_file(self.path, name), row.valid, camera, **maps_of(row))
-            unit = write_pngs(self.path, name, written, unit)
+            arrays = frame_arrays(result.frame, row)
+            write_frame(frame_file(self.path, name), arrays)
+            unit = write_pngs(self.path, name, arrays, unit)
         done = perf_counter()
         line = _line(frame_record(result, UFM, 1000 * (done - started), self._saving))
         with (self.path / RECORDS).open("ab") as file:
