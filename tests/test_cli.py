@@ -135,6 +135,16 @@ MISTAKES = {
         "ufmstar data check {path} --intrinsics 1 2 3",
         "--intrinsics must be a file, or the four numb",
     ),
+    "rank: part": ("ufmstar rank {tour} --depth self --by epistemic --out {out}", "comes with no epistemic variance"),
+    "rank: anchors": ("ufmstar rank {tour} --depth self --by anchored --out {out}", "--by anchored needs --anchors or"),
+    "rank: count": ("ufmstar rank {tour} --depth self --count 0 --out {out}", "--count must be at least 1"),
+    "rank: measured": ("ufmstar rank {tour} --depth self --measured 2 --out {out}", "--measured must be a share"),
+    "rank: depth": ("ufmstar rank {tour} {path} --depth a --out {out}", "--depth DIR goes with one sequence"),
+    "eval: spec": (
+        "ufmstar eval --suite depth-only --network depth_only=torchscript:n.ts --root {tour} --spec s --out {out}",
+        "--spec must be a file *.json",
+    ),
+    "anchors": ("--depth self --ufm.anchors.half_life 10", "--ufm.anchors.* needs --anchors"),
     "export": ("ufmstar export {path} --to depth", "no output of `ufmstar run`"),
 }
 
@@ -143,7 +153,9 @@ MISTAKES = {
 def test_a_mistake_is_reported_in_one_line(ufmstar, path, tmp_path, mistake):
     line, expected = MISTAKES[mistake]
     line = line if line.startswith("ufmstar") else f"ufmstar run {{path}} {line} --out {{out}}"
-    code, out, err = ufmstar(*line.format(path=path, out=tmp_path / "out").split()[1:])
+    code, out, err = ufmstar(
+        *line.format(path=path, out=tmp_path / "out", tour="tour:5?frames=3&size=64x96").split()[1:]
+    )
     assert (code, out) == (2, "")
     assert err.startswith("ufmstar")
     assert expected in err

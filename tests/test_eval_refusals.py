@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,8 +21,6 @@ from ufmstar_torch.eval.methods.setting import setting_from
 from ufmstar_torch.eval.methods.suite import Suite, suite_named
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics.recalibration import fit
-from ufmstar_torch.eval.run.colours import DEPTH_MAP, ColourScale
-from ufmstar_torch.eval.run.panels import FramePanel, contact_sheet
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.suite.shards import rank_of
 from ufmstar_torch.eval.suite.work_items import Shard
@@ -33,8 +30,6 @@ from ufmstar_torch.online import TrainDecision
 
 NAN, INF = math.nan, math.inf
 EYE, K = torch.eye(4, dtype=torch.float64), torch.from_numpy(intrinsics(24, 32))
-MAPS = {"depth": np.ones((2, 3)), "sigma": np.ones((2, 3))}
-PICTURE = np.ones((2, 3, 3), np.uint8)
 TORCHRUN = {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"}
 network, tour = NetworkChoice.parse, open_sequence
 
@@ -129,12 +124,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
         (partial(TrainDecision, **values), "cost must be finite, first at least 2")
         for values in ({"cost": NAN}, {"cost": 0.1, "first": 1}, {"cost": 0.1, "half_life": 0.0})
     ],
-    # pictures
-    (lambda: ColourScale(1.0, 1.0, DEPTH_MAP), "low must be less"),
-    (lambda: ColourScale(0.0, 1.0, DEPTH_MAP, logarithmic=True), "above 0"),
-    (lambda: contact_sheet([], "x.png"), "at least one frame"),
-    (lambda: FramePanel("a", PICTURE.astype(float), MAPS), "image must be uint8"),
-    (lambda: FramePanel("a", PICTURE, MAPS | {"sigma": np.ones((3, 3))}), "sigma must have"),
     # tours
     *[(partial(tour, name), "tour:SEED") for name in ("tour:", "tour:-1", "tour:a")],
     (lambda: tour("tour:1?colour=red"), "unknown option 'colour'"),
@@ -174,41 +163,3 @@ def test_it_is_refused_and_named(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=message):
         call()
-
-
-TOURS = ("tour:5?frames=3&size=64x96", "tour:6?frames=3&size=64x96")
-COMMANDS = [
-    (
-        ("rank", TOURS[0], "--depth", "self", "--by", "epistemic"),
-        "--by epistemic: the depth comes with no epistemic variance",
-    ),
-    (("rank", TOURS[0], "--depth", "self", "--by", "anchored"), "--by anchored needs --anchors or --posterior"),
-    (("rank", TOURS[0], "--depth", "self", "--count", "0"), "--count must be at least 1"),
-    (("rank", TOURS[0], "--depth", "self", "--measured", "2"), "--measured must be a share"),
-    (("rank", *TOURS, "--depth", "a"), "--depth DIR goes with one sequence"),
-    (("rank", TOURS[0], "--model", "trained"), "needs --weights FILE"),
-    (
-        (
-            "eval",
-            "--suite",
-            "depth-only",
-            "--network",
-            "depth_only=torchscript:n.ts",
-            "--root",
-            TOURS[0],
-            "--spec",
-            "s",
-        ),
-        "--spec must be a file *.json",
-    ),
-    (("run", TOURS[0], "--depth", "self", "--ufm.anchors.half_life", "10"), "--ufm.anchors.* needs --anchors"),
-]
-
-
-@pytest.mark.parametrize(("words", "message"), COMMANDS, ids=range(len(COMMANDS)))
-def test_a_command_refuses_and_names_the_option(
-    ufmstar: Any, tmp_path: Path, words: tuple[str, ...], message: str
-) -> None:
-    code, _, err = ufmstar(*words, "--out", tmp_path / "out")
-    assert code in (1, 2)
-    assert message in err

@@ -19,7 +19,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.folder import FolderError, hold
-from ufmstar_torch.eval.suite.folder import EvalFolder
+from ufmstar_torch.eval.suite.folder import EvalFolder, evaluation_folder
 from ufmstar_torch.eval.suite.work_items import Shard, WorkItem, find_work, read_names
 
 # ---- work list ----
@@ -95,25 +95,30 @@ ABOUT = {
 }  # fmt: skip
 
 
+def enter(*arguments, **how):
+    with evaluation_folder(*arguments, **how):
+        pass
+
+
 def test_a_folder_is_begun_continued_and_replaced_only_as_asked(tmp_path):
     out = tmp_path / "out"
-    EvalFolder.open(out, ABOUT)
+    enter(out, ABOUT)
     with pytest.raises(FolderError, match="--resume goes on with it, --overwrite replaces it"):
-        EvalFolder.open(out, ABOUT)
-    EvalFolder.open(out, ABOUT, resume=True)
-    EvalFolder.open(out, {**ABOUT, "suite": "y"}, overwrite=True)
+        enter(out, ABOUT)
+    enter(out, ABOUT, resume=True)
+    enter(out, {**ABOUT, "suite": "y"}, overwrite=True)
     assert json.loads((out / "eval.json").read_text())["suite"] == "y"
 
 
 def test_files_of_someone_else_are_not_touched(tmp_path):
     (tmp_path / "thesis.tex").write_text("x")
     with pytest.raises(FolderError, match="files of someone else"):
-        EvalFolder.open(tmp_path, ABOUT, resume=True)
+        enter(tmp_path, ABOUT, resume=True)
     with pytest.raises(FolderError, match="files of someone else"):
-        EvalFolder.open(tmp_path, ABOUT, overwrite=True)
+        enter(tmp_path, ABOUT, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     with pytest.raises(FolderError, match="is a file"):
-        EvalFolder.open(tmp_path / "thesis.tex", ABOUT)
+        enter(tmp_path / "thesis.tex", ABOUT)
 
 
 def test_overwriting_removes_our_files_alone(tmp_path):
@@ -126,7 +131,7 @@ def test_overwriting_removes_our_files_alone(tmp_path):
     made = [out / "tables" / "main.md", out / "results.csv", out / "cache" / "kept"]
     for file in made:
         file.write_text("made")
-    EvalFolder.open(out, ABOUT, overwrite=True)
+    enter(out, ABOUT, overwrite=True)
     assert all(file.read_text() == "mine" for file in own)
     assert [file.exists() for file in made] == [False, False, True]
     left = {path.name for path in out.rglob("*") if path.is_file()}
@@ -135,14 +140,14 @@ def test_overwriting_removes_our_files_alone(tmp_path):
 
 def test_a_shard_is_evaluated_by_one_process_and_not_overwritten_meanwhile(tmp_path):
     out = tmp_path / "out"
-    with EvalFolder.open(out, ABOUT, shard=Shard(1, 2)):
-        with EvalFolder.open(out, ABOUT, shard=Shard(2, 2), resume=True):
+    with evaluation_folder(out, ABOUT, shard=Shard(1, 2)):
+        with evaluation_folder(out, ABOUT, shard=Shard(2, 2), resume=True):
             pass
         with pytest.raises(FolderError, match="another process is evaluating shard 1/2 there now"):
-            EvalFolder.open(out, ABOUT, shard=Shard(1, 2), resume=True)
+            enter(out, ABOUT, shard=Shard(1, 2), resume=True)
         with pytest.raises(FolderError, match="another process is evaluating there now"):
-            EvalFolder.open(out, ABOUT, overwrite=True)
-    EvalFolder.open(out, ABOUT, overwrite=True)
+            enter(out, ABOUT, overwrite=True)
+    enter(out, ABOUT, overwrite=True)
 
 
 @pytest.mark.parametrize(
@@ -155,20 +160,20 @@ def test_a_shard_is_evaluated_by_one_process_and_not_overwritten_meanwhile(tmp_p
     ],
 )
 def test_resuming_something_else_is_refused_by_name(tmp_path, changed, told):
-    EvalFolder.open(tmp_path, ABOUT)
+    enter(tmp_path, ABOUT)
     with pytest.raises(FolderError, match=told):
-        EvalFolder.open(tmp_path, {**ABOUT, **changed}, resume=True)
+        enter(tmp_path, {**ABOUT, **changed}, resume=True)
 
 
 def test_resuming_adds_rows_sequences_and_networks(tmp_path):
-    EvalFolder.open(tmp_path, ABOUT)
+    enter(tmp_path, ABOUT)
     more = {
         "networks": {"ensemble": {"sha256": "c"}},
         "rows": [{"method": "B"}, {"method": "A"}],
         "sequences": [{"dataset": "d", "sequence": "t"}],
         "missing_bases": ["aleatoric", "evidential"],
     }
-    EvalFolder.open(tmp_path, {**ABOUT, **more}, resume=True)
+    enter(tmp_path, {**ABOUT, **more}, resume=True)
     about = json.loads((tmp_path / "eval.json").read_text())
     assert about["networks"].keys() == {"aleatoric", "ensemble"}
     assert about["rows"] == [{"method": "A"}, {"method": "B"}]

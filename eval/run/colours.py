@@ -34,11 +34,6 @@ class ColourScale:
     colour_map: str
     logarithmic: bool = False
 
-    def __post_init__(self) -> None:
-        if not self.low < self.high or (self.logarithmic and self.low <= 0):
-            least = " and above 0" if self.logarithmic else ""
-            raise ValueError(f"low must be less than high{least}, got {self.low} and {self.high}")
-
     def rgb(self, values: NDArray[Any]) -> NDArray[np.uint8]:
         """[..., 3] the colours of ``values`` [...] [m]; grey where not finite."""
         known = np.isfinite(values)

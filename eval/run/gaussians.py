@@ -76,11 +76,8 @@ class Components:
         )
         variance, axes = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
         axes[np.linalg.det(axes) < 0, :, 2] *= -1
-        T = torch.eye(4) if T_world_first is None else T_world_first.detach().cpu()
-        if tuple(T.shape) not in ((4, 4), (1, 4, 4)):
-            raise ValueError(f"T_world_first must have shape (4, 4) or (1, 4, 4), got {tuple(T.shape)}")
-        matrix = T.double().numpy().reshape(4, 4)
-        R, t = matrix[:3, :3], matrix[:3, 3]
+        T = np.eye(4) if T_world_first is None else T_world_first.detach().cpu().double().numpy().reshape(4, 4)
+        R, t = T[:3, :3], T[:3, 3]
         self.mean: NDArray[np.float64] = mean @ R.T + t
         self.axes: NDArray[np.float64] = R @ axes
         self.sigma: NDArray[np.float64] = np.sqrt(np.maximum(variance, SIGMA_FLOOR**2))

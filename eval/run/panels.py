@@ -179,22 +179,12 @@ class FramePanel:
 
     ``maps`` has names of ``MAPS``, "depth" and "sigma" always, and "measured", the share of the disagreement that rests
     on two views or more, which stripes sigma. ``note`` ("K = 31") stands beside the name.
-
-    Raises:
-        ValueError: shapes or types disagree.
     """
 
     name: str
     image: NDArray[np.uint8]
     maps: Mapping[str, NDArray[Any]]
     note: str = ""
-
-    def __post_init__(self) -> None:
-        if self.image.ndim != 3 or self.image.shape[-1] != 3 or self.image.dtype != np.uint8:
-            raise ValueError(f"image must be uint8 [H, W, 3], got {self.image.dtype} {self.image.shape}")
-        for label, value in self.maps.items():
-            if value.shape != self.shape:
-                raise ValueError(f"{label} must have the depth's shape {self.shape}, got {value.shape}")
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -241,9 +231,7 @@ def contact_sheet(
     panels: Sequence[FramePanel], path: str | Path, *, title: str = "", columns: Sequence[MapColumn] | None = None
 ) -> None:
     """Draw the frames below each other and write the picture (PNG), atomically; neighbouring ``columns`` (None: of all
-    maps) of one scale share a colour bar. Raises ValueError: there is no panel; ImportError: matplotlib is missing."""
-    if not panels:
-        raise ValueError("panels must hold at least one frame")
+    maps) of one scale share a colour bar. Raises ImportError: matplotlib is missing."""
     colours.require_matplotlib()
     columns = map_columns(panels) if columns is None else columns
     absent = ["no ground truth" if column.field == "error" else "none" for column in columns]

@@ -88,8 +88,8 @@ class Finished:
 
 def panel_of(name: str, note: str, frame: Frame, row: RowResult) -> FramePanel:
     """The image of a frame and a row's maps of it: depth, sigma and, with ground truth, the absolute error."""
-    if frame.image is None or row.variance is None:
-        raise ValueError(f"frame {name} has no image or no variance to show")
+    assert frame.image is not None
+    assert row.variance is not None
     maps = {"depth": row.depth.float().numpy(), "sigma": row.variance.float().sqrt().numpy()}
     if row.truth is not None:
         maps["error"] = absolute_error(maps["depth"], row.truth)

@@ -11,10 +11,11 @@ OUT/records/DATASET/SEQUENCE/failed.json
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -26,9 +27,6 @@ from ufmstar_torch.eval.run.folder import FolderError, FolderKind, hold, output_
 from ufmstar_torch.eval.suite.record import FORMAT, Record
 from ufmstar_torch.eval.suite.work_items import ALL, Shard, WorkItem
 
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
-
 FAILED, CACHE = "failed.json", "cache"
 # Files of a report; --overwrite removes them.
 _REPORT: tuple[str, ...] = ("efficiency.json", "results.csv", "report.html")
@@ -36,33 +34,29 @@ _REPORT += ("tables/*.md", "tables/*.tex", "tables/*.csv", "figures/*.png", "fig
 _OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz", "room/*.npz")
 
 
+@contextmanager
+def evaluation_folder(
+    out: Path, about: Mapping[str, Any], *, shard: Shard = ALL, resume: bool = False, overwrite: bool = False
+) -> Iterator[None]:
+    """Make the folder, or continue in it, and hold a shard; see ``output_folder``. When continuing, rows, sequences and
+    networks of ``about`` (eval.json) are added to those of the earlier evaluation; suite, settings and the networks of
+    the same base must be the same. The cache of predictions is never removed. Raises FolderError also where another
+    process evaluates the same shard, or any shard of a folder that is to be overwritten."""
+    with output_folder(out, EVALUATION, about, resume=resume, overwrite=overwrite):  # others work there too
+        lock = hold(out / f"eval-{shard.index}-of-{shard.count}.lock")
+    if lock is None:
+        raise FolderError(f"--out {out}: another process is evaluating shard {shard} there now")
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@dataclass(frozen=True)
 class EvalFolder:
-    """An output folder of ``ufmstar eval``; ``path`` is the folder. :meth:`open` makes it, for use with ``with``."""
+    """The records in the output folder ``path`` of ``ufmstar eval``."""
 
-    def __init__(self, path: Path, lock: BaseFileLock | None = None) -> None:
-        self.path, self._lock = path, lock
-
-    @classmethod
-    def open(
-        cls, out: Path, about: Mapping[str, Any], *, shard: Shard = ALL, resume: bool = False, overwrite: bool = False
-    ) -> EvalFolder:
-        """Make the folder, or continue in it; see ``output_folder``. When continuing, rows, sequences and networks
-        of ``about`` (eval.json) are added to those of the earlier evaluation; suite, settings and the networks of the
-        same base must be the same. The cache of predictions is never removed. Raises FolderError also where another
-        process evaluates the same shard, or any shard of a folder that is to be overwritten."""
-        with output_folder(out, EVALUATION, about, resume=resume, overwrite=overwrite):  # others work there too
-            lock = hold(out / f"eval-{shard.index}-of-{shard.count}.lock")
-        if lock is None:
-            raise FolderError(f"--out {out}: another process is evaluating shard {shard} there now")
-        return cls(out, lock)
-
-    def __enter__(self) -> EvalFolder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Release the shard."""
-        if self._lock is not None:
-            self._lock.release()
+    path: Path
 
     def sequence_folder(self, item: WorkItem) -> Path:
         """The folder of a sequence."""

@@ -26,7 +26,7 @@ from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.run.machine import available_cores, device_of
 from ufmstar_torch.eval.suite.evaluate import evaluate_item
-from ufmstar_torch.eval.suite.folder import EvalFolder
+from ufmstar_torch.eval.suite.folder import EvalFolder, evaluation_folder
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.work_items import Shard, WorkItem
 
@@ -66,8 +66,8 @@ def evaluate_suite(
         job: what is evaluated.
         shard: which part; None: torchrun's rank, or else everything.
         processes: number of processes on this computer that evaluate sequences of the shard.
-        threads: of the CPU for each process; None: torch's choice for one process, all cores divided among several.
-        resume, overwrite: see ``EvalFolder.open``. The shards of an evaluation start in any order, so that each of
+        threads: of the CPU for each of several processes; None: all cores divided among them.
+        resume, overwrite: see ``evaluation_folder``. The shards of an evaluation start in any order, so that each of
             several resumes what the first one has begun.
         stop: called before every frame; True ends the work.
         report: receives a line for every finished sequence.
@@ -82,12 +82,10 @@ def evaluate_suite(
     shard, local = (shard, 0) if shard is not None else rank_of(os.environ)
     if overwrite and shard.count > 1:
         raise ValueError("--overwrite goes without shards: another one may have begun")
-    if processes == 1 and threads is not None:
-        torch.set_num_threads(threads)
     device = torch.device(device_of(job.device, local) if processes == 1 else "cpu")
     networks, items, folder = job.load(device), shard.of(job.items), EvalFolder(job.out)
     how = {"resume": resume or shard.count > 1, "overwrite": overwrite}
-    with EvalFolder.open(job.out, job.about(networks), shard=shard, **how), warned_once():
+    with evaluation_folder(job.out, job.about(networks), shard=shard, **how), warned_once():
         if processes > 1:
             numbers = range(local * processes, (local + 1) * processes)
             finished = _in_processes(job, items, numbers, threads, stop, report, progress)
