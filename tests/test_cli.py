@@ -153,9 +153,8 @@ MISTAKES = {
 def test_a_mistake_is_reported_in_one_line(ufmstar, path, tmp_path, mistake):
     line, expected = MISTAKES[mistake]
     line = line if line.startswith("ufmstar") else f"ufmstar run {{path}} {line} --out {{out}}"
-    code, out, err = ufmstar(
-        *line.format(path=path, out=tmp_path / "out", tour="tour:5?frames=3&size=64x96").split()[1:]
-    )
+    names = {"path": path, "out": tmp_path / "out", "tour": "tour:5?frames=3&size=64x96"}
+    code, out, err = ufmstar(*line.format(**names).split()[1:])
     assert (code, out) == (2, "")
     assert err.startswith("ufmstar")
     assert expected in err

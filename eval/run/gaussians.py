@@ -39,8 +39,7 @@ def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_fir
     shortest axis), f_dc_0..2 (colour), opacity (logit), scale_0..2 = ln sigma [ln m], rot_0..3 = unit quaternion w x y
     z, so that Sigma = R diag(exp(scale))^2 R^T. Behind them our own: weight [px], disagreement [m^2], count. The colour
     is sqrt(disagreement) in magma from 0 to its 99th percentile, which the header states; grey where one view alone saw
-    it. ``T_world_first`` [4, 4] or [1, 4, 4] leads from the mixture's frame to the world; None = stay there. Raises
-    ValueError: it has another shape.
+    it. ``T_world_first`` [4, 4] or [1, 4, 4] leads from the mixture's frame to the world; None = stay there.
     """
     parts = Components(mixture, T_world_first)
     quaternion = Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True)
