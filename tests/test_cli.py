@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -76,6 +75,7 @@ def test_help_loads_nothing_beyond_the_package():
 
 
 NETWORK = "--model fastdepth --weights {path}/K.txt"
+EVAL = "ufmstar eval --suite depth-only --network depth_only=ground-truth:24x32 --root d={path} --out {out}"
 # The words behind ``ufmstar run SEQUENCE --out OUT``, or a whole line, and a part of the message.
 MISTAKES = {
     "unknown command": ("ufmstar walk", "no command 'walk', there are demo, run, rank, eval,"),
@@ -140,10 +140,21 @@ MISTAKES = {
     "rank: count": ("ufmstar rank {tour} --depth self --count 0 --out {out}", "--count must be at least 1"),
     "rank: measured": ("ufmstar rank {tour} --depth self --measured 2 --out {out}", "--measured must be a share"),
     "rank: depth": ("ufmstar rank {tour} {path} --depth a --out {out}", "--depth DIR goes with one sequence"),
-    "eval: spec": (
-        "ufmstar eval --suite depth-only --network depth_only=torchscript:n.ts --root {tour} --spec s --out {out}",
-        "--spec must be a file *.json",
-    ),
+    "eval: nothing": ("ufmstar eval", "--suite is missing"),
+    "eval: no network": ("ufmstar eval --suite depth-only --root x --out o", "--network is missing"),
+    "eval: no file": (f"{EVAL} --suite /nowhere/mine.toml", "/nowhere/mine.toml"),
+    "eval: base twice": (f"{EVAL} --network depth_only=ground-truth", "time and energy, got depth_only, depth_only"),
+    "eval: spec": (f"{EVAL} --network depth_only=torchscript:n.ts --spec s", "--spec must be a file *.json"),
+    "eval: no root": (f"{EVAL} --root /nowhere", "no such file or folder: /nowhere"),
+    "eval: frames": (f"{EVAL} --root /nowhere --frames 5", "--frames must be START:STOP"),
+    "eval: shard": (f"{EVAL} --root /nowhere --shard 3/2", "--shard must be 1/n to n/n"),
+    "eval: shard and overwrite": (f"{EVAL} --shard 1/2 --overwrite", "--overwrite goes without shards"),
+    "eval: both": (f"{EVAL} --resume --overwrite", "--resume and --overwrite contradict"),
+    "eval: processes": (f"{EVAL} --processes 0", "--processes must be at least 1"),
+    "eval: sequences": (f"{EVAL} --sequences 0", "--sequences must be at least 1"),
+    "eval: list": (f"{EVAL} --sequence-list /nowhere.txt", "/nowhere.txt"),
+    "demo: frames": ("ufmstar demo --frames 1 --out {out}", "--frames must be 2 to 150"),
+    "demo: seed": ("ufmstar demo --seed -1 --out {out}", "--seed must be at least 0"),
     "anchors": ("--depth self --ufm.anchors.half_life 10", "--ufm.anchors.* needs --anchors"),
     "export": ("ufmstar export {path} --to depth", "no output of `ufmstar run`"),
 }
@@ -169,18 +180,6 @@ def test_debug_shows_the_traceback(ufmstar, tmp_path):
 
 
 # ---- options ----
-
-
-def test_poses_in_another_convention(ufmstar, path, tmp_path):
-    """The remedy of ``data check`` is an option of ``run``."""
-    inverted = shutil.copytree(path, tmp_path / "inverted")
-    poses = np.loadtxt(path / "poses.txt").reshape(-1, 4, 4)
-    np.savetxt(inverted / "poses.txt", np.linalg.inv(poses).reshape(-1, 16))
-    for source, words in ((path, ()), (inverted, ("--poses", "world-to-camera"))):
-        words += ("--depth", "self", *QUICK, "--out", tmp_path / "out" / source.name)
-        assert ufmstar("run", source, *words)[0] == 0
-    mixtures = [read_summary(tmp_path / "out" / source.name)["mixture"] for source in (path, inverted)]
-    assert mixtures[0]["components"] == mixtures[1]["components"]
 
 
 def test_settings_come_from_a_file_and_options(ufmstar, path, tmp_path):

@@ -34,35 +34,6 @@ def test_list_names_every_suite(ufmstar):
     assert "Table 4: every member on every image" in out
 
 
-MISTAKES = {
-    "nothing": ([], "--suite is missing"),
-    "no network": (["--suite", "depth-only", "--root", "x", "--out", "o"], "--network is missing"),
-    "no file": (["{}", "--suite", "/nowhere/mine.toml"], "/nowhere/mine.toml"),
-    "base twice": (["{}", "--network", "depth_only=ground-truth"], "time and energy, got depth_only, depth_only"),
-    "no root": (["{}", "--root", "/nowhere"], "no such file or folder: /nowhere"),
-    "frames": (["{}", "--frames", "5"], "--frames must be START:STOP"),
-    "shard and overwrite": (["{}", "--shard", "1/2", "--overwrite"], "--overwrite goes without shards"),
-    "both": (["{}", "--resume", "--overwrite"], "--resume and --overwrite contradict"),
-    "processes": (["{}", "--processes", "0"], "--processes must be at least 1"),
-    "threads": (["{}", "--threads", "0"], "--threads must be at least 1"),
-    "sequences": (["{}", "--sequences", "0"], "--sequences must be at least 1"),
-    "list of nothing": (["{}", "--sequence-list", "/nowhere.txt"], "/nowhere.txt"),
-    "unknown option": (["{}", "--etaa", "1"], "--etaa"),
-    "device": (["{}", "--device", "abacus"], "--device abacus is not available"),
-}
-
-
-@pytest.mark.parametrize(("words", "told"), MISTAKES.values(), ids=MISTAKES)
-def test_mistakes_are_one_line_and_leave_no_folder(ufmstar, rooms, tmp_path, words, told):
-    good = words_for(rooms, tmp_path / "out")[1:]
-    code, out, err = ufmstar("eval", *[w for word in words for w in (good if word == "{}" else [word])])
-    assert (code, out) == (2, "")
-    assert err.startswith("ufmstar eval: ")
-    assert err.count("\n") == 1
-    assert told in err
-    assert not (tmp_path / "out").exists()
-
-
 def test_an_evaluation_ends_with_its_table_and_report(ufmstar, rooms, tmp_path):
     out = tmp_path / "out"
     code, text, err = ufmstar(*words_for(rooms, out, "--frames", "0:2", "--examples", "1"))

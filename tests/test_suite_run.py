@@ -9,7 +9,6 @@ import shutil
 import signal
 from dataclasses import replace
 
-import layouts
 import numpy as np
 import pytest
 import torch
@@ -21,7 +20,6 @@ from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.engine.predictions import CacheError
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.run.folder import FolderError
-from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.suite.evaluate import with_references
 from ufmstar_torch.eval.suite.folder import EvalFolder
 from ufmstar_torch.eval.suite.record import Record
@@ -170,17 +168,6 @@ def test_another_sequence_of_the_name_is_refused(tmp_path):
         go(job, resume=True)
 
 
-def test_stopping_loses_the_sequence_at_work_alone(rooms, tmp_path):
-    reached = []
-    job = job_on(rooms, tmp_path / "out")
-    outcome, _ = go(job, Stub(lambda *where: reached.append(where)), stop=lambda: reached[-1:] == [("birch", 2)])
-    assert (outcome.finished, outcome.stopped, outcome.complete) == (False, True, False)
-    assert {path.split("/")[2] for path in kept(job.out)} == {"ash"}
-    stub = Stub()
-    assert go(job, stub, resume=True)[0].complete
-    assert [name for name, _ in stub.asked] == ["birch", "cedar"]
-
-
 # Python 3.12 warns of forks beside threads; this process uses none of what is not its own.
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
@@ -226,16 +213,3 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, mon
     assert [(name, len(rows)) for name, rows in stub.asked] == [("birch", 2), ("cedar", 4)]
     go(job_on(rooms, tmp_path / "whole"))
     assert kept(job.out) == kept(tmp_path / "whole")
-
-
-def test_seven_scenes_with_its_own_calibration(tmp_path):
-    path, _, of_depth = layouts.write_seven_scenes(tmp_path)
-    np.savetxt(tmp_path / "T.txt", np.eye(4))
-    K = [of_depth.K[0, 0], of_depth.K[1, 1], of_depth.K[0, 2], of_depth.K[1, 2]]
-    words = ["--suite", "depth-only", "--network", "depth_only=ground-truth", "--root", path, "--out", "out"]
-    words += ["--T-color-depth", tmp_path / "T.txt", "--intrinsics", *K, "--depth-intrinsics", *K]
-    (item,) = job_from(read([str(word) for word in words])).items
-    expected = open_sequence(path, T_color_depth=np.eye(4), intrinsics=K, depth_intrinsics=K)
-    np.testing.assert_array_equal(item.open()[2].depth, expected[2].depth)
-    np.testing.assert_allclose(item.open()[2].depth, of_depth.depths[2], atol=1e-3)
-    np.testing.assert_array_equal(item.open()[2].T_world_cam, expected[2].T_world_cam)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from itertools import count, takewhile
+from itertools import takewhile
 from pathlib import Path
 from time import monotonic
 from typing import Any, ClassVar
@@ -36,8 +36,6 @@ from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
 from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.pipeline import UncertainDepth
-
-_View = Callable[[LiveResult, dict[str, float]], None]
 
 _STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
 # Options for opening that also go with a source that is no recording.
@@ -125,7 +123,7 @@ def main(options: LiveOptions) -> int:
             K = None if given is None else read_intrinsics(given)
             events = _events(options)
             model = _model(options)
-            view = _view() if options.view else None
+            view = RerunLog(open_viewer()[0]) if options.view else None
             if options.out is not None:
                 held.enter_context(output_folder(options.out, kind, started, overwrite=options.overwrite))
         times = RealTime(model)
@@ -147,7 +145,7 @@ def _run(
     K: NDArray[np.float64] | None,
     events: Iterator[LiveEvent],
     times: RealTime,
-    view: _View | None,
+    view: RerunLog | None,
 ) -> tuple[LiveStatistics, Exception | None]:
     """Push the events until they end, the time is over, or a signal comes. Returns the counts, and what failed."""
     ends = monotonic() + options.seconds
@@ -158,7 +156,7 @@ def _run(
             _write(options.out, result)
         about = _figures(result, live)
         if view is not None:
-            view(result, about)
+            view.add(_shown(result, len(times.latency), about))
         if options.json:
             print(json.dumps(about), flush=True)
         elif len(times.latency) % 30 == 1:
@@ -230,20 +228,13 @@ def _write(out: Path, result: LiveResult) -> None:
     write_atomic(out / f"{result.stamp:.6f}.npz", lambda file: np.savez(file, allow_pickle=False, **arrays, **camera))
 
 
-def _view() -> _View:
-    """A function that shows results in a new viewer. Errors as ``open_viewer``."""
-    log, numbers = RerunLog(open_viewer()[0]), count()
-
-    def show(result: LiveResult, about: dict[str, float]) -> None:
-        out, valid = result.out, result.out.ufm.valid[0]
-        depth, sigma = (
-            torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std)
-        )
-        camera = (result.T_world_cam, out.intrinsics[0].cpu().double().numpy())
-        named = (f"{result.stamp:.6f}", next(numbers), result.stamp)
-        log.add(Gated(*named, *camera, depth, sigma, figures=about, image=np.asarray(result.image)))
-
-    return show
+def _shown(result: LiveResult, number: int, figures: dict[str, float]) -> Gated:
+    """The result as the viewer takes it."""
+    out, valid = result.out, result.out.ufm.valid[0]
+    depth, sigma = (torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std))
+    about = (f"{result.stamp:.6f}", number, result.stamp, result.T_world_cam)
+    K = out.intrinsics[0].cpu().double().numpy()
+    return Gated(*about, K, depth, sigma, figures=figures, image=np.asarray(result.image))
 
 
 def _figures(result: LiveResult, live: LiveDepth) -> dict[str, float]:

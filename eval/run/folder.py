@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ufmstar_torch.eval.run.files import remove_temporaries, to_json, write_json_atomic
+from ufmstar_torch.stateful import flat
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -177,20 +178,10 @@ def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
 
 def differences(then: Manifest, now: Manifest) -> str:
     """The difference between two nested mappings of plain values, by dotted names; "" if nothing does."""
-    before, after = _flat(then), _flat(now)
+    before, after = flat(then), flat(now)
     changed = [key for key in sorted(before.keys() | after.keys()) if before.get(key) != after.get(key)]
     text = "; ".join(f"{key} was {_short(before.get(key))}, now {_short(after.get(key))}" for key in changed[:_SHOWN])
     return text + (f" and {len(changed) - _SHOWN} more" if len(changed) > _SHOWN else "")
-
-
-def _flat(values: Manifest, prefix: str = "") -> dict[str, Any]:
-    """Nested mappings and lists of them as one level, with dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, list) and value and isinstance(value[0], Mapping):
-            value = {str(i): item for i, item in enumerate(value)}
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
 
 
 def _short(value: Any) -> str:
