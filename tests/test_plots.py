@@ -18,7 +18,7 @@ from ufmstar_torch.eval.run.colours import (
     ColourScale,
     colour_table,
 )
-from ufmstar_torch.eval.run.panels import FramePanel, contact_sheet, fit_scales, map_columns
+from ufmstar_torch.eval.run.panels import FramePanel, contact_sheet, map_columns
 from ufmstar_torch.eval.run.pictures import preview_frame, write_video
 
 
@@ -60,19 +60,19 @@ class TestContactSheet:
     def test_columns_show_the_maps_on_common_scales(self, tmp_path: Path) -> None:
         panels = [panel("a", seed=1), panel("b", seed=2)]
         contact_sheet(panels, tmp_path / "s.png", title="t")
-        scales = fit_scales(panels)
+        depth = map_columns(panels)[0].scale
         picture = load(tmp_path / "s.png")[..., :3]
         # Every colour of both depth maps is in the picture, so both rows were drawn on the one scale.
         shown = {tuple(c) for c in picture.reshape(-1, 3).tolist()}
         for one in panels:
-            expected = {tuple(c) for c in scales["depth"].rgb(one.maps["depth"]).reshape(-1, 3).tolist()}
+            expected = {tuple(c) for c in depth.rgb(one.maps["depth"]).reshape(-1, 3).tolist()}
             assert len(expected & shown) > 0.95 * len(expected)
 
     def test_sigma_and_error_share_a_scale(self) -> None:
         one = panel()  # the error is twice sigma
-        length = fit_scales([one])["length"]
-        assert length.high == pytest.approx(np.percentile(2 * one.maps["sigma"][4:], 99))
-        assert [column.scale for column in map_columns([one])[1:]] == [length, length]
+        sigma, error = (column.scale for column in map_columns([one])[1:])
+        assert sigma == error
+        assert sigma.high == pytest.approx(np.percentile(2 * one.maps["sigma"][4:], 99))
 
     def test_a_small_sigma_of_the_posterior_is_not_black_beside_the_networks_errors(self) -> None:
         one = panel()
@@ -110,7 +110,7 @@ class TestPreview:
         step = 240 // size[0]
         left = step * size[1]
         cell = frame[22 : 22 + 240 : step, left : left + step * size[1] : step]
-        np.testing.assert_array_equal(cell, fit_scales([one])["depth"].rgb(one.maps["depth"]))
+        np.testing.assert_array_equal(cell, map_columns([one])[0].scale.rgb(one.maps["depth"]))
 
     def test_video_reads_back(self, tmp_path: Path) -> None:
         import cv2

@@ -91,7 +91,6 @@ class TrainOptions:
         resume: go on with the training in --out.
         overwrite: replace the training in --out.
         threads: CPU threads; default: one for each core.
-        debug: show tracebacks.
     """
 
     USAGE: ClassVar[str] = (
@@ -105,7 +104,6 @@ class TrainOptions:
     resume: bool = False
     overwrite: bool = False
     threads: int | None = None
-    debug: bool = False
     own: BackboneOptions = field(default_factory=BackboneOptions)
     changes: RecipeOptions = field(default_factory=RecipeOptions)
     source: DataOptions = field(default_factory=DataOptions)

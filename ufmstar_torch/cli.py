@@ -77,7 +77,6 @@ def _run(name: str, words: Sequence[str]) -> int:
         command = import_module(f"ufmstar_torch.{COMMANDS[name][0]}")
         try:
             options = command.read(words)
-            debug = getattr(options, "debug", debug)
             _set_up(options)
         except (OSError, ValueError) as error:
             raise UsageError(error) from error

@@ -96,7 +96,7 @@ def _onboard(options: DemoOptions, weights: Path) -> int:
     )
     with output_folder(options.out, kind, {}, overwrite=options.overwrite), Bars() as bars:
         measured = run_onboard(options.out, weights, options.seconds, options.seed, bars.show)
-    settings = {name: value for name, value in as_dict(options).items() if name not in ("debug", "frames", "device")}
+    settings = {name: value for name, value in as_dict(options).items() if name not in ("frames", "device")}
     about = {"program": kind.program, "out": str(options.out), "settings": settings}
     summary: dict[str, Any] = to_json(about | measured | {"hardware": hardware(), "versions": versions()})
     write_json_atomic(options.out / "summary.json", summary)

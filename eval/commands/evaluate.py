@@ -22,7 +22,7 @@ from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
 from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
 from ufmstar_torch.eval.suite.shards import EvalOutcome, evaluate_suite
-from ufmstar_torch.eval.suite.work_items import Shard, find_work, read_names
+from ufmstar_torch.eval.suite.work_items import ALL, Shard, find_work, read_names
 
 # Options that a job has under their names.
 _OF_JOB = ("device", "bins", "examples", "samples", "runtime", "precision")
@@ -137,11 +137,16 @@ class EvalOptions(MachineOptions):
             if not values[name]:
                 raise ValueError(f"--{name} is missing; ufmstar eval --help, and --list for the suites")
         parse_slice(self.data.frames)
-        Shard.parse(self.shard or "1/1")
+        _ = self.part
         if self.output.resume and self.output.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
         if self.shard and self.output.overwrite:
             raise ValueError("--overwrite goes without shards: another one may have begun")
+
+    @property
+    def part(self) -> Shard | None:
+        """The shard; None: all of them, or torchrun's. Raises ValueError: no such part."""
+        return None if self.shard is None else Shard.parse(self.shard)
 
 
 read = reader(EvalOptions, "ufmstar eval")
@@ -204,10 +209,9 @@ def _evaluate(options: EvalOptions) -> int:
                 posterior=PosteriorConfig() if any(row.setting.posterior for row in rows) else None,
             )
             warm_up_command(config, torch.device("cpu"), bars.show, dense=DENSE in anchors)
-        shard = Shard.parse(options.shard) if options.shard else None
         if sys.stderr.isatty():
             how["progress"] = bars.show
-        outcome = evaluate_suite(job, shard=shard, **how, stop=stop, report=bars.say)
+        outcome = evaluate_suite(job, shard=options.part, **how, stop=stop, report=bars.say)
     return _report(job, outcome, options)
 
 
@@ -260,7 +264,7 @@ def _dry_run(options: EvalOptions) -> int:
     job = job_from(options)
     for base in job.unused:
         print(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
-    networks, items = job.load(torch.device("cpu")), Shard.parse(options.shard or "1/1").of(job.items)
+    networks, items = job.load(torch.device("cpu")), (options.part or ALL).of(job.items)
     print(f"{job.suite.name}: {job.suite.title}\n{len(job.suite.rows)} rows:")
     for row in job.suite.rows:
         print(f"  {row.label}  [{networks[row.method.base].label}]")

@@ -35,7 +35,6 @@ class ExportOptions:
         max_sigma: largest standard deviation of a pixel [m]
         max_relative_sigma: largest standard deviation of a pixel, as a share of its depth
         voxel: side of the cloud's voxels [m], each of which has one point
-        debug: show tracebacks
     """
 
     USAGE: ClassVar[str] = "ufmstar export OUT --to depth|cloud|tum|transforms|mcap|rrd [options]"
@@ -45,7 +44,6 @@ class ExportOptions:
     max_sigma: float = option(float("inf"), positive=True)
     max_relative_sigma: float = option(float("inf"), positive=True)
     voxel: float = option(0.02, positive=True)
-    debug: bool = False
 
 
 read = reader(ExportOptions, "ufmstar export")

@@ -71,12 +71,10 @@ class MachineOptions:
     Attributes:
         device: cpu, cuda or cuda:N
         threads: number of CPU threads of network and step; default: all cores but one
-        debug: show tracebacks
     """
 
     device: str = "cpu"
     threads: int | None = None
-    debug: bool = False
 
 
 def positional() -> Any:
@@ -145,9 +143,9 @@ def _parse(options: type[T], words: Sequence[str], prog: str, defaults: Mapping[
         values = parser.parse_args(list(words)).as_dict()
     except (ArgumentError, TypeError) as error:  # TypeError: a list where a configuration file should have a mapping
         message, required, names = " ".join(str(error).split()).partition("the following arguments are required: ")
-        typed = {f.name: f.name if f.metadata.get("positional") else _form(f, str)[0][0] for f in fields(options)}
-        listed = ", ".join(typed.get(name, name) for name in names.split(", "))
-        raise ValueError(f"{message}{required}{listed}") from error
+        bare = {"", *(f.name for f in fields(options) if f.metadata.get("positional"))}
+        listed = [name if name in bare else f"--{name.replace('_', '-')}" for name in names.split(", ")]
+        raise ValueError(f"{message}{required}{', '.join(listed)}") from error
     return _build(options, values)
 
 
@@ -181,6 +179,7 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
         prog=prog, usage=usage, description=description, exit_on_error=False, formatter_class=Formatter
     )
     parser.add_argument("--config", action=BoundedConfigFile, help="JSON or YAML file with any of these options")
+    parser.add_argument("--debug", action="store_true", help="show tracebacks")
     parser.add_argument(_HELP_ALL, action="store_true", help="show every option, those of all settings included")
     _add_options(parser, parser, options, full)
     return parser

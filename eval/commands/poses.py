@@ -54,7 +54,6 @@ class PosesOptions:
         frames: START:STOP:STEP, which images, counted from 0 as Python does
         overwrite: replace the reconstruction in --out
         threads: number of CPU threads; default: all cores
-        debug: show tracebacks
     """
 
     USAGE: ClassVar[str] = (
@@ -74,7 +73,6 @@ class PosesOptions:
     frames: str | None = None
     overwrite: bool = False
     threads: int | None = None
-    debug: bool = False
 
     def __post_init__(self) -> None:
         parse_intrinsics(self.intrinsics, "--intrinsics")

@@ -32,14 +32,12 @@ class RecalibrateOptions:
         row: the row, as the table names it: UfM*-DepthOnly, say
         to: file of the map; WEIGHTS.recalibration.json beside the weights is used without being named
         covariate: what it is a map of: the variance, or a factor of it by the network's confidence
-        debug: show tracebacks
     """
 
     out: Path = positional()
     row: str
     to: Path
     covariate: str = option("variance", choices=("variance", CONFIDENCE))
-    debug: bool = False
 
 
 read = reader(RecalibrateOptions, "ufmstar recalibrate")

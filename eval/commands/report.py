@@ -18,12 +18,10 @@ class ReportOptions:
     Attributes:
         out: folder of `ufmstar eval`
         no_figures: tables and results alone (needs no matplotlib)
-        debug: show tracebacks
     """
 
     out: Path = positional()
     no_figures: bool = False
-    debug: bool = False
 
 
 read = reader(ReportOptions, "ufmstar report")

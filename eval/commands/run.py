@@ -59,8 +59,7 @@ class StreamOptions(MachineOptions):
 
     def settings(self) -> dict[str, Any]:
         """Return the options that define the result, as plain values of a configuration file."""
-        started = ("resume", "overwrite", "debug")
-        plain = {name: value for name, value in as_dict(self).items() if name not in started}
+        plain = {name: value for name, value in as_dict(self).items() if name not in ("resume", "overwrite")}
         ufm = {name: value for name, value in self.config.to_dict().items() if value or name not in SECTIONS}
         return plain | {"ufm": ufm}
 

@@ -75,22 +75,21 @@ def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iter
     done = [record for record in records if record["state"] == "done"]
     if not done:
         raise ValueError(f"{out} has no finished frame")
-    return _gated(out, done, max_sigma, max_relative_sigma)
+    return (_gated(out, record, max_sigma, max_relative_sigma) for record in done)
 
 
-def _gated(out: Path, done: list[dict], max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
-    for record in done:
-        maps = read_frame(frame_file(out, record["name"]))
-        if "T_world_cam" not in maps:
-            raise ValueError(f"{out}: the run is of an earlier version, whose frames have no poses; run it again")
-        prefix = "posterior_" if "posterior_depth" in maps else ""
-        depth, variance = maps[f"{prefix}depth"], maps[f"{prefix}variance"]
-        with np.errstate(invalid="ignore"):
-            sigma = np.sqrt(variance)
-            kept = maps["valid"] & (depth > 0) & np.isfinite(depth)
-            kept &= (sigma <= max_sigma) & (sigma <= max_relative_sigma * depth)
-        about = (record["name"], record["index"], record.get("timestamp"), maps["T_world_cam"], maps["intrinsics"])
-        yield Gated(*about, known_where(kept, depth), known_where(kept, sigma), maps.get("anchors"), record)
+def _gated(out: Path, record: Mapping[str, Any], max_sigma: float, max_relative_sigma: float) -> Gated:
+    maps = read_frame(frame_file(out, record["name"]))
+    if "T_world_cam" not in maps:
+        raise ValueError(f"{out}: the run is of an earlier version, whose frames have no poses; run it again")
+    prefix = "posterior_" if "posterior_depth" in maps else ""
+    depth, variance = maps[f"{prefix}depth"], maps[f"{prefix}variance"]
+    with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(variance)
+        kept = maps["valid"] & (depth > 0) & np.isfinite(depth)
+        kept &= (sigma <= max_sigma) & (sigma <= max_relative_sigma * depth)
+    about = (record["name"], record["index"], record.get("timestamp"), maps["T_world_cam"], maps["intrinsics"])
+    return Gated(*about, known_where(kept, depth), known_where(kept, sigma), maps.get("anchors"), record)
 
 
 def with_images(frames: Iterator[Gated], sequence: FrameSequence) -> Iterator[Gated]:

@@ -209,22 +209,16 @@ class MapColumn(NamedTuple):
 
 
 def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:
-    """The columns right of the image, of all maps that some panel has, on scales that fit all panels."""
-    scales = fit_scales(panels)
-    shown = (name for name in MAPS if any(name in panel.maps for panel in panels))
-    return [MapColumn(MAPS[name][0], scales[MAPS[name][1]], name) for name in shown]
-
-
-def fit_scales(panels: Sequence[FramePanel]) -> dict[str, ColourScale]:
-    """The scales of ``MAPS`` over all panels: depths from their 1st to their 99th percentile; sigmas and errors on one
-    logarithmic scale up to the largest of their 99th percentiles, so that a sigma as large as the error has its colour.
-    """
+    """The columns right of the image, of all maps that some panel has, on scales that fit all panels: depths from their
+    1st to their 99th percentile; sigmas and errors on one logarithmic scale up to the largest of their 99th
+    percentiles, so that a sigma as large as the error has its colour."""
     of = {name: [panel.maps[name] for panel in panels if name in panel.maps] for name in MAPS}
     depth = colours.robust_range([*of["depth"], *of["posterior"]], from_zero=False)
     lengths = [of[name] for name in ("sigma", "error", "posterior_sigma", "posterior_error") if of[name]]
     high = max(colours.robust_range(maps, from_zero=True)[1] for maps in lengths)
     length = ColourScale(high / 10**DECADES, high, colours.ERROR_MAP, logarithmic=True)
-    return {"depth": ColourScale(*depth, colours.DEPTH_MAP), "length": length}
+    scales = {"depth": ColourScale(*depth, colours.DEPTH_MAP), "length": length}
+    return [MapColumn(label, scales[scale], name) for name, (label, scale) in MAPS.items() if of[name]]
 
 
 def contact_sheet(
