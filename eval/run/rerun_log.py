@@ -31,8 +31,10 @@ from ufmstar_torch.optional import optional
 
 WORLD, CAMERA = "world", "world/camera"
 # Of a finished run, and of one that goes on.
-_PLOTS = ("mean_sigma", "mean_disagreement", "mean_network_sigma", "mean_anchored", "mean_bias", "components")
-_PLOTS += ("latency_ms", "depth_m", "sigma_m", "dropped", "skipped")
+_PLOTS = (
+    "mean_sigma", "mean_disagreement", "mean_network_sigma", "mean_anchored", "mean_bias", "components",
+    "latency_ms", "depth_m", "sigma_m", "dropped", "skipped",
+)  # fmt: skip
 _JPEG = 80  # quality
 _POINTS = 4000  # of a frame, coloured by sigma
 _LOCAL = "127.0.0.1"
