@@ -104,11 +104,16 @@ def test_a_folder_that_grows(tmp_path):
     folder, image = tmp_path / "images", np.full((8, 8, 3), 7, np.uint8)
     folder.mkdir()
     (folder / "1.0.png").write_bytes(content(image))  # was there before
-    events = growing_folder(folder, PoseFile(tmp_path / "poses.txt"), idle=5)
-    found = []
+    begun, found = threading.Event(), []
+
+    def clock():
+        begun.set()  # the folder's content is known
+        return time.monotonic()
+
+    events = growing_folder(folder, PoseFile(tmp_path / "poses.txt"), idle=5, clock=clock)
     thread = threading.Thread(target=lambda: found.extend(event for _, event in zip(range(4), events, strict=False)))
     thread.start()
-    time.sleep(0.1)
+    assert begun.wait(20)
     (folder / "2.0.png").write_bytes(content(image)[:40])  # still being written
     (folder / "3.0.png").write_bytes(content(image))
     (folder / "notes.txt").write_text("no image")
