@@ -94,22 +94,3 @@ def read_summary(out):
         raise AssertionError(f"summary.json holds {constant}")
 
     return json.loads((out / "summary.json").read_text(), parse_constant=refuse)
-
-
-class Recorder:
-    """A stream that remembers what was written, for fixtures of a module; capfd has function scope."""
-
-    encoding = "utf-8"
-
-    def __init__(self, parts):
-        self.parts = parts
-
-    def write(self, text):
-        self.parts.append(text)
-        return len(text)
-
-    def flush(self):
-        pass
-
-    def isatty(self):
-        return False

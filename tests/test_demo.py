@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
+from contextlib import redirect_stdout
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
 import pytest
 from demo_networks import SPEC, members, write_members
-from runs import Recorder
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.commands import demo, evaluate
@@ -31,11 +32,9 @@ def done(weights, tmp_path_factory):
     """One demo through the command line: (folder, words, exit code, stdout). No test may change the folder."""
     out = tmp_path_factory.mktemp("demo") / "out"
     words = [*map(str, ("demo", "--weights", weights, "--out", out, "--frames", FRAMES, "--seed", SEED))]
-    with pytest.MonkeyPatch.context() as patch:
-        message = []
-        patch.setattr("sys.stdout", Recorder(message))
+    with redirect_stdout(io.StringIO()) as message:
         code = cli.main(words)
-    return out, words, code, "".join(message)
+    return out, words, code, message.getvalue()
 
 
 def test_every_row_is_judged_in_both_kinds_of_rooms(done):

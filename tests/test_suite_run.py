@@ -26,6 +26,14 @@ from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.work_items import content_digest
 
 
+@pytest.fixture(scope="module")
+def whole(rooms, tmp_path_factory):
+    """The records of an undisturbed evaluation by the stub."""
+    out = tmp_path_factory.mktemp("whole")
+    go(job_on(rooms, out))
+    return kept(out)
+
+
 def folder_of(job):
     return EvalFolder(job.out)
 
@@ -60,7 +68,7 @@ def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
     assert [path.parent.name for path in sorted(job.out.glob("records/*/*/examples"))] == ["ash"]
 
 
-def test_resume_computes_rows_and_sequences_added_since(rooms, tmp_path):
+def test_resume_computes_rows_and_sequences_added_since(rooms, tmp_path, whole):
     job = job_on(rooms, tmp_path / "out")
     rows = job.suite.rows
     go(replace(job, suite=replace(job.suite, rows=rows[:2]), items=job.items[:2]))
@@ -68,8 +76,7 @@ def test_resume_computes_rows_and_sequences_added_since(rooms, tmp_path):
     go(job, stub, resume=True)
     names = [row.method.name for row in rows]
     assert stub.asked == [("ash", names[2:]), ("birch", names[2:]), ("cedar", names)]
-    go(job_on(rooms, tmp_path / "whole"))
-    assert kept(job.out) == kept(tmp_path / "whole")
+    assert kept(job.out) == whole
 
 
 def test_missing_rows_are_judged_beside_their_references():
@@ -79,7 +86,7 @@ def test_missing_rows_are_judged_beside_their_references():
     assert with_references(rows[4:], rows) == [rows[4]]
 
 
-def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path):
+def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path, whole):
     root = write_rooms(tmp_path / "own")
     (root / "birch" / "poses.txt").write_text("not a pose\n")
     job = job_on(root, tmp_path / "out")
@@ -97,8 +104,7 @@ def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path):
     assert go(job, stub, resume=True)[0].finished
     assert [name for name, _ in stub.asked] == ["birch"]
     assert not folder_of(job).failures(job.items)
-    go(job_on(rooms, tmp_path / "whole"))
-    assert kept(job.out) == kept(tmp_path / "whole")
+    assert kept(job.out) == whole
 
 
 def test_what_the_judge_cannot_use_is_broken_and_what_it_cannot_write_ends_all(rooms, tmp_path):
@@ -171,7 +177,7 @@ def test_another_sequence_of_the_name_is_refused(tmp_path):
 # Python 3.12 warns of forks beside threads; this process uses none of what is not its own.
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_a_kill_loses_the_sequence_at_work_alone(rooms, tmp_path):
+def test_a_kill_loses_the_sequence_at_work_alone(rooms, tmp_path, whole):
     def before(name, done):
         if (name, done) == ("birch", 2):
             os.kill(os.getpid(), signal.SIGKILL)
@@ -190,11 +196,10 @@ def test_a_kill_loses_the_sequence_at_work_alone(rooms, tmp_path):
     assert go(job, stub, resume=True)[0].complete
     assert [name for name, _ in stub.asked] == ["birch", "cedar"]
     assert (begun.exists(), own.exists()) == (False, True), "what a killed process had begun to write is removed"
-    go(job_on(rooms, tmp_path / "whole"))
-    assert kept(job.out) == kept(tmp_path / "whole")
+    assert kept(job.out) == whole
 
 
-def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, monkeypatch):
+def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, whole, monkeypatch):
     job, saved, whole = job_on(rooms, tmp_path / "out"), [], Record.save
 
     def save(self, path):
@@ -211,5 +216,4 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, mon
     stub = Stub()
     go(job, stub, resume=True)
     assert [(name, len(rows)) for name, rows in stub.asked] == [("birch", 2), ("cedar", 4)]
-    go(job_on(rooms, tmp_path / "whole"))
-    assert kept(job.out) == kept(tmp_path / "whole")
+    assert kept(job.out) == whole

@@ -124,7 +124,7 @@ def test_files_of_someone_else_are_not_touched(tmp_path):
 def test_overwriting_removes_our_files_alone(tmp_path):
     root, out = write_rooms(tmp_path / "rooms", ["ash"]), tmp_path / "out"
     go(job_on(root, out))
-    own = [out / "notes.txt", out / "tables" / "mine.csv", out / "records" / "rooms" / "ash" / "note.md"]
+    own = [out / "notes.txt", out / "tables" / "mine.txt", out / "records" / "rooms" / "ash" / "note.md"]
     for file in own:
         file.parent.mkdir(exist_ok=True)
         file.write_text("mine")
