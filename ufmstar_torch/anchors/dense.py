@@ -170,12 +170,14 @@ class DenseEvidence(SavedState):
         self._size, self._K = np.array(gray.shape), K
         small, scale = _reduced(gray, self.config.width)
         corners = self._tracker.update(small, T, scale @ K)
+        T, (number, poses) = self._tracker.pose, self._tracker.refined
+        self._keyframes.correct(number, poses)
         result = self._measured(small, scale, T, scale @ K, corners)
         if self._contradicted >= _JUMPED:
             self._contradicted = 0
             self._keyframes.reset()
             self._memory.forget()
-        self._keyframes.add(small, T, self._depth)
+        self._keyframes.add(small, T, self._depth, int(number.max()))
         return result
 
     def _measured(

@@ -23,7 +23,7 @@ _OVERLAP = 0.5
 class Keyframes(SavedState):
     """The last ``count`` keyframes: images in gray, and poses."""
 
-    HELD: ClassVar = {"_pose": "pose", "_added": "added"}
+    HELD: ClassVar = {"_pose": "pose", "_number": "number", "_added": "added"}
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -33,6 +33,7 @@ class Keyframes(SavedState):
         """Forget everything."""
         self._image = [np.zeros((0, 0), np.uint8)] * self._count  # none is ever written to
         self._pose = np.tile(np.eye(4), (self._count, 1, 1))
+        self._number = np.full(self._count, -1)
         self._added = 0
 
     @property
@@ -40,13 +41,14 @@ class Keyframes(SavedState):
         """Number of stored frames."""
         return min(self._added, self._count)
 
-    def add(self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], depth: float) -> None:
+    def add(self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], depth: float, number: int) -> None:
         """Keep a frame if the camera has moved or turned since the last one that was kept.
 
         Args:
             image: [H, W], of one size for all.
             T_world_cam: [4, 4] [m].
             depth: median of the scene [m].
+            number: of the image, for :meth:`correct`.
         """
         if self._image[0].shape != image.shape:
             self._image = [np.zeros(image.shape, np.uint8)] * self._count
@@ -57,8 +59,13 @@ class Keyframes(SavedState):
             if moved < _MOVED * depth and turned < _TURNED:
                 return
         slot = self._added % self._count
-        self._image[slot], self._pose[slot] = image.copy(), T_world_cam
+        self._image[slot], self._pose[slot], self._number[slot] = image.copy(), T_world_cam, number
         self._added += 1
+
+    def correct(self, number: NDArray[np.int64], T_world_cam: NDArray[np.float64]) -> None:
+        """Replace the poses of some images [V] by [V, 4, 4] where they are kept; negative numbers are none."""
+        slot, which = np.nonzero((self._number[:, None] == number) & (number >= 0))
+        self._pose[slot] = T_world_cam[which]
 
     def choose(
         self, T_world_cam: NDArray[np.float64], K: NDArray[np.float64], depth: float, shares: tuple[float, ...]

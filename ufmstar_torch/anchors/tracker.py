@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.anchors.bundle import PoseRefinement
 from ufmstar_torch.anchors.corners import find, follow
 from ufmstar_torch.anchors.saved_state import SavedState, saved_image
 from ufmstar_torch.checked import Checked, number
@@ -180,7 +181,9 @@ class LandmarkTracker(SavedState):
         "_K": "K",
         "_pixel": "pixel",
         "_seen": "seen",
+        "_given": "given_poses",
         "_poses": "poses",
+        "_number": "number",
         "_view": "view",
         "_noise": "noise",
         "_off": "off",
@@ -190,6 +193,7 @@ class LandmarkTracker(SavedState):
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
         self.config = config if config is not None else TrackerConfig()
+        self._refinement = PoseRefinement()
         self.reset()
 
     @property
@@ -203,8 +207,10 @@ class LandmarkTracker(SavedState):
         self._gray, self._K = np.zeros((0, 0), np.uint8), np.eye(3)  # of the last image
         self._pixel = np.zeros((n, w, 2))
         self._seen = np.zeros((n, w), dtype=bool)
-        self._poses = np.tile(np.eye(4), (w, 1, 1))
+        self._given, self._poses = np.tile(np.eye(4), (2, w, 1, 1))  # as given, and refined
+        self._number = np.full(w, -1)  # of the views, counted from the first image
         self._view = -1
+        self._refinement.reset()
         self._noise = self.config.pixel_noise**2
         self._off = -1.0  # standard deviation of corners from their epipolar lines [px]; negative = not measured
         self.baseline, self._depth = 0.0, self.config.start_depth  # of the views, and of the scene [m]
@@ -213,12 +219,13 @@ class LandmarkTracker(SavedState):
     def state(self) -> dict[str, Tensor]:
         """All that is remembered, for :meth:`load_state`: the window, and the last image in gray, which is shared and
         must not be written to."""
-        return {"gray": torch.from_numpy(self._gray)} | super().state()
+        return {"gray": torch.from_numpy(self._gray)} | super().state() | self._refinement.state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Continue where :meth:`state` was taken; ValueError: another ``max_points`` or ``window``."""
         gray = saved_image(state, "gray")
         super().load_state(state)
+        self._refinement.load_state(state)
         self._gray = gray
         self._triangulated()
 
@@ -248,16 +255,28 @@ class LandmarkTracker(SavedState):
             position, alive = self._followed(gray, T)
         else:
             position, alive = np.zeros((self.config.max_points, 2)), np.zeros(self.config.max_points, dtype=bool)
-        self._view = (self._view + 1) % self.config.window
+        last, self._view = self._view, (self._view + 1) % self.config.window
+        self._number[self._view] = self._number[last] + 1
         self._seen[~alive] = False  # a lost corner's slot is free
         self._seen[:, self._view] = alive
         self._pixel[:, self._view] = position
-        self._poses[self._view] = T
+        self._given[self._view] = self._poses[self._view] = T
         tracked = int(alive.sum())
         self._gray, self._K = gray, K
+        self._refine()
         self._compare_with_poses()
         self._fill(gray)
         return self._landmarks(tracked)
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """[4, 4] refined pose of the last image, camera-to-world [m]."""
+        return np.asarray(self._poses[self._view])
+
+    @property
+    def refined(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Numbers [W] of the images in the window, the first one 0, and their refined poses [W, 4, 4]."""
+        return self._number, self._poses
 
     @property
     def focal(self) -> float:
@@ -267,17 +286,24 @@ class LandmarkTracker(SavedState):
     @property
     def pose_error(self) -> float:
         """Standard deviation of corners from their epipolar lines [px]; NaN = not measured."""
-        return self._off if self._off >= 0 else float("nan")
+        return (self._off**2 + self._refinement.smooth) ** 0.5 if self._off >= 0 else float("nan")
 
     @property
     def pose_variance(self) -> float:
         """Variance that errors of the poses add to a tracked position [px^2]."""
-        return max(max(self._off, 0.0) ** 2 - self.config.pixel_noise**2, 0.0)
+        return max(max(self._off, 0.0) ** 2 - self.config.pixel_noise**2, 0.0) + self._refinement.smooth
 
     @property
     def contradicted(self) -> bool:
         """True where the poses contradict the images."""
-        return self._off > self.config.max_pose_error * self._gray.shape[1]
+        return self.pose_error > self.config.max_pose_error * self._gray.shape[1]
+
+    def _refine(self) -> None:
+        """Refine the window's poses by its corners."""
+        order = (self._view + 1 + np.arange(self.config.window)) % self.config.window
+        most = self.config.max_pose_error * self._gray.shape[1]
+        tracks = self._pixel[:, order], self._seen[:, order]
+        self._poses[order] = self._refinement.refine(*tracks, self._given[order], self._K, self._depth, most)
 
     def _compare_with_poses(self) -> None:
         """Follow how far corners lie from where the poses allow them to be, each in the first view that has it."""
@@ -384,7 +410,8 @@ class LandmarkTracker(SavedState):
         # Hopeless geometry can make the covariance indefinite.
         independent = np.maximum(residual, config.pixel_noise**2) * one_pixel
         fine &= (variance >= 0) & (independent <= np.square(config.max_relative_sigma * safe))
-        pixel, shared = self._pixel[chosen][fine, self._view], self.shared(self.baseline)
+        pixel = self._pixel[chosen][fine, self._view]
+        shared = self.shared(self.baseline) + self._refinement.shared
         variance = variance[fine] + shared * depth[fine] ** 4
         return Landmarks(pixel, depth[fine], variance, tracked, none, self.pose_error, shared)
 

@@ -37,6 +37,8 @@ class PosteriorFrame(FrameExtension):
         assert self._config.posterior is not None
         claimed = total(out.disagreement).detach()
         frame, anchors, packed = self._anchors.frame, self._anchors.anchors, state.by_stream["posterior"]
+        if anchors is not None and anchors.shared is not None:  # the poses contradict the images, for an unknown time
+            packed = packed.masked_fill(anchors.shared.isinf()[:, None], 0)
         learnt, posterior = self._update(packed, frame, anchors, claimed, self._config.posterior)
         more = torch.zeros_like(posterior.variance)
         if anchors is not None and anchors.contradiction is not None:  # most are off by more than a factor of 100

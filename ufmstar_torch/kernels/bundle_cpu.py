@@ -1,0 +1,154 @@
+"""Normal equations of a bundle adjustment with the inverse depths eliminated, for ``anchors.bundle``; on the CPU (numba).
+
+View W is the newest. A track whose ray there is n lies in view k at
+
+    q = Exp(-w_k) R_k^T (rho (C_W + s_W - C_k - s_k) + R_W Exp(w_W) n),
+
+up to scale. ``tests/oracle_bundle.py`` is the same in NumPy, its Jacobian by differences.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.kernels.compile_cpu import reordered
+
+# Numbers of a pose's error: a rotation about the camera's axes [rad] and a shift along the world's [m].
+POSE = 6
+# A point this near to a view's image plane, over its distance from the newest view, is not used.
+_AHEAD = 1e-3
+
+
+def inverse_depths(
+    ray: NDArray[np.float64], precision: NDArray[np.float64], T_world_cam: NDArray[np.float64],
+    prior: float, student: float, steps: int,
+) -> NDArray[np.float64]:  # fmt: skip
+    """[N] inverse depths by Gauss-Newton steps with poses that are held fixed; arguments as :func:`equations`."""
+    rho = np.full(len(ray), prior)
+    into, moved = _between(T_world_cam)
+    _inverse_depths(ray, precision, into, moved, prior, student, steps, rho)
+    return rho
+
+
+def equations(
+    ray: NDArray[np.float64], precision: NDArray[np.float64], T_world_cam: NDArray[np.float64],
+    rho: NDArray[np.float64], prior: float, student: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """The tracks' part of the normal equations of a Gauss-Newton step.
+
+    Args:
+        ray: [N, W, 2] x and y of the tracks' positions on the plane at depth 1; the newest view is the last.
+        precision: [N, W-1] of a position in the earlier views; 0 where a view does not show the track.
+        T_world_cam: [W, 4, 4] camera-to-world [m].
+        rho: [N] inverse depths in the newest view [1/m].
+        prior: mean of ``rho`` before the images, of which its standard deviation is twice as much [1/m].
+        student: degrees of freedom of the positions' distribution.
+
+    Returns:
+        A [6 W, 6 W], whose lower triangle counts, and b [6 W] of A d = b; h [N, 6 W] and v [N]: a track's inverse depth
+        changes by v - h d; and the squares [N, W-1] of the residuals before the step.
+    """
+    n, views = precision.shape
+    size = POSE * (views + 1)
+    A, b, h, v = np.zeros((size, size)), np.zeros(size), np.zeros((n, size)), np.zeros(n)
+    squares = np.zeros((n, views))
+    into, moved = _between(T_world_cam)
+    to_view = np.ascontiguousarray(T_world_cam[:, :3, :3].transpose(0, 2, 1))
+    _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, h, v, squares)
+    return A, b, h, v, squares
+
+
+def _between(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """R_k^T R_W [W-1, 3, 3] and R_k^T (C_W - C_k) [W-1, 3]."""
+    R, C = T_world_cam[:, :3, :3], T_world_cam[:, :3, 3]
+    into = R[:-1].transpose(0, 2, 1)
+    return np.ascontiguousarray(into @ R[-1]), ((C[-1] - C[:-1])[:, None] @ R[:-1])[:, 0]
+
+
+@reordered
+def _inverse_depths(ray, precision, into, moved, prior, student, steps, rho):
+    for n in range(len(ray)):
+        x, y = ray[n, -1, 0], ray[n, -1, 1]
+        for _ in range(steps):
+            weight = 0.25 / (prior * prior)
+            above = weight * (prior - rho[n])
+            for k in range(precision.shape[1]):
+                if precision[n, k] == 0:
+                    continue
+                R, t = into[k], moved[k]
+                z = R[2, 0] * x + R[2, 1] * y + R[2, 2] + rho[n] * t[2]
+                if z < _AHEAD:
+                    continue
+                u = (R[0, 0] * x + R[0, 1] * y + R[0, 2] + rho[n] * t[0]) / z
+                v = (R[1, 0] * x + R[1, 1] * y + R[1, 2] + rho[n] * t[1]) / z
+                du, dv = (t[0] - u * t[2]) / z, (t[1] - v * t[2]) / z
+                right, down = ray[n, k, 0] - u, ray[n, k, 1] - v
+                p = precision[n, k]
+                p *= (student + 2) / (student + p * (right * right + down * down))
+                weight += p * (du * du + dv * dv)
+                above += p * (du * right + dv * down)
+            rho[n] = min(max(rho[n] + above / weight, 0.02 * prior), 20 * prior)
+
+
+@reordered
+def _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, h, v, squares):
+    views = precision.shape[1]
+    last = POSE * views
+    # By the newest pose and by view k's: rows u and v.
+    own, other = np.empty((2, POSE)), np.empty((2, POSE))
+    for n in range(len(ray)):
+        x, y = ray[n, -1, 0], ray[n, -1, 1]
+        row = h[n]
+        total = 0.25 / (prior * prior)
+        above = total * (prior - rho[n])
+        for k in range(views):
+            R, t, to = into[k], moved[k], to_view[k]
+            z = R[2, 0] * x + R[2, 1] * y + R[2, 2] + rho[n] * t[2]
+            if precision[n, k] == 0 or z < _AHEAD:
+                continue
+            over = 1 / z
+            u = (R[0, 0] * x + R[0, 1] * y + R[0, 2] + rho[n] * t[0]) * over
+            w = (R[1, 0] * x + R[1, 1] * y + R[1, 2] + rho[n] * t[1]) * over
+            right, down = ray[n, k, 0] - u, ray[n, k, 1] - w
+            squares[n, k] = right * right + down * down
+            p = precision[n, k]
+            p *= (student + 2) / (student + p * squares[n, k])
+            for i in range(2):
+                at = u if i == 0 else w
+                r0, r1, r2 = R[i, 0] - at * R[2, 0], R[i, 1] - at * R[2, 1], R[i, 2] - at * R[2, 2]
+                # R [n]x with n = (x, y, 1), negative: the change by w of the newest view.
+                own[i, 0], own[i, 1], own[i, 2] = (r2 * y - r1) * over, (r0 - r2 * x) * over, (r1 * x - r0 * y) * over
+                for c in range(3):
+                    own[i, 3 + c] = rho[n] * (to[i, c] - at * to[2, c]) * over
+                    other[i, 3 + c] = -own[i, 3 + c]
+            # [q]x: the change by w_k.
+            other[0, 0], other[0, 1], other[0, 2] = u * w, -(1 + u * u), w
+            other[1, 0], other[1, 1], other[1, 2] = 1 + w * w, -u * w, -u
+            du, dv = (t[0] - u * t[2]) * over, (t[1] - w * t[2]) * over
+            total += p * (du * du + dv * dv)
+            above += p * (du * right + dv * down)
+            first = POSE * k
+            for c in range(POSE):
+                by_own, by_own_v = p * own[0, c], p * own[1, c]
+                by, by_v = p * other[0, c], p * other[1, c]
+                row[last + c] += by_own * du + by_own_v * dv
+                row[first + c] += by * du + by_v * dv
+                b[last + c] += by_own * right + by_own_v * down
+                b[first + c] += by * right + by_v * down
+                for d in range(POSE):
+                    A[last + c, first + d] += by_own * other[0, d] + by_own_v * other[1, d]
+                for d in range(c + 1):
+                    A[last + c, last + d] += by_own * own[0, d] + by_own_v * own[1, d]
+                    A[first + c, first + d] += by * other[0, d] + by_v * other[1, d]
+        over_total = 1 / total
+        v[n] = above * over_total
+        for c in range(last + POSE):
+            if row[c] == 0:
+                continue
+            b[c] -= row[c] * v[n]
+            by = row[c] * over_total
+            for d in range(c + 1):
+                A[c, d] -= by * row[d]
+        for c in range(last + POSE):
+            row[c] *= over_total
