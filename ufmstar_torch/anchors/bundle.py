@@ -1,13 +1,14 @@
-"""Poses of a window of views, refined by the corners that are tracked through them: bundle adjustment.
+"""Bundle adjustment of a window of views: tracked corners refine the poses, with the given ones as the prior.
 
-The given poses of the views are off by independent errors, a rotation w and a shift s each, of standard deviations
-sigma_w and sigma_s. They are the prior, so that the refined poses neither drift nor change the scale: only what the
-images show about them changes. In a view, a corner's position has a Student-t distribution about its point's projection,
-of a variance that grows with the number of views between, since errors of tracking add up. Gauss-Newton steps on poses
-and inverse depths, these eliminated, lead to the most likely poses (``kernels.bundle_cpu``).
+Each given pose is off by a rotation w and a shift s, normal with the standard deviations sigma_w and sigma_s. As this
+prior holds for every view, the refined poses do not drift and keep the scale. A corner's position in an earlier view is
+distributed about its point's projection as Student's t; its variance grows with the number of views between, since
+errors of tracking add up. Gauss-Newton steps on poses and inverse depths, the latter eliminated
+(``kernels.bundle_cpu``), lead to the most likely poses.
 
-sigma_w, sigma_s and the noise of the corners are learnt from every frame (EM): with the error d of the newest pose, of
-which the posterior variance c remains, E[d^2] = sigma^2 - c under the prior.
+sigma_w and sigma_s are learnt (EM): the error d of the newest pose has the prior variance sigma^2 and, given the
+images, the posterior variance c; so d^2 should be sigma^2 - c on average. Independent errors show in the images. Errors
+that successive poses share, as those of a late trajectory, hardly do; the mean product of successive d measures them.
 """
 
 from __future__ import annotations
@@ -19,119 +20,113 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.anchors.saved_state import SavedState
 
-# [px] Standard deviations before anything is learnt, of a position by errors of the poses and by tracking; the least.
-_FIRST, _TRACKING, _LEAST = 0.1, 0.35, 0.003
-# Share of the learnt numbers that remains after a frame.
-_MEMORY = 0.8
+# [px] Standard deviations of a position: by errors of the poses before any is learnt, the least and the largest one
+# that is learnt, and by tracking from one view to the next (.25 to .4 on recordings and tours).
+_FIRST, _LEAST, _LARGEST, _TRACKING = 0.1, 0.003, 20.0, 0.35
 # The variance of a corner's position v views before is 1 + _DRIFT (v - 1) times that of the view before.
 _DRIFT = 0.6
-# What a position says about a pose, over that of an independent one: neighbouring corners, and the same corner in
-# several views, err alike. Fitted on tours, whose poses have no error: with 1, they are moved by .3 px.
-_INFORMATION = 0.1
-# Degrees of freedom of the corners' errors, steps for poses and, before, for inverse depths alone.
-_CAP = 5.0
+# Information of a position, over that of an independent one: neighbouring corners err alike, and a corner in several
+# views. On tours .3 is best with noisy poses, .05 with a rolling shutter.
+_INFORMATION = 0.15
+# Share of the learnt numbers that remains after a frame.
+_MEMORY = 0.8
+# Degrees of freedom of a position's distribution; Gauss-Newton steps, and those for inverse depths alone before.
 _STUDENT, _STEPS, _DEPTH_STEPS = 4.0, 4, 6
-# Tracks and views from which on poses are refined.
+# Corners and views from which on poses are refined.
 _ENOUGH, _VIEWS = 8, 3
-# The median of a chi-squared variable of two degrees of freedom.
-_MEDIAN_SQUARE = 1.386
 
 
 class PoseRefinement(SavedState):
-    """Refines poses; remembers how large their errors are.
+    """Refines poses and learns how large their errors are.
 
     Attributes:
         shared: variance of the corners' inverse depths by the errors that remain in the refined poses, the median over
-            the last corners [1/m^2]; the same error for all of them. 0 where nothing was refined.
-        smooth: variance of a position by errors of the given poses that successive views share [px^2]: the images show
-            little of them, while independent ones they show well.
+            the corners [1/m^2]; one error for all of them. 0 where nothing was refined.
+        correlated: variance of a position by the errors that successive given poses share [px^2].
     """
 
-    HELD: ClassVar = {"_variance": "given_pose_variance", "shared": "remaining_pose_variance", "smooth": "smooth_pose_error", "_last": "last_pose_error"}
+    HELD: ClassVar = {
+        "_variance": "given_pose_variance",
+        "_last": "last_pose_error",
+        "correlated": "correlated_pose_variance",
+        "shared": "remaining_pose_variance",
+    }
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
         """Forget everything."""
-        self._variance = np.full(2, _FIRST**2 / 2)  # of w and of s over the scene's depth, in px^2 of a view
-        self.shared, self.smooth, self._last = 0.0, 0.0, np.zeros(6)
+        self._variance = np.full(2, _FIRST**2 / 2)  # of a position, by w and by s [px^2]
+        self._last = np.zeros((2, 3))  # w and s of the last pose as shifts of a position [px]
+        self.correlated = self.shared = 0.0
 
     def refine(
         self, pixel: NDArray[np.float64], seen: NDArray[np.bool_], T_world_cam: NDArray[np.float64],
-        K: NDArray[np.float64], depth: float, most: float,
+        K: NDArray[np.float64], depth: float,
     ) -> NDArray[np.float64]:  # fmt: skip
-        """Most likely poses of some views.
+        """Compute the most likely poses of W successive views.
 
         Args:
-            pixel: [N, W, 2] (u, v) of corners; the newest view is the last.
-            seen: [N, W] which views show them.
+            pixel: [N, W, 2] positions (u, v) of corners; the newest view is the last.
+            seen: [N, W] which of them hold.
             T_world_cam: [W, 4, 4] given poses, camera-to-world [m].
             K: [3, 3] [px].
             depth: median of the scene [m].
-            most: largest standard deviation of a position by errors of the poses [px].
 
         Returns:
-            [W, 4, 4] the refined poses; the given ones where too few corners are seen.
+            [W, 4, 4] refined poses; the given ones where too few corners are seen.
         """
-        from ufmstar_torch.kernels.bundle_cpu import POSE, equations, inverse_depths  # compiles when first needed
+        from ufmstar_torch.kernels.bundle_cpu import FAR, NEAR, equations, inverse_depths  # compiles when first needed
 
         self.shared = 0.0
-        views = np.flatnonzero(seen.any(0))
-        tracks = seen[:, -1] & (seen.sum(1) > 1)
+        tracks, views = seen[:, -1] & (seen.sum(1) > 1), np.flatnonzero(seen.any(0))
         if tracks.sum() < _ENOUGH or len(views) < _VIEWS:
             return T_world_cam
-        f = K[0, 0]
+        unit = np.array([[1], [depth]]) / K[0, 0]  # w [rad] and s [m] that shift a position by a pixel
         ray = (pixel[np.ix_(tracks, views)] - K[:2, 2]) / K.diagonal()[:2]
         growth = 1 + _DRIFT * np.arange(len(views) - 2, -1, -1)
-        shown = seen[np.ix_(tracks, views[:-1])] / growth
-        precision = shown * (f / _TRACKING) ** 2
-        sigma2 = self._variance / f**2 * [1, depth**2]
-        given, poses, prior = T_world_cam[views], T_world_cam[views], np.tile(np.repeat(1 / sigma2, 3), len(views))
-        error, start = np.zeros(len(prior)), 1 / depth
-        rho = inverse_depths(ray, precision, poses, start, _STUDENT, _DEPTH_STEPS)
-        for _ in range(_STEPS):
-            A, b, h, v, squares = equations(ray, precision, poses, rho, start, _STUDENT)
-            A, b = _INFORMATION * A, _INFORMATION * b - prior * error
-            A[np.diag_indices(len(A))] += prior
-            L = np.linalg.cholesky(A)
-            step = np.linalg.solve(L.T, np.linalg.solve(L, b))
-            error += step
-            poses = moved(poses, step)
-            rho = (rho + v - h @ step).clip(0.02 * start, 20 * start)
-        if not np.isfinite(poses).all():
+        precision = seen[np.ix_(tracks, views[:-1])] / growth * (K[0, 0] / _TRACKING) ** 2
+        prior = np.broadcast_to(1 / (self._variance[:, None] * unit**2), (len(views), 2, 3)).ravel()
+        poses, error = T_world_cam[views], np.zeros(len(prior))
+        rho = inverse_depths(ray, precision, poses, 1 / depth, _STUDENT, _DEPTH_STEPS)
+        try:
+            for _ in range(_STEPS):
+                A, b, by_error, alone = equations(ray, precision, poses, rho, 1 / depth, _STUDENT)
+                L = np.linalg.cholesky(_INFORMATION * A + np.diag(prior))
+                step = np.linalg.solve(L.T, np.linalg.solve(L, _INFORMATION * b - prior * error))
+                poses, error = moved(poses, step), error + step
+                rho = (rho + alone - by_error @ step).clip(FAR / depth, NEAR / depth)
+        except np.linalg.LinAlgError:  # not positive definite: numbers that are far out of scale
             return T_world_cam
-        remains = np.linalg.inv(L)
-        self._learn(error[-POSE:], remains[-POSE:, -POSE:], sigma2, f, depth, most)
-        self.shared = float(np.median(np.square(h @ remains.T).sum(1)))
-        result = T_world_cam.copy()
-        result[views] = poses
-        return result
+        inverse = np.linalg.inv(L)  # the covariance is its square
+        self.shared = float(np.median(np.square(by_error @ inverse.T).sum(1)))
+        remains = np.square(inverse[-6:, -6:]).sum(0).reshape(2, 3)
+        self._learn(error[-6:].reshape(2, 3) / unit, remains / unit**2)
+        refined = T_world_cam.copy()
+        refined[views] = poses
+        return refined
 
-    def _learn(
-        self, error: NDArray[np.float64], remains: NDArray[np.float64], sigma2: NDArray[np.float64],
-        f: float, depth: float, most: float,
-    ) -> None:  # fmt: skip
-        """Follow the errors of the given poses by the newest one's: ``error`` [6] and L^-1 of its precision [6, 6]."""
-        shown = 3 - np.square(remains).sum(0).reshape(2, 3).sum(1) / sigma2  # of the three numbers, what images showed
-        change = np.square(error).reshape(2, 3).sum(1) - shown * sigma2
-        now = (sigma2 + (1 - _MEMORY) * change / np.maximum(shown, 1)) * f**2 / [1, depth**2]
-        moves = error / np.repeat([1, depth], 3) * f  # [px]
-        self.smooth = max(_MEMORY * self.smooth + (1 - _MEMORY) * float(moves @ self._last) / 3, 0.0)
-        self._last = moves
-        self._variance = now.clip(_LEAST**2 / 2, (_CAP * most)**2 / 2)
+    def _learn(self, error: NDArray[np.float64], remains: NDArray[np.float64]) -> None:
+        """Follow the given poses' errors by the newest one's [2, 3] and its posterior variance, in pixels."""
+        shown = (1 - remains / self._variance[:, None]).sum(1)  # of three numbers, what the images showed
+        excess = np.square(error).sum(1) - shown * self._variance
+        variance = self._variance + (1 - _MEMORY) * excess / np.maximum(shown, 1)
+        self._variance = variance.clip(_LEAST**2 / 2, _LARGEST**2 / 2)
+        product = float((error * self._last).sum()) / 3
+        self.correlated = max(_MEMORY * self.correlated + (1 - _MEMORY) * product, 0.0)
+        self._last = error
 
 
 def moved(T_world_cam: NDArray[np.float64], error: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses [W, 4, 4] after a rotation about their own axes and a shift along the world's, [6 W] one after the other."""
+    """Poses [W, 4, 4] rotated about their own axes [rad] and shifted along the world's [m] by ``error`` [6 W]."""
     w, s = error.reshape(-1, 2, 3).swapaxes(0, 1)
     angle = np.linalg.norm(w, axis=1)[:, None, None]
     x, y, z = w.T
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
-    first = np.sinc(angle / np.pi)  # sin(angle)/angle
-    second = np.square(np.sinc(angle / (2 * np.pi))) / 2  # (1 - cos(angle))/angle^2
-    turned = T_world_cam.copy()
-    turned[:, :3, :3] = T_world_cam[:, :3, :3] @ (np.eye(3) + first * cross + second * cross @ cross)
-    turned[:, :3, 3] += s
-    return turned
+    first, second = np.sinc(angle / np.pi), np.square(np.sinc(angle / (2 * np.pi))) / 2  # sin(a)/a, (1 - cos(a))/a^2
+    result = T_world_cam.copy()
+    result[:, :3, :3] = T_world_cam[:, :3, :3] @ (np.eye(3) + first * cross + second * cross @ cross)
+    result[:, :3, 3] += s
+    return result

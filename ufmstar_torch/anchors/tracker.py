@@ -1,4 +1,5 @@
-"""Anchors from the images themselves: corners tracked over a few frames and triangulated with the given poses.
+"""Anchors from the images themselves: corners tracked over a few frames, which refine the poses (``bundle``) and are
+triangulated with them.
 
 Needs OpenCV (``opencv-python-headless``), on the CPU; nothing else of the package does. One tracker a camera. What it
 keeps is of fixed size: a window of views, and the positions of at most ``max_points`` corners in them.
@@ -112,7 +113,8 @@ class Landmarks:
         variance: [N] of ``depth`` [m^2].
         tracked: corners followed into this image, of which these N passed all tests; of a map, its landmarks.
         none: why there is no landmark, where N = 0.
-        pose_error: standard deviation of tracked corners from their epipolar lines [px]; NaN = not measured.
+        pose_error: standard deviation of tracked corners from the epipolar lines of the refined poses, with the errors
+            that successive given poses share [px]; NaN = not measured.
         shared: variance of inverse depths by errors of the poses, the same error for all landmarks of the image
             [1/m^2]; it is in ``variance`` too. Infinite where the poses contradict the images.
         contradicted: the poses contradict the images, and no depth is used.
@@ -271,7 +273,7 @@ class LandmarkTracker(SavedState):
     @property
     def pose(self) -> NDArray[np.float64]:
         """[4, 4] refined pose of the last image, camera-to-world [m]."""
-        return np.asarray(self._poses[self._view])
+        return np.array(self._poses[self._view])
 
     @property
     def refined(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -285,13 +287,13 @@ class LandmarkTracker(SavedState):
 
     @property
     def pose_error(self) -> float:
-        """Standard deviation of corners from their epipolar lines [px]; NaN = not measured."""
-        return (self._off**2 + self._refinement.smooth) ** 0.5 if self._off >= 0 else float("nan")
+        """Standard deviation of corners from their epipolar lines [px], as in :class:`Landmarks`."""
+        return (self._off**2 + self._refinement.correlated) ** 0.5 if self._off >= 0 else float("nan")
 
     @property
     def pose_variance(self) -> float:
         """Variance that errors of the poses add to a tracked position [px^2]."""
-        return max(max(self._off, 0.0) ** 2 - self.config.pixel_noise**2, 0.0) + self._refinement.smooth
+        return max(max(self._off, 0.0) ** 2 - self.config.pixel_noise**2, 0.0) + self._refinement.correlated
 
     @property
     def contradicted(self) -> bool:
@@ -301,9 +303,8 @@ class LandmarkTracker(SavedState):
     def _refine(self) -> None:
         """Refine the window's poses by its corners."""
         order = (self._view + 1 + np.arange(self.config.window)) % self.config.window
-        most = self.config.max_pose_error * self._gray.shape[1]
-        tracks = self._pixel[:, order], self._seen[:, order]
-        self._poses[order] = self._refinement.refine(*tracks, self._given[order], self._K, self._depth, most)
+        views = self._pixel[:, order], self._seen[:, order], self._given[order]
+        self._poses[order] = self._refinement.refine(*views, self._K, self._depth)
 
     def _compare_with_poses(self) -> None:
         """Follow how far corners lie from where the poses allow them to be, each in the first view that has it."""

@@ -1,4 +1,4 @@
-"""Normal equations of a bundle adjustment with the inverse depths eliminated, for ``anchors.bundle``; on the CPU (numba).
+"""Normal equations of a bundle adjustment, inverse depths eliminated, for ``anchors.bundle``; on the CPU (numba).
 
 View W is the newest. A track whose ray there is n lies in view k at
 
@@ -16,6 +16,8 @@ from ufmstar_torch.kernels.compile_cpu import reordered
 
 # Numbers of a pose's error: a rotation about the camera's axes [rad] and a shift along the world's [m].
 POSE = 6
+# Inverse depths lie between these multiples of that of the scene.
+FAR, NEAR = 0.02, 20.0
 # A point this near to a view's image plane, over its distance from the newest view, is not used.
 _AHEAD = 1e-3
 
@@ -34,7 +36,7 @@ def inverse_depths(
 def equations(
     ray: NDArray[np.float64], precision: NDArray[np.float64], T_world_cam: NDArray[np.float64],
     rho: NDArray[np.float64], prior: float, student: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     """The tracks' part of the normal equations of a Gauss-Newton step.
 
     Args:
@@ -46,17 +48,16 @@ def equations(
         student: degrees of freedom of the positions' distribution.
 
     Returns:
-        A [6 W, 6 W], whose lower triangle counts, and b [6 W] of A d = b; h [N, 6 W] and v [N]: a track's inverse depth
-        changes by v - h d; and the squares [N, W-1] of the residuals before the step.
+        A [6 W, 6 W], whose lower triangle counts, and b [6 W] of A d = b for the errors d of the poses; h [N, 6 W] and
+        v [N]: a track's inverse depth changes by v - h d.
     """
     n, views = precision.shape
     size = POSE * (views + 1)
     A, b, h, v = np.zeros((size, size)), np.zeros(size), np.zeros((n, size)), np.zeros(n)
-    squares = np.zeros((n, views))
     into, moved = _between(T_world_cam)
     to_view = np.ascontiguousarray(T_world_cam[:, :3, :3].transpose(0, 2, 1))
-    _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, h, v, squares)
-    return A, b, h, v, squares
+    _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, h, v)
+    return A, b, h, v
 
 
 def _between(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -88,11 +89,11 @@ def _inverse_depths(ray, precision, into, moved, prior, student, steps, rho):
                 p *= (student + 2) / (student + p * (right * right + down * down))
                 weight += p * (du * du + dv * dv)
                 above += p * (du * right + dv * down)
-            rho[n] = min(max(rho[n] + above / weight, 0.02 * prior), 20 * prior)
+            rho[n] = min(max(rho[n] + above / weight, FAR * prior), NEAR * prior)
 
 
 @reordered
-def _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, h, v, squares):
+def _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, h, v):
     views = precision.shape[1]
     last = POSE * views
     # By the newest pose and by view k's: rows u and v.
@@ -111,9 +112,8 @@ def _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, 
             u = (R[0, 0] * x + R[0, 1] * y + R[0, 2] + rho[n] * t[0]) * over
             w = (R[1, 0] * x + R[1, 1] * y + R[1, 2] + rho[n] * t[1]) * over
             right, down = ray[n, k, 0] - u, ray[n, k, 1] - w
-            squares[n, k] = right * right + down * down
             p = precision[n, k]
-            p *= (student + 2) / (student + p * squares[n, k])
+            p *= (student + 2) / (student + p * (right * right + down * down))
             for i in range(2):
                 at = u if i == 0 else w
                 r0, r1, r2 = R[i, 0] - at * R[2, 0], R[i, 1] - at * R[2, 1], R[i, 2] - at * R[2, 2]
