@@ -61,6 +61,11 @@ class PoseRefinement(SavedState):
         self._last = np.zeros((2, 3))  # w and s of the last pose as shifts of a position [px]
         self.correlated = self.shared = 0.0
 
+    @property
+    def given(self) -> float:
+        """Variance of a position by errors of the given poses [px^2]."""
+        return float(self._variance.sum())
+
     def refine(
         self, pixel: NDArray[np.float64], seen: NDArray[np.bool_], T_world_cam: NDArray[np.float64],
         K: NDArray[np.float64], depth: float,

@@ -255,7 +255,7 @@ class DenseEvidence(SavedState):
 
     def _apart(self, corners: Landmarks, taken: NDArray[np.float64], width: int) -> NDArray[np.int64]:
         """Indices of the corners that become anchors: certain ones, away from the ``taken`` positions [N, 2]."""
-        over = self._tracker.pose_error / max(self._tracker.baseline, 1e-9) / self._tracker.focal
+        over = self._tracker.remaining_error / max(self._tracker.baseline, 1e-9) / self._tracker.focal
         sigma = np.maximum(np.sqrt(corners.variance) / corners.depth, over * np.maximum(corners.depth, self._depth))
         fine = np.flatnonzero(sigma <= self.config.corner_sigma)
         square = np.square(corners.pixel[fine, None] - taken).sum(-1).min(1, initial=np.inf)

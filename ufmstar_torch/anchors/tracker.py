@@ -77,8 +77,9 @@ class TrackerConfig(Checked):
             parallax, and to leave it out would hide the error there.
         min_share: least share of the triangulated tracks that fit, 0 to 1. Where fewer do, poses and image contradict
             each other, and those that fit do so by chance: none is used.
-        max_pose_error: largest distance of tracked corners from their epipolar lines, a standard deviation, as a share
-            of the image's width: beyond, poses and images contradict each other, and no depth is used.
+        max_pose_error: largest distance of tracked corners from the epipolar lines of the refined poses, a standard
+            deviation, as a share of the image's width: beyond, poses and images contradict each other, and no depth is
+            used.
         start_depth: median depth of the scene before one is known [m]; right to a factor of 5.
 
     Raises:
@@ -113,8 +114,8 @@ class Landmarks:
         variance: [N] of ``depth`` [m^2].
         tracked: corners followed into this image, of which these N passed all tests; of a map, its landmarks.
         none: why there is no landmark, where N = 0.
-        pose_error: standard deviation of tracked corners from the epipolar lines of the refined poses, with the errors
-            that successive given poses share [px]; NaN = not measured.
+        pose_error: standard deviation of tracked corners from their epipolar lines by the given poses [px]; NaN = not
+            measured.
         shared: variance of inverse depths by errors of the poses, the same error for all landmarks of the image
             [1/m^2]; it is in ``variance`` too. Infinite where the poses contradict the images.
         contradicted: the poses contradict the images, and no depth is used.
@@ -287,18 +288,24 @@ class LandmarkTracker(SavedState):
 
     @property
     def pose_error(self) -> float:
-        """Standard deviation of corners from their epipolar lines [px], as in :class:`Landmarks`."""
-        return (self._off**2 + self._refinement.correlated) ** 0.5 if self._off >= 0 else float("nan")
+        """Standard deviation of corners from their epipolar lines by the given poses [px]; NaN = not measured."""
+        return (self._off**2 + self._refinement.given) ** 0.5 if self._off >= 0 else float("nan")
+
+    @property
+    def remaining_error(self) -> float:
+        """That by the refined poses, with the errors that successive given poses share [px]; 0 = not measured."""
+        return (max(self._off, 0.0) ** 2 + self._refinement.correlated) ** 0.5
 
     @property
     def pose_variance(self) -> float:
         """Variance that errors of the poses add to a tracked position [px^2]."""
-        return max(max(self._off, 0.0) ** 2 - self.config.pixel_noise**2, 0.0) + self._refinement.correlated
+        off = max(self._off, 0.0) ** 2 - self.config.pixel_noise**2
+        return max(off, 0.0) + self._refinement.correlated
 
     @property
     def contradicted(self) -> bool:
         """True where the poses contradict the images."""
-        return self.pose_error > self.config.max_pose_error * self._gray.shape[1]
+        return self.remaining_error > self.config.max_pose_error * self._gray.shape[1]
 
     def _refine(self) -> None:
         """Refine the window's poses by its corners."""
@@ -388,7 +395,7 @@ class LandmarkTracker(SavedState):
         chosen, result = self._triangulated()
         none = _NO_DEPTH if tracked else _NO_TRACK
         if self.contradicted:
-            none = contradiction(self.pose_error, config.max_pose_error * self._gray.shape[1])
+            none = contradiction(self.remaining_error, config.max_pose_error * self._gray.shape[1])
         if result is None or self.contradicted:
             nothing, shared = np.zeros(0), self.shared(self.baseline)
             pixel = np.zeros((0, 2))
