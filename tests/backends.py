@@ -146,11 +146,10 @@ def _fused(previous, current, pairs, config, *, rounds=None):
 
 
 def _floored(cov, floor):
-    out, mean = torch.zeros_like(cov), torch.zeros(*cov.shape[:-2], 3, dtype=cov.dtype)
+    out, mean = cov.clone(), torch.zeros(*cov.shape[:-2], 3, dtype=cov.dtype)
     mean[..., 2] = floor.sqrt()  # a camera whose pixel is 1 wide at depth 1
-    given = mean.view(-1, 3).numpy(), cov.reshape(-1, 3, 3).numpy()
-    work = np.empty(fuse_cpu.WORK)
-    compiled(fuse_cpu.floored)(len(given[0]), *given, 0.0, 1.0, 1.0, 0.0, out.view(-1, 3, 3).numpy(), work)
+    given = (value.numpy() for value in (mean.view(-1, 3), out.view(-1, 3, 3), torch.ones_like(floor).view(-1)))
+    fuse_cpu.lift(*given, 0.0, 1.0, 1.0, 0.0)
     return out
 
 

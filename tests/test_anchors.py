@@ -75,7 +75,7 @@ def test_sums_and_means_by_hand(seed, memory, kappa):
     rng = np.random.default_rng(seed)
     n, k = 3, 3  # fewer than could support each other: all are taken
     sums, total = np.zeros((k, 3)), np.zeros(3)
-    evidence = Evidence.empty(1, k, dtype=torch.float64, device="cpu")
+    evidence = Evidence(torch.zeros(1, k, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64))
     for _ in range(3):
         d, g = rng.uniform(1, 4, n), rng.uniform(1, 4, n)
         s2, own = rng.uniform(0, 0.1, (2, n))

@@ -114,7 +114,7 @@ def test_no_weighted_claim_exceeds_the_other_anchors_errors():
             rows = stream(np.stack([5.0 * np.arange(n), np.zeros(n)], -1), rng.normal(0.1, 0.01, n), n)
             own = torch.tensor(10.0 ** rng.uniform(-6, 12, n))[None]
             spoilt = replace(rows, predicted=rows.predicted * torch.tensor(d), depth=rows.depth * 3, own_variance=own)
-            evidence = Evidence.empty(1, 1, dtype=torch.float64, device="cpu")
+            evidence = Evidence(torch.zeros(1, 1, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64))
             sums, _ = observe(evidence, spoilt, lambda values: values.sum(1, keepdim=True), 1.0)
             squares = (spoilt.depth / spoilt.predicted - 1).square().sum()
             assert -max(1.0, 4 * float(squares)) <= float(sums.overall[0, 2]) <= float(squares)

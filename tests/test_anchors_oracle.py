@@ -192,7 +192,7 @@ def test_the_compiled_lesson_is_the_references_own(n, dtype, tolerance):
     frame = check_frame(
         seen, torch.eye(4), torch.tensor(K), None, None, None, None, feature_count=0, rotation_tolerance=1e-3
     )
-    slow = fast = Evidence.empty(2, mixture.capacity, dtype=dtype, device="cpu")
+    slow = fast = Evidence(torch.zeros(2, mixture.capacity, 3, dtype=dtype), torch.zeros(2, 3, dtype=dtype))
     for _ in range(3):
         pixel = torch.rand(2, n, 2, generator=generator) * torch.tensor([WIDTH, HEIGHT]) - 0.5
         relative = 1.2 + 0.1 * torch.randn(2, n, generator=generator)

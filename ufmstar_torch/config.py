@@ -102,13 +102,8 @@ class SPGFConfig(Checked):
         }
         if name not in presets:
             raise ValueError(f"SPGFConfig.preset must be one of {', '.join(presets)}, got {name!r}")
-        upstream = {
-            "adaptive_thresh_scale": 2.4, "noise_floor": 0.08, "noise_thresh": 0.2, "line_thresh": 0.3,
-            "occlusion_gap": 10, "n_check": 16, "max_open": 2, "angle_cosine": 0.5, "sparse": 5,
-            "min_gaussian_length": 0.5, "frame_max_scale": 4.0, "max_depth": 20.0, "min_pixels": 200,
-            "min_rows": 16, "prune": "both", "reference_focal": 525.0, "reference_height": 480, "reference_width": 640,
-        }  # fmt: skip
-        return cls(**{**upstream, **presets[name]})
+        camera = {"max_depth": 20.0, "reference_focal": 525.0, "reference_height": 480, "reference_width": 640}
+        return cls(**{**camera, **presets[name]})
 
     @property
     def depth_limit(self) -> float:

@@ -1,4 +1,4 @@
-"""Closed forms for Gaussians: eigenvalues, square roots, Wasserstein distance and geodesic, overlap.
+"""Closed forms for Gaussians: singular values, Wasserstein distance and geodesic, overlap.
 
 All functions are batched over leading dimensions, differentiable almost everywhere and free of host
 synchronisation. Distances, geodesics and barycenters are computed in float64 whatever the caller's dtype, and
@@ -64,23 +64,6 @@ def right_singular(M: Tensor) -> tuple[Tensor, Tensor]:
             columns[p], columns[q] = c * a - s * b, s * a + c * b
     rotated = torch.stack(columns, dim=-1)
     return torch.linalg.vector_norm(rotated[..., :3, :], dim=-2), rotated[..., 3:, :]
-
-
-def symmetric_eigh(S: Tensor) -> tuple[Tensor, Tensor]:
-    """Eigenvalues (ascending) [..., 3] and eigenvectors (columns) [..., 3, 3] of symmetric S [..., 3, 3].
-
-    The contract of ``torch.linalg.eigh``, by cyclic two-sided Jacobi; only the symmetric part counts.
-    """
-    S = symmetrize(S)
-    V = torch.eye(3, dtype=S.dtype, device=S.device).expand_as(S)
-    for _ in range(_SWEEPS):
-        for p, q in _PAIRS:
-            c, s = _rotation(S[..., p, p], S[..., q, q], S[..., p, q])
-            G = torch.eye(3, dtype=S.dtype, device=S.device).expand_as(S).clone()
-            G[..., p, p], G[..., q, q], G[..., p, q], G[..., q, p] = c, c, s, -s
-            S, V = symmetrize(congruence(G.mT, S)), product(V, G)
-    values, order = torch.diagonal(S, dim1=-2, dim2=-1).sort(dim=-1)
-    return values, torch.gather(V, -1, order[..., None, :].expand_as(V))
 
 
 def cholesky3(S: Tensor) -> Tensor:
@@ -274,14 +257,14 @@ def floor_covariance(covariance: Tensor, floor: Tensor) -> Tensor:
     """Covariances whose eigenvalues are at least ``floor``.
 
     Args:
-        covariance: [..., 3, 3] [m^2].
+        covariance: [..., 3, 3] [m^2], positive semidefinite.
         floor: [...] [m^2].
 
     Returns:
         [..., 3, 3]; those that satisfy the floor already come back unchanged to the last bit.
     """
-    values, V = symmetric_eigh(covariance)
-    low = values[..., 0] < floor
+    values, V = right_singular(covariance)  # of a positive semidefinite matrix: its eigenvalues and eigenvectors
+    low = values.amin(-1) < floor
     lifted = symmetrize(product(V * torch.maximum(values, floor[..., None])[..., None, :], V.mT))
     return torch.where(low[..., None, None], lifted, covariance)
 

@@ -265,15 +265,8 @@ class DenseEvidence(SavedState):
         from ufmstar_torch.kernels.dense_cpu import Search
 
         config, over = self.config, 1 / self._depth
-        return Search(
-            start=over,
-            low=_FARTHEST * over,
-            high=_NEAREST * over,
-            sigmas=config.sigmas,
-            least_score=config.least_score,
-            rival=config.rival,
-            match=config.match_noise,
-        )
+        accepted = config.sigmas, config.least_score, config.rival, config.match_noise
+        return Search(over, _FARTHEST * over, _NEAREST * over, *accepted)
 
     def _views(self, keyframes: list[int], noise: NDArray, T: NDArray, K: NDArray) -> Views:
         """The chosen keyframes, and how pixels of the camera T [4, 4] get into them."""
@@ -301,9 +294,9 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
 
 def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Means of two by two pixels; an odd last row or column is left out."""
-    height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-    quarters = image[:height, :width].reshape(height // 2, 2, width // 2, 2).astype(np.uint16)
-    return np.asarray((quarters.sum((1, 3)) + 2) // 4, dtype=np.uint8)
+    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    return np.asarray(cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _cell(width: int) -> int:

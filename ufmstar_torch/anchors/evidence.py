@@ -74,14 +74,6 @@ class Evidence:
     component: Tensor
     overall: Tensor
 
-    @classmethod
-    def empty(cls, streams: int, capacity: int, *, dtype: torch.dtype, device: torch.device | str) -> Evidence:
-        """Nothing learnt yet."""
-        return cls(
-            torch.zeros(streams, capacity, SUMS, dtype=dtype, device=device),
-            torch.zeros(streams, SUMS, dtype=dtype, device=device),
-        )
-
     def padded(self, capacity: int) -> Evidence:
         """With room for a mixture that has grown."""
         missing = capacity - self.component.shape[1]

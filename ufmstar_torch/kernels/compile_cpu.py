@@ -236,31 +236,13 @@ reordered_leaf = _inner(_nrt=False, fastmath=_ANY_ORDER)
 
 @intrinsic
 def _empty(typing, shape, dtype):
-    """``np.empty(shape, dtype)``, which itself takes .1 s to compile for every kind of array, ``np.zeros`` .3 s."""
-    return _array_type(shape, dtype)(shape, dtype), _allocated
+    """``np.empty(shape, dtype)``, which itself takes .1 s to compile for every kind of array."""
+    array = types.Array(dtype.dtype, len(shape) if isinstance(shape, types.BaseTuple) else 1, "C")
+    return array(shape, dtype), _allocated
 
 
-@intrinsic
-def _zeros(typing, shape, dtype):
-    """``np.zeros(shape, dtype)``."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        value = _allocated(context, builder, signature, arguments)
-        array = make_array(signature.return_type)(context, builder, value)
-        size = builder.mul(array.nitems, array.itemsize)
-        cgutils.memset(builder, builder.bitcast(array.data, cgutils.voidptr_t), size, 0)
-        return value
-
-    return _array_type(shape, dtype)(shape, dtype), generate
-
-
-# As a type checker sees them from a kernel, where the typing context is not an argument.
+# As a type checker sees it from a kernel, where the typing context is not an argument.
 empty: Callable[..., NDArray[Any]] = cast(Any, _empty)
-zeros: Callable[..., NDArray[Any]] = cast(Any, _zeros)
-
-
-def _array_type(shape: Any, dtype: Any) -> types.Array:
-    return types.Array(dtype.dtype, len(shape) if isinstance(shape, types.BaseTuple) else 1, "C")
 
 
 def _allocated(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -11,6 +11,7 @@ copied at once; loops run over all pixels of a window, which compilers turn into
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,8 +58,7 @@ class Views:
     noise: NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Search:
+class Search(NamedTuple):
     """Settings of the search for a depth, and of its acceptance.
 
     Attributes:
@@ -123,11 +123,8 @@ def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, 
     n, v = len(pixel), len(views.image)
     rho, variance, agreed, contradicted = np.zeros(n), np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64)
     each = np.full((n, v, 8), np.nan)
-    numbers = (search.start, search.low, search.high, search.sigmas, search.least_score, search.rival, search.match)
-    _measure(
-        *(image, pixel, views.image, views.H, views.b, views.noise, numbers),
-        *(rho, variance, agreed, contradicted, each),
-    )
+    into = rho, variance, agreed, contradicted, each
+    _measure(image, pixel, views.image, views.H, views.b, views.noise, search, *into)
     value, noise, _, _, speed, slope, across, across_noise = np.moveaxis(each, 2, 0)
     along = each[:, :, 2:4]
     return Measured(rho, variance, agreed, contradicted, value, noise, along, speed, slope, across, across_noise)
@@ -153,8 +150,8 @@ def best_pixels(image, cell, pixel, strength):
 
 
 @reordered
-def _measure(image, pixel, keys, H, b, noise, numbers, rho, variance, agreed, contradicted, each):
-    start, first_low, first_high, sigmas, least_score, least_rival, match = numbers
+def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, contradicted, each):
+    start, first_low, first_high, sigmas, least_score, least_rival, match = search
     height, width = image.shape
     flat = image.reshape(image.size)
     place, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)

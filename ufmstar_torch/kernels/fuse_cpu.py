@@ -1,8 +1,4 @@
-"""Fusion on the CPU (numba): the floor of covariances, one pass over the matched pairs, and what is appended.
-
-The scalar twins of ``ufmstar_torch.gaussian`` stand here and not in a file of their own: numba's cache of a compiled
-function notices edits in its own file only.
-"""
+"""Fusion on the CPU (numba): the floor of covariances, one pass over the matched pairs, and what is appended."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import leaf
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
 
 _SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
@@ -153,16 +149,15 @@ def floor_covariance(S, floor, work):
             S[j, i] = value
 
 
-@leaf
-def floored(count, mean, covariance, near, focal, widening, epsilon, covariance_out, work):
-    """Write the covariances of the first slots with the floor that a segment needs (``step``): the variance across one
-    pixel, and ``epsilon`` times the trace for storage."""
-    for n in range(count):
-        S = covariance_out[n]
-        for i in range(3):
-            for j in range(3):
-                S[i, j] = covariance[n, i, j]
-        across = max(np.float64(mean[n, 2]), near) / focal
+@kernel
+def lift(mean, covariance, weight, near, focal, widening, epsilon):
+    """Lift the covariances of occupied slots, which are the first ones, to the floor that a segment needs (``step``),
+    in place: the variance across one pixel, and ``epsilon`` times the trace for storage."""
+    work = empty(WORK, np.float64)
+    for n in range(weight.size):
+        if not weight[n] > 0:
+            break
+        S, across = covariance[n], max(mean[n, 2], near) / focal
         floor_covariance(S, max(across * across * widening, epsilon * (S[0, 0] + S[1, 1] + S[2, 2])), work)
 
 

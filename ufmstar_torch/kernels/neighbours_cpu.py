@@ -18,11 +18,8 @@ from ufmstar_torch.anchors.evidence import (
     TIE,
 )
 from ufmstar_torch.kernels.compile_cpu import leaf, part
-from ufmstar_torch.kernels.regress_vectors_cpu import count_less, square_distances
-from ufmstar_torch.kernels.vectors_cpu import LANES
 
 _FEW = 3  # anchors of a cell, on average
-_TRIALS = 100  # of a radius: distances differ by so little only where rounding makes them equal
 
 
 @part
@@ -67,17 +64,16 @@ def supported(pixel, predicted, depth, variance, valid, out):
         out[a] = valid[a]
     if n <= SUPPORT:
         return
-    most, room = min(NEIGHBOURS, n - 1), n + LANES
+    most = min(NEIGHBOURS, n - 1)
     # In the order of the grid: pixel, what breaks a tie, log g/d, and the variance of log g.
-    u, v, tie, ratio, noise = np.empty(room), np.empty(room), np.empty(room), np.empty(n), np.empty(n)
+    u, v, tie, ratio, noise = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     for i in range(n):
         a = order[i]
         u[i], v[i], tie[i] = pixel[a, 0], pixel[a, 1], TIE * a
         ratio[i], noise[i] = math.log(depth[a] / predicted[a]), variance[a] / (depth[a] * depth[a])
-    neighbour, differ = np.empty((n, most + 1), np.int64), np.empty(n * most)
-    distance, place, work = np.empty(room), np.empty(n, np.int64), np.empty(4)
+    neighbour, differ, distance = np.empty((n, most), np.int64), np.empty(n * most), np.empty(most)
     for i in range(n):
-        _nearest(cells, u, v, tie, i, distance, place, work, neighbour[i])
+        _nearest(cells, u, v, tie, i, distance, neighbour[i])
         for j in range(most):
             differ[i * most + j] = abs(ratio[i] - ratio[neighbour[i, j]])
     sigma = _lower_quartile(differ.copy(), differ.size) / LOWER_QUARTILE
@@ -117,66 +113,29 @@ def _lower_quartile(values, n):
 
 
 @leaf
-def _nearest(cells, u, v, tie, i, distance, place, work, neighbour):
-    """Write the anchors nearest to anchor i to ``neighbour`` [most + 1], whose last entry is scratch, of more than
-    ``most`` in the order of the grid.
-
-    They are among those in rings of cells around its own if so many lie within the circle that the rings contain.
-    """
-    low, side, columns, rows = cells[:4]
-    work[0], work[1], most = u[i], v[i], neighbour.size - 1
+def _nearest(cells, u, v, tie, i, distance, neighbour):
+    """Write the ``distance.size`` anchors nearest to anchor i, in the order of the grid, to ``neighbour``; there are as
+    many others. They are searched in rings of cells around its own, until the rings contain a circle with so many."""
+    low, side, columns, rows, start = cells[0], cells[1], cells[2], cells[3], cells[4]
     x, y = (u[i] - low[0]) / side, (v[i] - low[1]) / side
     column, row = min(int(x), columns - 1), min(int(y), rows - 1)
     # [cells] From the anchor to the border of its cell; a billionth less for rounding.
     margin = max(min(min(x - column, column + 1 - x), min(y - row, row + 1 - y)) - 1e-9, 0.0)
-    ring, within, n, limit = 0, 0, 0, 0.0
-    while within < most:
+    ring, last, limit = 0, distance.size - 1, 0.0
+    while ring == 0 or not distance[last] < limit:
         ring += 1
-        n = _around(cells, u, v, tie, i, column, row, ring, distance, place, work)
-        limit = (ring + margin) * side * ((ring + margin) * side)
-        if ring >= max(columns, rows):  # all of them
-            for j in range(n):
-                limit = max(limit, 2 * distance[j] + 1) if distance[j] < np.inf else limit
-        within = _within(distance, n, limit, work)
-    least, below = 0.0, 0
-    for _ in range(_TRIALS):
-        if within == most:
-            break
-        # Their number grows about as the square of the distance.
-        middle = least + (limit - least) * (most + 0.5 - below) / (within + 1 - below)
-        count = _within(distance, n, middle, work)
-        if count < most:
-            least, below = middle, count
-        else:
-            limit, within = middle, count
-    count = 0
-    for j in range(n):  # without a branch, which would be mispredicted
-        neighbour[count] = place[j]
-        count = min(count + (distance[j] < limit), most)
-
-
-@leaf
-def _around(cells, u, v, tie, i, column, row, ring, distance, place, work):
-    """Write the squared distances of anchor i from those in rings of cells around its own, infinite from itself, and
-    which they are; return how many. Behind the last one there are as many infinite ones as fit in a vector."""
-    columns, rows, start = cells[2], cells[3], cells[4]
-    n, left, right = 0, max(column - ring, 0), min(column + ring, columns - 1)
-    for y in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
-        first, last = start[y * columns + left], start[y * columns + right + 1]
-        square_distances(u, v, tie, first, last - first, work, distance, n)
-        for j in range(first, last):
-            place[n + j - first] = j
-        if first <= i < last:
-            distance[n + i - first] = np.inf
-        n += last - first
-    for j in range(LANES):
-        distance[n + j] = np.inf
-    return n
-
-
-@leaf
-def _within(distance, n, limit, work):
-    """Number of the n distances that are less than ``limit``."""
-    work[2] = limit
-    count_less(distance, n, work[2:])
-    return int(work[3])
+        limit = np.inf if ring >= max(columns, rows) else (ring + margin) * side * ((ring + margin) * side)
+        for k in range(last + 1):
+            distance[k] = limit
+        left, right = max(column - ring, 0), min(column + ring, columns - 1)
+        for y_cell in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
+            for j in range(start[y_cell * columns + left], start[y_cell * columns + right + 1]):
+                du, dv = u[j] - u[i], v[j] - v[i]
+                apart = du * du + dv * dv + tie[j]
+                if j == i or not apart < distance[last]:
+                    continue
+                k = last
+                while k > 0 and distance[k - 1] > apart:
+                    distance[k], neighbour[k] = distance[k - 1], neighbour[k - 1]
+                    k -= 1
+                distance[k], neighbour[k] = apart, j

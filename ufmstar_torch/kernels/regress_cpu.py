@@ -20,9 +20,7 @@ from ufmstar_torch.kernels.compile_cpu import contracted, kernel
 from ufmstar_torch.kernels.regress_cull_cpu import in_view
 from ufmstar_torch.kernels.regress_near_cpu import near
 from ufmstar_torch.kernels.regress_tiles_cpu import exact, exact_at
-from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, WEIGHT
 from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
-from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression
 from ufmstar_torch.unmeasured import HALF
 
@@ -41,23 +39,6 @@ class Seen(NamedTuple):
     disagreement: NDArray[np.float64]
     features: NDArray[np.float64]
 
-    def moments(self) -> tuple[NDArray[np.float64], ...]:
-        """Mean [n, 3], covariance [n, 3, 3] and weight [n]."""
-        rows = self.components[:, : len(self.disagreement)].T
-        mean, covariance, weight = np.split(rows, (COVARIANCE, WEIGHT), axis=1)
-        return mean.copy(), np.ascontiguousarray(covariance).reshape(-1, 3, 3), weight[:, 0].copy()
-
-
-def in_slots(seen: Sequence[Seen], capacity: int) -> GaussianMixture:
-    """The components in the first slots of a mixture [B, capacity] in the camera's frame, the others empty."""
-    features = seen[0].features.shape[1]
-    mixture = GaussianMixture.empty(len(seen), capacity, features=features, dtype=torch.float64, device="cpu")
-    for b, one in enumerate(seen):
-        values = map(torch.from_numpy, (*one.moments(), one.disagreement, one.features))
-        for field, value in zip(_tensors(mixture), values, strict=True):
-            field[b, : len(value)] = value
-    return mixture
-
 
 def look(
     seen: Sequence[Seen], depth: Tensor, intrinsics: Tensor, config: UfMStarConfig, *others: torch.dtype
@@ -65,7 +46,7 @@ def look(
     """The part of each stream's mixture in view, as the exact sum takes it, with the error of the depth's dtype or of a
     more precise one of the ``others``."""
     epsilon = min(EPSILON[dtype] for dtype in (depth.dtype, *others))
-    streams = zip(seen, _doubles(intrinsics)[0], array(depth), strict=True)
+    streams = zip(seen, np.asarray(array(intrinsics), np.float64), array(depth), strict=True)
     prior = config.prior_weight, config.prior_mean
     return [in_view(*one, K, z, float(z.max()), *prior, epsilon) for one, K, z in streams]
 
@@ -85,9 +66,9 @@ def regress_maps(
     With the exact sum, ``views`` are those of :func:`look`, which None makes, and ``shift`` [B, 2] is added to the two
     features before the last, of three or more; None = nothing.
     """
-    z, K = array(depth), _doubles(intrinsics)[0]
+    z, K = array(depth), np.asarray(array(intrinsics), np.float64)
     shape, features = z.shape if pixels is None else tuple(pixels.shape), seen[0].features.shape[1]
-    out, out_f = np.empty(shape, z.dtype), np.empty((len(z), features, *shape[1:]), z.dtype)
+    out, out_f = (np.full(size, np.nan, z.dtype) for size in (shape, (len(z), features, *shape[1:])))
     shares = 1 if pixels is not None else shares_of_stream(len(z), z[0].size)
     moved = np.zeros((len(z), 2)) if shift is None else shift
     if config.regression != "exact":
@@ -156,14 +137,6 @@ def _fill_and_smooth(disagreement, depth, previous, measured, memory, shown, sha
 def _plus(value, more, factor):
     """As torch's ``add`` with ``alpha``."""
     return value + more * factor
-
-
-def _doubles(*values: Tensor) -> list[NDArray[np.float64]]:
-    return [np.asarray(array(value), np.float64) for value in values]
-
-
-def _tensors(m: GaussianMixture) -> tuple[Tensor, ...]:
-    return m.mean, m.covariance, m.weight, m.disagreement, m.features
 
 
 def _regression(out: NDArray[Any], features: NDArray[Any]) -> Regression:

@@ -14,19 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import contracted, empty, kernel, leaf, part, zeros
+from ufmstar_torch.kernels.compile_cpu import contracted, empty, kernel, leaf, part
 from ufmstar_torch.kernels.regress_cull_cpu import FIELDS, cull, pad
-from ufmstar_torch.kernels.regress_vectors_cpu import (
-    PIXELS,
-    TILE,
-    TINY,
-    mix,
-    mix_more,
-    mix_three,
-    place,
-    read_tile,
-    write_tile,
-)
+from ufmstar_torch.kernels.regress_vectors_cpu import PIXELS, TILE, TINY, mix, mix_more, mix_three, place
 from ufmstar_torch.kernels.vectors_cpu import LANES
 
 _SIDE = 4  # tiles of a block
@@ -39,8 +29,9 @@ _EVIDENCE, _TOTAL, _LAST = range(3)  # rows of a tile's sums and averages, as `m
 def exact(depth, K, view, features, shift, out, out_f, first, shares):
     """One stream; of its blocks every ``shares``-th, from ``first`` on.
 
-    depth [H, W], K [3, 3], what is in view (:func:`in_view`) and features [K, F] into out [H, W] and out_f [F, H, W];
-    NaN where the depth is not positive. ``shift`` [2] is added to the two features before the last, of three or more.
+    depth [H, W], K [3, 3], what is in view (:func:`in_view`) and features [K, F] into out [H, W] and out_f [F, H, W],
+    which are NaN and stay so where the depth is not positive. ``shift`` [2] is added to the two features before the
+    last, of three or more.
     """
     tiles, lists, sums = _scratch(view, out_f.shape[0], shift)
     grid = tiles[0]
@@ -55,10 +46,10 @@ def exact_at(depth, K, pixels, view, features, shift, out, out_f):
     """One stream at some pixels [n], indices into the flattened image, into out [n] and out_f [F, n]."""
     height, width = depth.shape
     columns, rows = (width + _BLOCK - 1) // _BLOCK, (height + _BLOCK - 1) // _BLOCK
-    begin, sorted_pixels = zeros(rows * columns + 1, np.int64), empty((4, pixels.size), np.int64)
-    _by_block(pixels, width, columns, begin, sorted_pixels)
+    begin, order = empty(rows * columns + 2, np.int64), empty(pixels.size, np.int64)
+    _by_block(pixels, width, columns, begin, order)
     tiles, lists, sums = _scratch(view, out_f.shape[0], shift)
-    _at_pixels(depth, K, begin, sorted_pixels, view, features, tiles, lists, sums, out, out_f)
+    _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sums, out, out_f)
 
 
 @part
@@ -78,8 +69,8 @@ def _scratch(view, features, shift):
         empty((_TILES, 9), np.float64), empty(_TILES, np.bool_), empty((_TILES, PIXELS), dtype), empty(10, dtype),
     )  # fmt: skip
     lists = empty((FIELDS, n), dtype), empty(n + 8, dtype), empty(n, np.int64), empty(n, np.int64)
-    start = zeros(6, dtype)
-    start[_EVIDENCE], start[_TOTAL], start[3] = view[4][0], view[4][0] * view[4][1], TINY
+    start = empty(6, dtype)
+    start[_EVIDENCE], start[_TOTAL], start[_LAST], start[3] = view[4][0], view[4][0] * view[4][1], 0, TINY
     start[4], start[5] = shift[1], shift[0]
     densities = empty((n if more > 0 else 0, PIXELS), dtype)
     return (
@@ -112,10 +103,7 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
             if seen[tile]:
                 _depths(depth, v, u, z)
                 seen[tile] = _place((u + half - K[0, 2]) / K[0, 0], (v + half - K[1, 2]) / K[1, 1], tiles, tile)
-            if seen[tile]:
-                some = True
-            else:
-                _blank(v, u, out, out_f)
+            some |= seen[tile]
         if not some:
             continue
         count = cull(everyone, view[0].size, view[4][4], _union(boxes, seen), view[4], work, in_block)
@@ -133,67 +121,65 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
 
 
 @leaf
-def _by_block(pixels, width, columns, begin, out):
-    """Sort pixels by block, keeping their order within one: ``begin`` [blocks + 1], and ``out`` [3 and more, n] with
-    the number of each, its row and its column."""
+def _by_block(pixels, width, columns, begin, order):
+    """Sort pixels by block, keeping their order within one: block b has those from place ``begin[b]`` of the order to
+    ``begin[b + 1]``."""
+    for block in range(begin.size):
+        begin[block] = 0
     for i in range(pixels.size):
-        v = pixels[i] // width
-        out[3, i] = v
-        begin[_block(v, pixels[i] - v * width, columns) + 1] += 1
-    for block in range(1, begin.size):
+        begin[_block(pixels[i], width, columns) + 2] += 1
+    for block in range(2, begin.size):
         begin[block] += begin[block - 1]
     for i in range(pixels.size):
-        v = out[3, i]
-        u = pixels[i] - v * width
-        block = _block(v, u, columns)
-        at = begin[block]
-        out[0, at], out[1, at], out[2, at] = i, v, u
-        begin[block] += 1
-    for block in range(begin.size - 1, 0, -1):
-        begin[block] = begin[block - 1]
-    begin[0] = 0
+        block = _block(pixels[i], width, columns)
+        order[begin[block + 1]] = i
+        begin[block + 1] += 1
 
 
 @leaf
-def _block(v, u, columns):
+def _block(pixel, width, columns):
     """The block of a pixel."""
-    return v // _BLOCK * columns + u // _BLOCK
+    v = pixel // width
+    return v // _BLOCK * columns + (pixel - v * width) // _BLOCK
 
 
 @leaf
-def _at_pixels(depth, K, begin, pixels, view, features, tiles, lists, sums, out, out_f):
-    """The blocks of an image at some pixels, up to 64 at a time; ``begin`` and ``pixels`` are those of
+def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sums, out, out_f):
+    """The blocks of an image at some pixels, up to 64 at a time; ``begin`` and ``order`` are those of
     :func:`_by_block`."""
     grid, z, kept, averages, more, last = tiles[0], tiles[1], lists[2], sums[3], sums[4], out_f.shape[0] - 1
-    nan, columns, order = out.dtype.type(np.nan), (depth.shape[1] + _BLOCK - 1) // _BLOCK, pixels[0]
-    for block in range(begin.size - 1):
+    columns = (depth.shape[1] + _BLOCK - 1) // _BLOCK
+    for block in range(begin.size - 2):
         v0, u0 = block // columns * _BLOCK + 0.5 * (_BLOCK - 1), block % columns * _BLOCK + 0.5 * (_BLOCK - 1)
         for low in range(begin[block], begin[block + 1], PIXELS):
             count = min(PIXELS, begin[block + 1] - low)
             for i in range(count):
-                v, u = pixels[1, low + i], pixels[2, low + i]
+                v = pixels[order[low + i]] // depth.shape[1]
+                u = pixels[order[low + i]] - v * depth.shape[1]
                 grid[0, i], grid[1, i] = (u - u0) / K[0, 0], (v - v0) / K[1, 1]
                 z[i] = depth[v, u]
             for i in range(count, PIXELS):  # the last one again
                 grid[0, i], grid[1, i], z[i] = grid[0, count - 1], grid[1, count - 1], z[count - 1]
-            some = _place((u0 - K[0, 2]) / K[0, 0], (v0 - K[1, 2]) / K[1, 1], tiles, 0)
-            if some:
-                chosen = cull(view[2], view[0].size, view[4][4], _box(tiles[3], 0), view[4], lists[1], kept)
-                filled = (count + LANES - 1) // LANES * LANES
-                _average(filled, tiles, 0, kept, chosen, view, features, sums)
+            if not _place((u0 - K[0, 2]) / K[0, 0], (v0 - K[1, 2]) / K[1, 1], tiles, 0):
+                continue
+            chosen = cull(view[2], view[0].size, view[4][4], _box(tiles[3], 0), view[4], lists[1], kept)
+            filled = (count + LANES - 1) // LANES * LANES
+            _average(filled, tiles, 0, kept, chosen, view, features, sums)
             for i in range(count):
-                out[order[low + i]] = averages[_TOTAL, i] if some else nan
+                out[order[low + i]] = averages[_TOTAL, i]
                 for g in range(more.shape[0]):
-                    out_f[g, order[low + i]] = more[g, i] if some else nan
+                    out_f[g, order[low + i]] = more[g, i]
                 for g in range(more.shape[0], last + 1):
-                    out_f[g, order[low + i]] = averages[_LAST + last - g, i] if some else nan
+                    out_f[g, order[low + i]] = averages[_LAST + last - g, i]
 
 
 @leaf
 def _depths(depth, v0, u0, z):
     """Depths [64] of a tile, 0 beyond the image."""
     if v0 + TILE <= depth.shape[0] and u0 + TILE <= depth.shape[1]:
-        read_tile(depth, v0 * depth.shape[1] + u0, depth.shape[1], z)
+        for v in range(TILE):
+            for u in range(TILE):
+                z[v * TILE + u] = depth[v0 + v, u0 + u]
     else:
         for i in range(PIXELS):
             v, u = v0 + i // TILE, u0 + i % TILE
@@ -235,17 +221,6 @@ def _union(boxes, seen):
             a, b, c = min(a, boxes[tile, 0]), min(b, boxes[tile, 1]), min(c, boxes[tile, 2])
             d, e, f = max(d, boxes[tile, 3]), max(e, boxes[tile, 4]), max(f, boxes[tile, 5])
     return a, b, c, d, e, f
-
-
-@leaf
-def _blank(v_low, u_low, out, out_f):
-    """NaN at the pixels of a tile."""
-    nan = out.dtype.type(np.nan)
-    for v in range(v_low, min(v_low + TILE, out.shape[0])):
-        for u in range(u_low, min(u_low + TILE, out.shape[1])):
-            out[v, u] = nan
-            for g in range(out_f.shape[0]):
-                out_f[g, v, u] = nan
 
 
 @leaf
@@ -291,7 +266,9 @@ def _write(sums, v0, u0, out, out_f):
 def _copy(values, v0, u0, out):
     """The values [64] of a tile into a map."""
     if v0 + TILE <= out.shape[0] and u0 + TILE <= out.shape[1]:
-        write_tile(values, out, v0 * out.shape[1] + u0, out.shape[1])
+        for v in range(TILE):
+            for u in range(TILE):
+                out[v0 + v, u0 + u] = values[v * TILE + u]
     else:
         for v in range(v0, min(v0 + TILE, out.shape[0])):
             for u in range(u0, min(u0 + TILE, out.shape[1])):

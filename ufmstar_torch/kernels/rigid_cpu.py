@@ -61,20 +61,10 @@ def turn(code, motion, n, stride, fields):
 
 
 @leaf
-def move(motion, mean, covariance, weight, mean_out, covariance_out, half):
-    """Write the moved mean [K, 3] and covariance [K, 3, 3] of occupied slots. What is not written stays as it is;
-    ``half`` [3, 3] is scratch."""
-    for k in range(weight.size):
-        if not weight[k] > 0:
-            continue
-        x, y, z = mean[k, 0], mean[k, 1], mean[k, 2]
-        S = covariance[k]
+def scatter(n, fields, mean, covariance):
+    """Write the first n columns of fields [13, n and more] to slots, mean and covariance: :func:`gather` backwards."""
+    for j in range(n):
         for i in range(3):
-            a, b, c = motion[i, 0], motion[i, 1], motion[i, 2]
-            mean_out[k, i] = a * x + b * y + c * z + motion[i, 3]
-            for j in range(3):
-                half[i, j] = a * S[0, j] + b * S[1, j] + c * S[2, j]
-        for i in range(3):
-            for j in range(3):
-                value = half[i, 0] * motion[j, 0] + half[i, 1] * motion[j, 1] + half[i, 2] * motion[j, 2]
-                covariance_out[k, i, j] = value
+            mean[j, i] = fields[i, j]
+            for axis in range(3):
+                covariance[j, i, axis] = fields[COVARIANCE + 3 * i + axis, j]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,6 @@ from torch import Tensor
 
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.segment_image_cpu import join_rows, write_gaussians, write_labels
 from ufmstar_torch.kernels.segment_rows_cpu import SEGMENT, SEGMENT_INT, scan_rows
 from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
@@ -48,43 +47,14 @@ class _Limits(NamedTuple):
     min_rows: int
 
 
-Fit = tuple[np.ndarray, np.ndarray, np.ndarray]  # kept, gaussians and whole, as :func:`join_rows` returns them
-
-
 def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.segment.segment`, for CPU tensors, float64 inside."""
-    fits, labels = fit(given, before_pruning=before_pruning)
-    dtype = np.float32 if given.dtype == torch.float32 else np.float64
-    b, k = len(fits), most_gaussians(fits)
-    mean, covariance = np.zeros((b, k, 3), dtype), np.zeros((b, k, 3, 3), dtype)
-    weight, count = np.zeros((b, k), dtype), np.zeros((b, k), np.int64)
-    for i, (kept, gaussians, whole) in enumerate(fits):
-        _write(kept, gaussians, whole, mean[i], covariance[i], weight[i], count[i])
-    features = np.empty((b, k, 0), dtype)
-    if given.features is not None:
-        features = feature_means(array(given.features), labels, weight)
-    fields = (mean, covariance, weight, np.zeros((b, k), dtype), count, features)
-    return GaussianMixture(*map(torch.from_numpy, fields)), labels()
+    mixture, labels = gaussians(given, before_pruning=before_pruning)
+    return mixture, labels()
 
 
-def most_gaussians(fits: Sequence[Fit]) -> int:
-    """The slots of a mixture for all streams, at least 1."""
-    return max(1, *(kept.size for kept, _, _ in fits))
-
-
-def feature_means(features: np.ndarray, labels: Callable[[], Tensor], weight: np.ndarray) -> np.ndarray:
-    """Means [B, K, F] of the features [B, F, H, W] over the pixels of each Gaussian, summed in raster order, in the
-    dtype of ``weight`` [B, K]."""
-    out = np.empty((*weight.shape, features.shape[1]), weight.dtype)
-    for b, place in enumerate(labels().numpy() + 1):  # 0: of no Gaussian
-        for f, values in enumerate(features[b]):
-            sums = np.bincount(place.ravel(), values.ravel(), weight.shape[1] + 1)
-            out[b, :, f] = sums[1:] / np.maximum(weight[b], 1)
-    return out
-
-
-def fit(given: SegmentInput, *, before_pruning: bool = False) -> tuple[list[Fit], Callable[[], Tensor]]:
-    """The Gaussians of :func:`segment`, stream by stream, and a function that writes the labels."""
+def gaussians(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Callable[[], Tensor]]:
+    """The mixture of :func:`segment`, and a function that writes the labels."""
     z = array(given.depth)
     streams, height, width = z.shape
     absent = (streams, height, 0)  # rows of no pixels stand for "not given"
@@ -107,15 +77,35 @@ def fit(given: SegmentInput, *, before_pruning: bool = False) -> tuple[list[Fit]
         joins.append((width, fy, cy, slope, bins[0], limits, *tables))
     each(scan_rows, scans)
     joined = each(join_rows, joins)
-    slots = [slot for *_, slot in joined]
 
     def labels() -> Tensor:
         out = np.empty(z.shape, np.int64)
-        for b, slot in enumerate(slots):
+        for b, (*_, slot) in enumerate(joined):
             write_labels(spans[b], runs[b], slot, out[b])
         return torch.from_numpy(out)
 
-    return [(kept, gaussians, whole) for kept, gaussians, whole, _ in joined], labels
+    dtype = np.float32 if given.dtype == torch.float32 else np.float64
+    k = max(1, *(kept.size for kept, *_ in joined))
+    mean, covariance = np.zeros((streams, k, 3), dtype), np.zeros((streams, k, 3, 3), dtype)
+    weight, count = np.zeros((streams, k), dtype), np.zeros((streams, k), np.int64)
+    for b, fit in enumerate(joined):
+        write_gaussians(*fit[:3], mean[b], covariance[b], weight[b], count[b])
+    features = np.empty((streams, k, 0), dtype)
+    if given.features is not None:
+        features = _feature_means(array(given.features), labels().numpy(), weight)
+    fields = (mean, covariance, weight, np.zeros((streams, k), dtype), count, features)
+    return GaussianMixture(*map(torch.from_numpy, fields)), labels
+
+
+def _feature_means(features: np.ndarray, labels: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Means [B, K, F] of the features [B, F, H, W] over the pixels of each Gaussian, summed in raster order, in the
+    dtype of ``weight`` [B, K]."""
+    out = np.empty((*weight.shape, features.shape[1]), weight.dtype)
+    for b, place in enumerate(labels + 1):  # 0: of no Gaussian
+        for f, values in enumerate(features[b]):
+            sums = np.bincount(place.ravel(), values.ravel(), weight.shape[1] + 1)
+            out[b, :, f] = sums[1:] / np.maximum(weight[b], 1)
+    return out
 
 
 @functools.lru_cache(maxsize=16)
@@ -149,8 +139,3 @@ def _depth_bins(s: float, limits: _Limits) -> tuple[np.ndarray, np.ndarray]:
         lengths2[k], edges[k] = length * length, edge
         length = min(max(s * edge, limits.shortest_bin), limits.longest_bin)
     return lengths2, edges
-
-
-@kernel
-def _write(kept, gaussians, whole, mean, covariance, weight, count):
-    write_gaussians(kept, gaussians, whole, mean, covariance, weight, count)

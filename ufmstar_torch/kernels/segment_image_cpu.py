@@ -229,7 +229,7 @@ def _prune(whole, created, limits, emitted, kept, place):
     return n
 
 
-@leaf
+@kernel
 def write_gaussians(kept, gaussians, whole, mean, covariance, weight, count):
     """The kept Gaussians as the mixture's slots; a single pixel has no sample covariance (zeros)."""
     for i in range(kept.size):

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, zeros
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
 
 # Counters start here: numba gives a plain 0 another type, and would compile the functions called with it twice.
 ZERO: Any = np.int64(0)
@@ -54,21 +54,24 @@ def scan_rows(
     its runs.
     """
     width = z.shape[1]
-    row, rx = (
-        (empty(width, np.float64), empty(width, np.float64), empty(width, np.float64), zeros(width, np.float64)),
+    depth, x, tau_z, s2 = (
+        empty(width, np.float64),
+        empty(width, np.float64),
+        empty(width, np.float64),
         empty(width, np.float64),
     )
+    row, rx = (depth, x, tau_z, s2), empty(width, np.float64)
     for u in range(width):
-        rx[u] = (u - cx) / fx
+        rx[u], s2[u] = (u - cx) / fx, 0.0
     place = empty(width + 1, np.int32)  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
-    older, older_int = empty((limits.max_open, 10), np.float64), empty((limits.max_open, 5), np.int64)
+    older = empty((limits.max_open, 15), np.float64)
     end, pixels = first * segments_of_row(width, limits), first * width
     for v in range(first, last):
         spans[v, 0], spans[v, 2] = end, pixels
-        _usable(z, use, spread, v, limits.max_depth, row[0], row[3])
-        _thresholds(row[0], rx, slope, limits, row[1], row[2])
+        _usable(z, use, spread, v, limits.max_depth, depth, s2)
+        _thresholds(depth, rx, slope, limits, x, tau_z)
         end, pixels = _scanline(
-            row, rx, (v - cy) / fy, slope, lengths2, edges, limits, spread.size > 0, older, older_int, table,
+            row, rx, (v - cy) / fy, slope, lengths2, edges, limits, spread.size > 0, older, table,
             table_int, end, place, runs, pixels,
         )  # fmt: skip
         spans[v, 1], spans[v, 3] = end, pixels
@@ -115,25 +118,23 @@ def _near(x, z, last_x, last_z, tau_z, slope, limits):
 
 @leaf
 def _scanline(
-    row, rx, ry, slope, lengths2, edges, limits, spread, older, older_int, segments, segments_int, done,
+    row, rx, ry, slope, lengths2, edges, limits, spread, older, segments, segments_int, done,
     place, runs, run,
 ):  # fmt: skip
-    """Scanline segmentation of a row.
+    """Scanline segmentation of a row, of which ``row`` are depth, x, tau_z and variances.
 
-    ``row`` are depth, x, tau_z and variances, which are 0 without ``spread``.
     Writes the finished segments from ``done`` on and the runs from ``run`` on; returns the end of both. The newest open
     segment lives in registers, the others in a ring of max_open - 1 places, ``front`` being the newest of them.
     ``place`` is scratch.
     """
-    depth, x_of, tau_z, s2 = row
-    y_factor = 1.0 + ry * ry
-    room = limits.max_open - 1
-    front = waiting = started = n = right = left = nearest = u = k = ZERO
-    x0 = z0 = w2 = dx = dz = dxx = dxz = dzz = 0.0
+    depth, x, tau_z, s2 = row
+    stop = 0 if spread else depth.size
+    y_factor, room, first_run = 1.0 + ry * ry, limits.max_open - 1, run
+    front = waiting = started = u = k = ZERO
     low, high, length2 = 0.0, edges[0], lengths2[0]  # of depth bin k
-    first_run = run
+    newest = _fresh(u, k, started, 0.0, 0.0)
     while u < depth.size:
-        z, x = depth[u], x_of[u]
+        z = depth[u]
         if z == 0.0:
             run = _begun(runs, first_run, run, u, 0)
             u += 1
@@ -145,68 +146,45 @@ def _scanline(
                 k -= 1
             low, length2 = edges[k - 1] if k > 0 else 0.0, lengths2[k]
             high = edges[k] if k < edges.size - 1 else np.inf
-        fits = n > 0 and u - right <= limits.occlusion_gap and w2 < length2
-        if fits and n > limits.n_check:
-            fits = dx != 0 and abs(z0 + dz * (x - x0) / dx - z) < tau_z[u]
-        elif fits:
-            fits = _near(x, z, x_of[right], depth[right], tau_z[u], slope, limits)
-        if not fits:
-            q = _waiting_match(older, older_int, front, waiting, room, x, z, u, slope, tau_z[u], length2, limits)
+        if not (newest.n > 0 and _fits(newest, x[u], z, u, slope, tau_z[u], length2, limits)):
+            q = _waiting_match(older, front, waiting, room, x[u], z, u, slope, tau_z[u], length2, limits)
             if q >= 0:
-                match = _extended(_load(older, older_int, q), x, z, u, k, y_factor, rx[u], s2[u])
-                _store(older, older_int, q, match)
+                match = _extended(_load(older, q), x[u], z, u, k, y_factor, rx[u], s2[u])
+                _store(older, q, match)
                 run = _begun(runs, first_run, run, u, match.born)
                 u += 1
                 continue
-            if n > 0:
-                newest = _Open(
-                    n, left, right, nearest, started, x0, z0, x_of[right], depth[right], w2, dx, dz, dxx, dxz, dzz
-                )
+            if newest.n > 0:
                 front, waiting, done = _push(
-                    newest, older, older_int, front, waiting, room, limits.sparse, segments, segments_int, done, place
+                    newest, older, front, waiting, room, limits.sparse, segments, segments_int, done, place
                 )
             started += 1
-            n, left, nearest, x0, z0 = ZERO, u, k, x, z
-            dx = dz = dxx = dxz = dzz = 0.0
-        begin = u
-        ex, ez = x - x0, z - z0
-        w2 = ex * ex + y_factor * (ez * ez)
-        dx, dz, dxx, dxz, dzz = dx + ex, dz + ez, dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
-        if s2[u] > 0:
-            dxx, dxz, dzz = dxx + s2[u] * (rx[u] * rx[u]), dxz + s2[u] * rx[u], dzz + s2[u]
-        nearest = min(nearest, k)
+            newest = _fresh(u, k, started, x[u], z)
+        run = _begun(runs, first_run, run, u, started)
+        newest = _extended(newest, x[u], z, u, k, y_factor, rx[u], s2[u])
         u += 1
-        # Pixels that follow without a gap in the same depth bin, by the same rules: until n_check, then by the line.
-        short = u if spread else min(depth.size, max(u, begin + limits.n_check - n + 1))
-        while 0 <= u < short:  # the index is not negative: no wrap-around to compile
-            ex, ez = x_of[u] - x0, depth[u] - z0
-            near = _near(x_of[u], depth[u], x_of[u - 1], depth[u - 1], tau_z[u], slope, limits)
-            if not (near & (depth[u] > low) & (depth[u] <= high) & (w2 < length2)):
+        # Pixels that follow in the same depth bin; holes are in none.
+        while 0 <= u < stop:  # the index is not negative: no wrap-around to compile
+            near = _continues(newest, x[u], depth[u], slope, tau_z[u], limits)
+            if not (near & (depth[u] > low) & (depth[u] <= high) & (newest.w2 < length2)):
                 break
-            w2 = ex * ex + y_factor * (ez * ez)
-            dx, dz, dxx, dxz, dzz = dx + ex, dz + ez, dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
+            newest = _extended(newest, x[u], depth[u], u, k, y_factor, 0.0, 0.0)
             u += 1
-        stop = depth.size if u == short and not spread else u
-        while 0 <= u < stop:
-            ex, ez = x_of[u] - x0, depth[u] - z0
-            off = abs(z0 + dz * ex / dx - depth[u])
-            if not ((off < tau_z[u]) & (depth[u] > low) & (depth[u] <= high) & (w2 < length2)):
-                break
-            w2 = ex * ex + y_factor * (ez * ez)
-            dx, dz, dxx, dxz, dzz = dx + ex, dz + ez, dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
-            u += 1
-        run = _begun(runs, first_run, run, begin, started)
-        n, right = n + u - begin, u - 1
-    if n > 0:
-        newest = _Open(n, left, right, nearest, started, x0, z0, x_of[right], depth[right], w2, dx, dz, dxx, dxz, dzz)
+    if newest.n > 0:
         done = _finish(newest, limits.sparse, segments, segments_int, done, place)
     for i in range(waiting):
         q = front - i if front >= i else front - i + room
-        done = _finish(_load(older, older_int, q), limits.sparse, segments, segments_int, done, place)
+        done = _finish(_load(older, q), limits.sparse, segments, segments_int, done, place)
     place[0] = 0
     for i in range(first_run, run):
         runs[i, 1] = place[runs[i, 1]]
     return done, run
+
+
+@leaf
+def _fresh(u, k, born, x, z):
+    """An open segment without pixels, anchored at the present one."""
+    return _Open(ZERO, u, u, k, born, x, z, x, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @leaf
@@ -219,36 +197,41 @@ def _begun(runs, first, run, u, owner):
 
 
 @leaf
-def _push(newest, older, older_int, front, waiting, room, sparse, segments, segments_int, done, place):
+def _push(newest, older, front, waiting, room, sparse, segments, segments_int, done, place):
     """Let the newest open segment wait, and finish the oldest if there is no room."""
     if room == 0:
         return front, waiting, _finish(newest, sparse, segments, segments_int, done, place)
     front = front + 1 if front + 1 < room else 0
     if waiting == room:  # the ring is full: the place after the front holds the oldest
-        oldest = _load(older, older_int, front)
+        oldest = _load(older, front)
         done = _finish(oldest, sparse, segments, segments_int, done, place)
     else:
         waiting += 1
-    _store(older, older_int, front, newest)
+    _store(older, front, newest)
     return front, waiting, done
 
 
 @leaf
 def _fits(o, x, z, u, slope, tau_z, length2, limits):
     """Does the point continue the open segment?"""
-    if u - o.u_right > limits.occlusion_gap or not o.w2 < length2:
-        return False
-    if o.n <= limits.n_check:
-        return _near(x, z, o.x_right, o.z_right, tau_z, slope, limits)
-    return o.dx != 0 and abs(o.z_left + o.dz * (x - o.x_left) / o.dx - z) < tau_z
+    near = (u - o.u_right <= limits.occlusion_gap) & (o.w2 < length2)
+    return near and _continues(o, x, z, slope, tau_z, limits)
 
 
 @leaf
-def _waiting_match(older, older_int, front, waiting, room, x, z, u, slope, tau_z, length2, limits):
+def _continues(o, x, z, slope, tau_z, limits):
+    """Does the point lie near the last one of an open segment, or of one that is long enough on its line?"""
+    if o.n <= limits.n_check:
+        return _near(x, z, o.x_right, o.z_right, tau_z, slope, limits)
+    return abs(o.z_left + o.dz * (x - o.x_left) / o.dx - z) < tau_z  # NaN or infinity where dx = 0
+
+
+@leaf
+def _waiting_match(older, front, waiting, room, x, z, u, slope, tau_z, length2, limits):
     """The newest of the waiting segments that the point continues, or -1."""
     for i in range(waiting):
         q = front - i if front >= i else front - i + room
-        if _fits(_load(older, older_int, q), x, z, u, slope, tau_z, length2, limits):
+        if _fits(_load(older, q), x, z, u, slope, tau_z, length2, limits):
             return q
     return -1
 
@@ -267,22 +250,18 @@ def _extended(o, x, z, u, k, y_factor, rx, s2):
 
 
 @leaf
-def _store(values, whole, q, o):
-    whole[q, 0], whole[q, 1], whole[q, 2], whole[q, 3], whole[q, 4] = o.n, o.u_left, o.u_right, o.nearest, o.born
-    values[q, 0], values[q, 1], values[q, 2], values[q, 3], values[q, 4] = (
-        o.x_left,
-        o.z_left,
-        o.x_right,
-        o.z_right,
-        o.w2,
-    )
-    values[q, 5], values[q, 6], values[q, 7], values[q, 8], values[q, 9] = o.dx, o.dz, o.dxx, o.dxz, o.dzz
+def _store(older, q, o):
+    out = older[q]
+    out[0], out[1], out[2], out[3], out[4] = o.n, o.u_left, o.u_right, o.nearest, o.born
+    out[5], out[6], out[7], out[8], out[9] = o.x_left, o.z_left, o.x_right, o.z_right, o.w2
+    out[10], out[11], out[12], out[13], out[14] = o.dx, o.dz, o.dxx, o.dxz, o.dzz
 
 
 @leaf
-def _load(values, whole, q):
-    f, i = values[q], whole[q]
-    return _Open(i[0], i[1], i[2], i[3], i[4], f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9])
+def _load(older, q):
+    f = older[q]
+    whole = int(f[0]), int(f[1]), int(f[2]), int(f[3]), int(f[4])
+    return _Open(*whole, f[5], f[6], f[7], f[8], f[9], f[10], f[11], f[12], f[13], f[14])
 
 
 @leaf

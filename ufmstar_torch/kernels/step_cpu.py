@@ -24,10 +24,11 @@ from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.fuse import make_room
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.regress_cpu import Seen, View, fill_and_smooth, in_slots, look, regress_maps
+from ufmstar_torch.kernels.fuse_cpu import lift
+from ufmstar_torch.kernels.regress_cpu import Seen, View, fill_and_smooth, look, regress_maps
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, padded
-from ufmstar_torch.kernels.segment_cpu import feature_means, fit, most_gaussians
-from ufmstar_torch.kernels.stream_cpu import describe, join, match
+from ufmstar_torch.kernels.segment_cpu import gaussians
+from ufmstar_torch.kernels.stream_cpu import join, match
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import StepOutput
@@ -93,7 +94,7 @@ def step(
     changed: dict[str, Tensor] = {}
     views, shift = None, None
     if extensions.columns:
-        changed, views, shift = _columns(state, joined, frame, extensions, config)
+        changed, views, shift = _columns(state, joined, frame, extensions, config, torch.from_numpy(cameras[0]))
     stage("append")
 
     result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels, views, shift)
@@ -124,21 +125,12 @@ def _segment(
 ) -> tuple[tuple[NDArray[Any], ...], Callable[[], Tensor]]:
     """Step 2: the fields of C_i in the camera frame, float64, its covariances lifted to the floor that the reference
     states, and its labels."""
-    given = SegmentInput.of_frame(frame, config)
-    fits, labels = fit(given)
-    rounding = np.float32 if given.dtype == torch.float32 else np.float64
-    b, n = len(fits), most_gaussians(fits)
-    mean, covariance, weight, zero = np.zeros((b, n, 3)), np.zeros((b, n, 3, 3)), np.zeros((b, n)), np.zeros((b, n))
-    count, rounded = np.zeros((b, n), np.int64), np.empty(13 * n, rounding)
-    scratch = rounded[: 3 * n].reshape(n, 3), rounded[3 * n : 12 * n].reshape(n, 3, 3), rounded[12 * n :]
+    mixture, labels = gaussians(SegmentInput.of_frame(frame, config))
+    segments = tuple(map(array, mixture.to(torch.float64).tensors().values()))
     epsilon = 8 * torch.finfo(stored).eps
-    for i, K in enumerate(intrinsics.tolist()):
-        written = (mean[i], covariance[i], weight[i], count[i])
-        describe(fits[i], scratch, config.near_plane, min(K[0][0], K[1][1]), PIXEL_VARIANCE, epsilon, *written)
-    features = np.empty((b, n, 0))
-    if given.features is not None:
-        features = feature_means(array(given.features), labels, weight.astype(rounding)).astype(np.float64)
-    return (mean, covariance, weight, zero, count, features), labels
+    for K, *written in zip(intrinsics.tolist(), *segments[:3], strict=True):
+        lift(*written, config.near_plane, min(K[0][0], K[1][1]), PIXEL_VARIANCE, epsilon)
+    return segments, labels
 
 
 def _match(
@@ -233,8 +225,9 @@ def _within_limit(joined: _Joined, old: Sequence[int], position: Tensor, limit: 
 
 
 def _columns(
-    state: UfMStarState, joined: _Joined, frame: FrameInput, extensions: FrameExtensions, config: UfMStarConfig
-) -> tuple[dict[str, Tensor], list[View] | None, NDArray[np.float64] | None]:
+    state: UfMStarState, joined: _Joined, frame: FrameInput, extensions: FrameExtensions, config: UfMStarConfig,
+    first: Tensor,
+) -> tuple[dict[str, Tensor], list[View] | None, NDArray[np.float64] | None]:  # fmt: skip
     """Write the columns of extensions to the features before the last. Returns the tensors of the state that change;
     what is in view, and what the regression is to add to the columns, where an extension works on what is in view."""
     capacity, tensors = joined.mixture["weight"].shape[1], {**state.by_stream, **joined.sums}
@@ -242,7 +235,8 @@ def _columns(
         views = look(joined.seen, frame.depth, frame.intrinsics, config, state.covariance.dtype)
         if (found := extensions.in_view(tensors, capacity, joined.seen, views)) is not None:
             return found[0], views, array(found[1])
-    mixture_cam = in_slots(joined.seen, capacity)
+    mixture = GaussianMixture(**joined.mixture).to(torch.float64)
+    mixture_cam = mixture.rigid(*relative_pose(first, frame.T_world_cam))
     changed, with_columns = extensions.before_regression(tensors, mixture_cam, distribute)
     columns = array(with_columns.features)[..., -extensions.columns :]
     for one, values in zip(joined.seen, columns, strict=True):

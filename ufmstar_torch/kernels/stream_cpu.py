@@ -4,28 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import empty, kernel, zeros
+from ufmstar_torch.kernels.compile_cpu import empty, kernel
 from ufmstar_torch.kernels.correspond_cpu import matches
-from ufmstar_torch.kernels.fuse_cpu import WORK, append, floored, fuse_pairs
-from ufmstar_torch.kernels.rigid_cpu import FIELDS, gather, move, padded, relative, turn
-from ufmstar_torch.kernels.segment_image_cpu import write_gaussians
-
-
-@kernel
-def describe(fit, rounded, near, focal, widening, epsilon, mean, covariance, weight, count):
-    """Step 2's segments (``segment_cpu.fit``) as slots [C, ...] in float64, their covariances lifted to the floor that
-    the reference states (:func:`floored`).
-
-    ``rounded`` are mean, covariance and weight [C, ...] in the dtype to which the values are rounded before.
-    """
-    kept, gaussians, whole = fit
-    m, c, pi = rounded
-    write_gaussians(kept, gaussians, whole, m, c, pi, count)
-    for i in range(kept.size):
-        weight[i] = pi[i]
-        for axis in range(3):
-            mean[i, axis] = m[i, axis]
-    floored(kept.size, m, c, near, focal, widening, epsilon, covariance, empty(WORK, np.float64))
+from ufmstar_torch.kernels.fuse_cpu import WORK, append, fuse_pairs
+from ufmstar_torch.kernels.rigid_cpu import FIELDS, gather, padded, relative, scatter, turn
 
 
 @kernel
@@ -98,9 +80,12 @@ def join(present, first, slots, segments, pairs, distance, new, occupied, settin
     mean_c, cov_c, weight_c, features_c = segments
     c, k, overlap = pairs
     work, motion = empty(WORK, np.float64), empty((3, 4), np.float64)
-    moved, turned = zeros(mean_c.shape, np.float64), zeros(cov_c.shape, np.float64)
+    moved, turned = empty(mean_c.shape, np.float64), empty(cov_c.shape, np.float64)
     relative(present, first, motion)
-    move(motion, mean_c, cov_c, weight_c, moved, turned, work[0])
+    by_field = empty((FIELDS, padded(weight_c.size)), np.float64)
+    gather(weight_c.size, mean_c, cov_c, weight_c, by_field)
+    turn(motion, by_field.shape[1], by_field.shape[1], by_field)
+    scatter(weight_c.size, by_field, moved, turned)
     fuse_pairs(
         mean, covariance, weight, disagreement, count, features, moved, turned, weight_c, features_c, c, k,
         overlap, distance, settings[0], settings[1], work,

@@ -132,31 +132,6 @@ class Memory:
         at = self._builder.bitcast(self._at(place, offset), self._vector.as_pointer())
         self._builder.store(value.value, at).align = self._size
 
-    def load_rows(self, width: int, place: Any, stride: Any) -> Lanes:
-        """A vector of rows of ``width`` numbers, from ``place`` on, ``stride`` numbers apart."""
-        row, count = ir.VectorType(self._vector.element, width), self._vector.count
-        parts = []
-        for at in self._rows(width, place, stride):
-            parts.append(self._builder.load(self._builder.bitcast(at, row.as_pointer())))
-            parts[-1].align = self._size
-        if len(parts) == 1:
-            return self._lanes(parts[0])
-        places = ir.Constant(ir.VectorType(ir.IntType(32), count), list(range(count)))
-        return self._lanes(self._builder.shuffle_vector(*parts, places))
-
-    def store_rows(self, value: Lanes, width: int, place: Any, stride: Any) -> None:
-        """Write the rows that :meth:`load_rows` reads."""
-        row = ir.VectorType(self._vector.element, width)
-        for i, at in enumerate(self._rows(width, place, stride)):
-            places = ir.Constant(ir.VectorType(ir.IntType(32), width), list(range(i * width, (i + 1) * width)))
-            part = self._builder.shuffle_vector(value.value, value.value, places)
-            self._builder.store(part, self._builder.bitcast(at, row.as_pointer())).align = self._size
-
-    def _rows(self, width: int, place: Any, stride: Any) -> Iterator[Any]:
-        """Addresses of the first numbers of a vector's one or two rows."""
-        for i in range(self._vector.count // width):
-            yield self._at(self._builder.add(place, self._builder.mul(stride, _INDEX(i))), 0)
-
     def one(self, place: Any, offset: int = 0) -> Lanes:
         """A single number, in all places of a vector."""
         none, first = ir.Constant(self._vector, ir.Undefined), ir.IntType(32)(0)
