@@ -93,11 +93,11 @@ def test_the_cloud_lies_on_the_surfaces(finished):
 
 
 def test_merging_weighs_by_the_inverse_variance(tmp_path):
-    from ufmstar_torch.eval.run.export import Gated, export_cloud
+    from ufmstar_torch.eval.run.export import RunFrame, export_cloud
 
     def frame(depth, sigma):
         maps = (np.float32([[depth]]), np.float32([[sigma]]))
-        return Gated("0", 0, None, np.eye(4), np.eye(3), *maps)
+        return RunFrame("0", 0, None, np.eye(4), np.eye(3), *maps)
 
     export_cloud(iter([frame(2.1, 0.1), frame(2.4, 0.2), frame(np.nan, np.nan)]), tmp_path, 1.0)
     (point,) = read_ply(tmp_path / "export" / "cloud.ply")

@@ -16,7 +16,7 @@ from ufmstar_torch.eval.engine.maps import MapSource
 from ufmstar_torch.eval.report.text import run_table
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.panels import map_columns
-from ufmstar_torch.eval.run.pictures import Finished
+from ufmstar_torch.eval.run.pictures import FinishedRun
 from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.frame import in_memory
@@ -219,14 +219,14 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
         image = read_depth(whole / kind / f"{name}.png")
         expected = np.minimum(values, 65535 * unit)[one["valid"]]
         np.testing.assert_allclose(image[one["valid"]], expected, atol=unit)
-    panel = Finished(whole, tour, records(whole), with_error=True).panel(7)
+    panel = FinishedRun(whole, tour, records(whole), with_error=True).panel(7)
     labels = [column.label for column in map_columns([panel])]
     assert labels == ["depth", "posterior", "σ", "|error|", "σ, posterior", "|error|, posterior"]
     assert np.nanmean(panel.maps["posterior_error"]) < 0.7 * np.nanmean(panel.maps["error"])
 
 
 def test_pictures_have_a_column_for_what_anchors_add(tour, finished):
-    panel = Finished(finished[0], tour, records(finished[0]), with_error=True).panel(7)
+    panel = FinishedRun(finished[0], tour, records(finished[0]), with_error=True).panel(7)
     stored = read_frame(finished[0] / "frames" / f"{tour.names[7]}.npz")
     expected = np.where(stored["valid"], np.sqrt(stored["anchored"]), np.nan)
     np.testing.assert_array_equal(panel.maps["anchored"], expected)

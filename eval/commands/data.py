@@ -63,7 +63,7 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
         OSError: no such path.
         ValueError: an option out of range, or nothing below the folder has a known layout.
     """
-    path, opening = options.path, options.opening.given()
+    path, opening = options.path, options.opening.arguments()
     require_layout(options.opening.layout, options.opening.plugin)
     one = path.startswith("tour:") or any(name in opening for name in _OF_ONE)
     if not one:  # a folder that fits several layouts is one too, whose layout must be named

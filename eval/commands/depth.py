@@ -169,7 +169,7 @@ class UfMOptions:
             defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
         return defaults
 
-    def fitted(self, weights: tuple[str, ...], source: DepthSource) -> Recalibration | None:
+    def load_recalibration(self, weights: tuple[str, ...], source: DepthSource) -> Recalibration | None:
         """The recalibration of the option, or of the file beside the weights; None: there is neither. Raises
         FileNotFoundError: the named file does not exist; ValueError: it is no recalibration, or was fitted under other
         settings or to another network."""

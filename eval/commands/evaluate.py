@@ -177,7 +177,7 @@ def job_from(options: EvalOptions) -> EvalJob:
     if further and not suite.efficiency:
         given = ", ".join(text.partition("=")[0] for text in what.network)
         raise ValueError(f"--network: every base once, but in a suite that measures time and energy, got {given}")
-    opening = {name: value for name, value in options.opening.given().items() if name != "layout"}
+    opening = {name: value for name, value in options.opening.arguments().items() if name != "layout"}
     only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
     where: dict[str, Any] = {"layout": options.opening.layout, "plugin": options.opening.plugin}
     items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, **where)

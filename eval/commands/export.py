@@ -71,4 +71,4 @@ def _sequence(out: Path) -> FrameSequence:
     settings = export.run_settings(out)
     names = [f.name for f in fields(SequenceOptions) if f.name in settings]
     values: dict[str, Any] = {name: tuple(v) if isinstance(v := settings[name], list) else v for name in names}
-    return open_sequence(settings["sequence"], **SequenceOptions(**values).given())
+    return open_sequence(settings["sequence"], **SequenceOptions(**values).arguments())

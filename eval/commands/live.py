@@ -24,7 +24,7 @@ from ufmstar_torch.eval.commands.terminal import Bars
 from ufmstar_torch.eval.engine.anchors import landmarks_of
 from ufmstar_torch.eval.engine.realtime import RealTime
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
-from ufmstar_torch.eval.run.export import Gated
+from ufmstar_torch.eval.run.export import RunFrame
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderKind, output_folder, remover
 from ufmstar_torch.eval.run.machine import share_threads
@@ -181,7 +181,7 @@ def _events(options: LiveOptions) -> Iterator[LiveEvent]:
     """The source's images and poses; errors as ``open_sequence``."""
     opening = options.opening
     if options.recorded:
-        sequence = open_sequence(options.source, **opening.given())
+        sequence = open_sequence(options.source, **opening.arguments())
         if not sequence.posed:
             raise ValueError(f"{options.source} has no poses; ufmstar poses computes them")
         return sources.replay(sequence, options.speed)
@@ -205,7 +205,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
         posterior=options.uncertainty.posterior,
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
         anchors=None if anchors is False else landmarks_of(anchors, None),
-        recalibration=options.uncertainty.fitted(chosen.weights, source),
+        recalibration=options.uncertainty.load_recalibration(chosen.weights, source),
     ).to(options.device)
     with Bars() as bars:
         dense = config.anchors is not None and anchors in (False, "dense")
@@ -228,13 +228,13 @@ def _write(out: Path, result: LiveResult) -> None:
     write_atomic(out / f"{result.stamp:.6f}.npz", lambda file: np.savez(file, allow_pickle=False, **arrays, **camera))
 
 
-def _shown(result: LiveResult, number: int, figures: dict[str, float]) -> Gated:
+def _shown(result: LiveResult, number: int, figures: dict[str, float]) -> RunFrame:
     """The result as the viewer takes it."""
     out, valid = result.out, result.out.ufm.valid[0]
     depth, sigma = (torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std))
     about = (f"{result.stamp:.6f}", number, result.stamp, result.T_world_cam)
     K = out.intrinsics[0].cpu().double().numpy()
-    return Gated(*about, K, depth, sigma, figures=figures, image=np.asarray(result.image))
+    return RunFrame(*about, K, depth, sigma, figures=figures, image=np.asarray(result.image))
 
 
 def _figures(result: LiveResult, live: LiveDepth) -> dict[str, float]:

@@ -66,13 +66,13 @@ class SequenceOptions:
     plugin: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        Options(**{name: value for name, value in self.given().items() if name not in ("layout", "poses")})
+        Options(**{name: value for name, value in self.arguments().items() if name not in ("layout", "poses")})
 
     def changed(self) -> dict[str, Any]:
         """The options that differ from their defaults."""
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
 
-    def given(self) -> dict[str, Any]:
+    def arguments(self) -> dict[str, Any]:
         """The arguments of ``open_sequence`` that differ from its defaults, as plain values. Raises ValueError:
         intrinsics are neither a file nor four numbers."""
         changed = self.changed()

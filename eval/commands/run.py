@@ -118,7 +118,7 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         FileNotFoundError, NotADirectoryError: no such file or folder.
         ModuleNotFoundError: an optional package is missing.
     """
-    sequence, ufm = open_sequence(path, **options.opening.given()), options.uncertainty
+    sequence, ufm = open_sequence(path, **options.opening.arguments()), options.uncertainty
     if not sequence.posed:
         raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
     indices = range(len(sequence))[parse_slice(options.frames)]
@@ -140,7 +140,7 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         indices=indices,
         source=source,
         config=options.config.within(source.max_depth, source.states_confidence),
-        recalibration=ufm.fitted(options.network.weights, source),
+        recalibration=ufm.load_recalibration(options.network.weights, source),
         device=torch.device(options.device),
         settings=options.settings(),
         every=options.network.mode == "full",

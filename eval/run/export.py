@@ -33,7 +33,7 @@ _FOLD = 4_000_000  # points that are held until they are merged
 
 
 @dataclass(frozen=True, eq=False)
-class Gated:
+class RunFrame:
     """A frame of a run: its name, camera and maps [h, w]; depth and sigma [m] are NaN where left out."""
 
     name: str
@@ -48,7 +48,7 @@ class Gated:
     image: NDArray[np.uint8] | None = None  # [H, W, 3] RGB of the recording
     image_intrinsics: NDArray[np.float64] | None = None  # [3, 3] of the image [px]
 
-    def at_image(self) -> Gated:
+    def at_image(self) -> RunFrame:
         """The frame with maps at the pixels of its image, NaN where they do not show what the image shows; itself
         without an image."""
         if self.image is None or self.image_intrinsics is None:
@@ -65,7 +65,7 @@ class Gated:
         return points_of(u, v, self.depth[v, u], self.intrinsics), (v, u)
 
 
-def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[Gated]:
+def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[RunFrame]:
     """The finished frames of a run. Pixels of a larger sigma [m], or a larger one as a share of the depth, are left
     out. Raises ValueError: no run's folder, one without a finished frame, or one of an earlier version, without
     poses."""
@@ -78,7 +78,7 @@ def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iter
     return (_gated(out, record, max_sigma, max_relative_sigma) for record in done)
 
 
-def _gated(out: Path, record: Mapping[str, Any], max_sigma: float, max_relative_sigma: float) -> Gated:
+def _gated(out: Path, record: Mapping[str, Any], max_sigma: float, max_relative_sigma: float) -> RunFrame:
     maps = read_frame(frame_file(out, record["name"]))
     if "T_world_cam" not in maps:
         raise ValueError(f"{out}: the run is of an earlier version, whose frames have no poses; run it again")
@@ -89,10 +89,10 @@ def _gated(out: Path, record: Mapping[str, Any], max_sigma: float, max_relative_
         kept = maps["valid"] & (depth > 0) & np.isfinite(depth)
         kept &= (sigma <= max_sigma) & (sigma <= max_relative_sigma * depth)
     about = (record["name"], record["index"], record.get("timestamp"), maps["T_world_cam"], maps["intrinsics"])
-    return Gated(*about, known_where(kept, depth), known_where(kept, sigma), maps.get("anchors"), record)
+    return RunFrame(*about, known_where(kept, depth), known_where(kept, sigma), maps.get("anchors"), record)
 
 
-def with_images(frames: Iterator[Gated], sequence: FrameSequence) -> Iterator[Gated]:
+def with_images(frames: Iterator[RunFrame], sequence: FrameSequence) -> Iterator[RunFrame]:
     """The frames with the images of their recording, where they can be read."""
     for frame in frames:
         if frame.index < len(sequence) and sequence.names[frame.index] == frame.name:
@@ -102,7 +102,7 @@ def with_images(frames: Iterator[Gated], sequence: FrameSequence) -> Iterator[Ga
         yield frame
 
 
-def export_depth(frames: Iterator[Gated], out: Path) -> str:
+def export_depth(frames: Iterator[RunFrame], out: Path) -> str:
     """depth/NAME.png and sigma/NAME.png, 16 bits, 0 = left out."""
     folders, unit, count = [export_folder(out, kind) for kind in ("depth", "sigma")], None, 0
     for frame in frames:
@@ -113,7 +113,7 @@ def export_depth(frames: Iterator[Gated], out: Path) -> str:
     return f"{folders[0]}, {folders[1]}: {count} maps each"
 
 
-def export_trajectory(frames: Iterator[Gated], out: Path) -> str:
+def export_trajectory(frames: Iterator[RunFrame], out: Path) -> str:
     """Lines "time tx ty tz qx qy qz qw", the time [s] or, without one, the frame's number."""
     from scipy.spatial.transform import Rotation
 
@@ -127,7 +127,7 @@ def export_trajectory(frames: Iterator[Gated], out: Path) -> str:
     return f"{file}: {len(lines) - 1} poses"
 
 
-def export_cloud(frames: Iterator[Gated], out: Path, voxel: float) -> str:
+def export_cloud(frames: Iterator[RunFrame], out: Path, voxel: float) -> str:
     """cloud.ply: x y z and sigma [m], and red green blue where images can be read.
 
     A point is the mean of the pixels in a voxel of that side [m], weighted by 1/sigma^2. Its sigma is
@@ -154,7 +154,7 @@ def export_cloud(frames: Iterator[Gated], out: Path, voxel: float) -> str:
     return f"{file}: {len(keys)} points"
 
 
-def export_transforms(frames: Iterator[Gated], out: Path) -> str:
+def export_transforms(frames: Iterator[RunFrame], out: Path) -> str:
     """transforms.json with images as they are, and depth and sigma at their pixels (16 bits, 0 = left out). Frames
     whose image cannot be read are left out."""
     import cv2
@@ -196,7 +196,7 @@ def points_of(u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any], K: NDArray[
     return np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1)
 
 
-def _voxels(frame: Gated, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _voxels(frame: RunFrame, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """[P] the number of each pixel's voxel, and [P, 8] its weight w, w x, w y, w z, w r, w g, w b, and 1."""
     in_camera, (v, u) = frame.points()
     sigma, K, T = np.maximum(frame.sigma[v, u], _LEAST_SIGMA), frame.intrinsics, frame.T_world_cam

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.eval.run.export import Gated, export_folder
+from ufmstar_torch.eval.run.export import RunFrame, export_folder
 from ufmstar_torch.optional import optional
 
 WORLD, CAMERA = "world", "camera"
@@ -27,7 +27,7 @@ _LATEST = 2.0**31 - 1  # [s], of builtin_interfaces/Time
 _FLOAT32 = 7  # of sensor_msgs/PointField
 
 
-def export_bag(frames: Iterator[Gated], out: Path) -> str:
+def export_bag(frames: Iterator[RunFrame], out: Path) -> str:
     """OUT/export/bag: of each frame the image (where the recording can be read), camera info, depth and sigma (32FC1,
     [m]), its points in the camera's axes with their variance [m^2], and the camera's pose in tf. An earlier bag is
     replaced when the new one is whole. Raises ModuleNotFoundError: rosbags is not installed; ValueError: a frame's time
@@ -46,7 +46,7 @@ def export_bag(frames: Iterator[Gated], out: Path) -> str:
     return f"{folder}: {count} frames"
 
 
-def _write_bag(rosbag2: Any, ros: _Messages, folder: Path, frames: Iterator[Gated]) -> int:
+def _write_bag(rosbag2: Any, ros: _Messages, folder: Path, frames: Iterator[RunFrame]) -> int:
     """Write the bag into a new folder; the number of frames."""
     count = 0
     with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
@@ -65,7 +65,7 @@ def _write_bag(rosbag2: Any, ros: _Messages, folder: Path, frames: Iterator[Gate
     return count
 
 
-def _of_frame(ros: _Messages, stamp: int, frame: Gated) -> dict[str, Any]:
+def _of_frame(ros: _Messages, stamp: int, frame: RunFrame) -> dict[str, Any]:
     """A frame's messages by topic."""
     seen, (points, (v, u)) = frame.at_image(), frame.points()
     image = {} if frame.image is None else {IMAGE: ros.image(stamp, frame.image, "rgb8")}

@@ -34,7 +34,7 @@ DEFAULT_FPS, FPS_RANGE = 10.0, (2.0, 30.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Finished:
+class FinishedRun:
     """The finished frames of a run in the folder ``out``: their sequence, their lines of frames.jsonl in order, and
     whether there is a ground truth that the prediction can differ from."""
 
@@ -44,7 +44,7 @@ class Finished:
     with_error: bool
 
     def panel(self, number: int) -> FramePanel:
-        """Finished frame ``number``, with square pixels, and the image cut to what the prediction shows."""
+        """FinishedRun frame ``number``, with square pixels, and the image cut to what the prediction shows."""
         record = self.records[number]
         stored = read_frame(frame_file(self.out, record["name"]))
         K, size = pinhole(*record["intrinsics"]), (record["size"][0], record["size"][1])
@@ -100,12 +100,12 @@ def panel_of(name: str, note: str, frame: Frame, row: RowResult) -> FramePanel:
     return FramePanel(name, image, shown, note)
 
 
-def common_columns(finished: Finished) -> list[MapColumn]:
+def common_columns(finished: FinishedRun) -> list[MapColumn]:
     """The maps of sheet and video, on scales that fit frames spread over the whole run."""
     return map_columns([finished.panel(number) for number in finished.spread(SCALE_FRAMES)])
 
 
-def draw_sheet(finished: Finished, columns: Sequence[MapColumn], title: str) -> None:
+def draw_sheet(finished: FinishedRun, columns: Sequence[MapColumn], title: str) -> None:
     """Write contact_sheet.png: frames spread over the run, the last one included. The first is not, unless it is the
     only one: it was compared with nothing."""
     wide = "posterior" in finished.records[-1]  # before and after
@@ -114,7 +114,7 @@ def draw_sheet(finished: Finished, columns: Sequence[MapColumn], title: str) -> 
     contact_sheet(panels, finished.out / SHEET, title=title, columns=columns)
 
 
-def draw_video(finished: Finished, columns: Sequence[MapColumn]) -> Iterator[int]:
+def draw_video(finished: FinishedRun, columns: Sequence[MapColumn]) -> Iterator[int]:
     """Write preview.mp4 frame by frame; yields how many are done, so that the caller can report and stop."""
     with write_video(finished.out / "preview.mp4", finished.fps()) as add:
         for number in range(len(finished.records)):

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.array_files import read_npz_whole
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
-from ufmstar_torch.eval.run.export import Gated, export_folder, points_of
+from ufmstar_torch.eval.run.export import RunFrame, export_folder, points_of
 from ufmstar_torch.eval.run.gaussians import RADIUS, Components
 from ufmstar_torch.eval.run.writers import fitting_unit
 from ufmstar_torch.mixture import GaussianMixture
@@ -55,7 +55,7 @@ class RerunLog:
         self._unit: float | None = None
         stream.log(WORLD, self._rr.ViewCoordinates.RDF, static=True)
 
-    def add(self, frame: Gated) -> None:
+    def add(self, frame: RunFrame) -> None:
         """Log a frame with its image, and plot its numbers."""
         rr, log, T = self._rr, self._stream.log, frame.T_world_cam
         if self.scale is None:
@@ -85,7 +85,7 @@ class RerunLog:
             if isinstance(value := frame.figures.get(name), int | float):
                 log(f"plots/{name}", rr.Scalars(value))
 
-    def _add_anchors(self, frame: Gated, anchors: NDArray[np.float32]) -> None:
+    def _add_anchors(self, frame: RunFrame, anchors: NDArray[np.float32]) -> None:
         """Anchors [N, 4], and lines from them to the depth of their pixels, coloured by the distance as sigma is."""
         rr, K, scale = self._rr, frame.intrinsics, self.scale
         assert scale is not None
@@ -147,7 +147,7 @@ def _listens(port: int) -> bool:
     return True
 
 
-def export_rerun(frames: Iterator[Gated], out: Path) -> str:
+def export_rerun(frames: Iterator[RunFrame], out: Path) -> str:
     """OUT/export/run.rrd; an earlier one is replaced when the new one is whole. Raises ModuleNotFoundError: rerun-sdk
     is not installed."""
     rr, count = rerun(), 0

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.engine.writer_thread import WriterThread
 from ufmstar_torch.eval.run.folder import output_folder
 from ufmstar_torch.eval.run.gaussians import write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.run.job import RunJob
-from ufmstar_torch.eval.run.pictures import Finished, common_columns, draw_sheet, draw_video
+from ufmstar_torch.eval.run.pictures import FinishedRun, common_columns, draw_sheet, draw_video
 from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
 from ufmstar_torch.eval.run.summary import FAILED, FINISHED, INTERRUPTED, write_summary
 from ufmstar_torch.stream_warnings import LOGGER
@@ -113,7 +113,7 @@ def _outputs(
     write_mixture_npz(folder.path / "mixture.npz", ufm.mixture, T_world_first=ufm.T_world_first)
     made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "mixture.npz"))
     with_error = any(record["ground_truth"] for record in done) and not job.source.is_truth
-    finished = Finished(folder.path, job.sequence, done, with_error)
+    finished = FinishedRun(folder.path, job.sequence, done, with_error)
     try:
         if job.sheet or job.video:
             columns = common_columns(finished)
