@@ -178,7 +178,7 @@ def test_a_run_with_a_file_equals_a_loop_by_hand_and_resumes(tour, file, tmp_pat
 
     def job(frames=slice(None)):
         source = MapSource(too_far, {"maps": "30 % too far"})
-        return job_of(tour, source, config=ON, frames=frames, landmarks=lambda: landmarks)
+        return job_of(tour, source, config=ON, frames=frames, landmarks=landmarks)
 
     summary = run(job(), tmp_path / "out")
     ufm = UfMStar(ON)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any, ClassVar
 
 import torch
 
-from ufmstar_torch.anchors.landmarks import DENSE, LandmarkSource
-from ufmstar_torch.anchors.tracker import LandmarkTracker
+from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, LandmarkSource
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, UfMOptions
 from ufmstar_torch.eval.commands.opening import SequenceOptions
@@ -144,21 +143,22 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         device=torch.device(options.device),
         settings=options.settings(),
         every=options.network.mode == "full",
-        landmarks=_landmarks(ufm.anchors or DENSE, sequence) if options.config.anchors else LandmarkTracker,
+        landmarks=_landmarks(ufm.anchors or DENSE, sequence) if options.config.anchors else CORNERS,
         scale=scale,
     )
 
 
-def _landmarks(value: str | bool, sequence: FrameSequence) -> Callable[[], LandmarkSource]:
-    """Makes the source of anchors in its initial state. Raises ValueError, ModuleNotFoundError: images to track in, or
-    OpenCV, are missing; others as ``landmarks_of``."""
+def _landmarks(value: str | bool, sequence: FrameSequence) -> str | LandmarkSource:
+    """The source of anchors of ``--anchors``. Raises ValueError, ModuleNotFoundError: images to track in, or OpenCV,
+    are missing; others as ``landmarks_of``."""
     source = landmarks_of(value, sequence.folder, sequence.pose_scale)
-    if source.needs_image and all(entry.load_image is None for entry in sequence.entries):
+    if not source.needs_image:
+        return source
+    if all(entry.load_image is None for entry in sequence.entries):
         raise ValueError(f"--anchors tracks corners of images, of which the sequence {sequence.name!r} has none")
-    if source.needs_image and find_spec("cv2") is None:
+    if find_spec("cv2") is None:
         raise ModuleNotFoundError("--anchors needs OpenCV: pip install 'ufmstar-torch[eval]'")
-    # A map of landmarks keeps no state and is read once.
-    return (lambda: landmarks_of(value, sequence.folder)) if source.needs_image else (lambda: source)
+    return CORNERS if value is True else str(value)
 
 
 def _report(summary: Mapping[str, Any], out: str) -> int:

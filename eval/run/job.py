@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.landmarks import LandmarkSource
-from ufmstar_torch.anchors.tracker import LandmarkTracker
+from ufmstar_torch.anchors.landmarks import LandmarkSource, landmark_source
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.check.image_fit import FollowedCorners, ImageFit, image_fit, track_corners
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
@@ -55,8 +54,7 @@ class RunJob:
     every: bool = False  # all members predict on every image, instead of one in turn
     video: bool = True  # whether to make preview.mp4
     sheet: bool = True  # whether to make contact_sheet.png
-    # makes the source of the anchors, in its initial state; for ``config.anchors``.
-    landmarks: Callable[[], LandmarkSource] = LandmarkTracker
+    landmarks: str | LandmarkSource = CORNERS  # "corners", "dense" or a map of landmarks; for ``config.anchors``
     scale: NetworkScale | None = None  # of the poses, where it is the network's own; anchors then show shape alone
 
     @cached_property
@@ -78,7 +76,7 @@ class RunJob:
         estimator = Gaussians(self.config, self.device, recalibration=self.recalibration)
         anchors = None
         if self.config.anchors is not None:
-            anchors = AnchorSource(Setting(anchors=CORNERS), Tracks(self.landmarks()))
+            anchors = AnchorSource(Setting(anchors=CORNERS), Tracks(landmark_source(self.landmarks)))
         how: dict[str, Any] = {"every": self.every, "anchors": anchors, "device": self.device}
         row = RowRunner(UFM, self.source, estimator, skips_faults=True, **how)
         if checkpoint.state:
@@ -94,7 +92,8 @@ class RunJob:
     @property
     def source_identity(self) -> dict[str, Any]:
         """Plain values on which depth and anchors depend."""
-        return {**self.source.identity, **(self.landmarks().identity if self.config.anchors is not None else {})}
+        anchors = {} if self.config.anchors is None else landmark_source(self.landmarks).identity
+        return {**self.source.identity, **anchors}
 
     def identity(self) -> dict[str, Any]:
         """Plain values on which the results depend. A run is only continued with the same ones."""

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.anchors.dense import DenseEvidence
+from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
@@ -22,6 +22,8 @@ from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
 from ufmstar_torch.eval.run.summary import FAILED, FINISHED, INTERRUPTED, write_summary
 from ufmstar_torch.stream_warnings import LOGGER
 
+Show, Stop = Callable[[Progress], None], Callable[[], bool]
+
 
 def run(
     job: RunJob,
@@ -29,8 +31,8 @@ def run(
     *,
     resume: bool = False,
     overwrite: bool = False,
-    progress: Callable[[Progress], None] = lambda _: None,
-    stop: Callable[[], bool] = lambda: False,
+    progress: Show = lambda _: None,
+    stop: Stop = lambda: False,
 ) -> dict[str, Any]:
     """Run a job and leave its frames, pictures, mixture and summary in a folder; the content of summary.json.
 
@@ -49,27 +51,28 @@ def run(
     how = {"resume": resume, "overwrite": overwrite}
     with output_folder(path, RUN, identity, **how) as resumed, RunFolder(job, path, resumed) as folder:
         no_end = "no orderly end: the program was killed, or is still running"
-        for text in write_summary(job, folder, INTERRUPTED, no_end)["warnings"]:
+        for text in write_summary(folder, INTERRUPTED, no_end)["warnings"]:
             LOGGER.warning("%s", text)
         ending, outputs = (FAILED, "an error in the program"), {}
         try:
-            _frames(job, folder, progress, stop)
-            ending = _ending(job, folder)
-            outputs = _outputs(job, folder, progress, stop)
+            _frames(folder, progress, stop)
+            ending = _ending(folder)
+            outputs = _outputs(folder, progress, stop)
         except (KeyboardInterrupt, Stopped):
-            ending = INTERRUPTED, f"stopped by the user after {_counts(folder, job)}; --resume goes on"
+            ending = INTERRUPTED, f"stopped by the user after {_counts(folder)}; --resume goes on"
         except OSError as error:
-            ending = FAILED, f"{error}; stopped after {_counts(folder, job)}; --resume goes on"
+            ending = FAILED, f"{error}; stopped after {_counts(folder)}; --resume goes on"
         except BaseException as error:
             ending = FAILED, f"{type(error).__name__}: {error}"
             raise
         finally:
-            summary = write_summary(job, folder, *ending, outputs)
+            summary = write_summary(folder, *ending, outputs)
     return summary
 
 
-def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
+def _frames(folder: RunFolder, progress: Show, stop: Stop) -> None:
     """The frames that are left."""
+    job = folder.job
     warm_up_job(job, progress)
     row, position = job.row(folder.checkpoint), folder.checkpoint.position
     stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=position)
@@ -77,16 +80,16 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
         stream.drive([writer, ProgressSink(progress, _skipped(folder))], stop=stop)
 
 
-def warm_up_job(job: RunJob, progress: Callable[[Progress], None]) -> None:
+def warm_up_job(job: RunJob, progress: Show) -> None:
     """Compile what a job needs before its first frame."""
-    dense = job.config.anchors is not None and isinstance(job.landmarks(), DenseEvidence)
+    dense = job.config.anchors is not None and job.landmarks == DENSE
     warm_up_command(job.config, job.device, progress, dense=dense)
 
 
-def _ending(job: RunJob, folder: RunFolder) -> tuple[str, str]:
+def _ending(folder: RunFolder) -> tuple[str, str]:
     """State and message of a run that has processed all frames."""
     if any(record["state"] == "done" for record in folder.records):
-        return FINISHED, _counts(folder, job)
+        return FINISHED, _counts(folder)
     reasons = sorted({record["reason"] for record in folder.records})
     return FAILED, f"no frame could be used: {'; '.join(reasons[:3])}"
 
@@ -95,16 +98,15 @@ def _skipped(folder: RunFolder) -> int:
     return sum(record["state"] == "skipped" for record in folder.records)
 
 
-def _counts(folder: RunFolder, job: RunJob) -> str:
+def _counts(folder: RunFolder) -> str:
     skipped = _skipped(folder)
-    done = f"{len(folder.records) - skipped} of {len(job.indices)} frames"
+    done = f"{len(folder.records) - skipped} of {len(folder.job.indices)} frames"
     return f"{done} ({skipped} skipped)" if skipped else done
 
 
-def _outputs(
-    job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]
-) -> dict[str, str | None]:
+def _outputs(folder: RunFolder, progress: Show, stop: Stop) -> dict[str, str | None]:
     """Mixture and pictures of all finished frames: by file, None if made, else why not."""
+    job = folder.job
     done = [record for record in folder.records if record["state"] == "done"]
     if not done:
         return {}
@@ -118,7 +120,7 @@ def _outputs(
         if job.sheet or job.video:
             columns = common_columns(finished)
         if job.sheet:
-            draw_sheet(finished, columns, f"{job.sequence.name}: {_counts(folder, job)}")
+            draw_sheet(finished, columns, f"{job.sequence.name}: {_counts(folder)}")
             made["contact_sheet.png"] = None
         for drawn in draw_video(finished, columns) if job.video else ():
             progress(Progress("pictures", drawn, len(done)))

@@ -65,7 +65,7 @@ class RunFolder(FrameSink):
     """
 
     def __init__(self, job: RunJob, path: Path, resumed: bool) -> None:
-        self.path = path
+        self.job, self.path = job, path
         self.checkpoint, self.records = _load(path) if resumed else (Checkpoint(), [])
         self.metrics = job.metrics(self.checkpoint)
         (self.path / FRAMES).mkdir(exist_ok=True)

@@ -27,11 +27,11 @@ STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "s
 
 
 def write_summary(
-    job: RunJob, folder: RunFolder, state: str, reason: str, outputs: Mapping[str, str | None] | None = None
+    folder: RunFolder, state: str, reason: str, outputs: Mapping[str, str | None] | None = None
 ) -> dict[str, Any]:
     """Write summary.json from the run's records and sums, and return its content as plain values. ``outputs`` has for
     each file None if it exists, or why it does not. Raises OSError: the file cannot be written."""
-    checkpoint, records = folder.checkpoint, folder.records
+    job, checkpoint, records = folder.job, folder.checkpoint, folder.records
     done = [record for record in records if record["state"] == "done"]
     figures = job.metrics(checkpoint).figures()
     alone_reason = "the depth comes without a variance of its own"
@@ -61,16 +61,16 @@ def write_summary(
         "versions": versions(),
         "machine": hardware(),
     }
-    depth = None if job.image_fit is None or job.image_fit.problem else _depth_fit(job, folder, done)
+    depth = None if job.image_fit is None or job.image_fit.problem else _depth_fit(folder, done)
     summary |= {"image_fit": job.image_fit, "depth_fit": depth, "warnings": _warnings(job, depth, done)}
     plain: dict[str, Any] = to_json(summary)
     write_json_atomic(folder.path / "summary.json", plain)
     return plain
 
 
-def _depth_fit(job: RunJob, folder: RunFolder, done: Records) -> DepthFit | None:
+def _depth_fit(folder: RunFolder, done: Records) -> DepthFit | None:
     """The maps of finished frames beside the depth of corners tracked in their images."""
-    records, sequence = {record["index"]: record for record in done}, job.sequence
+    records, sequence = {record["index"]: record for record in done}, folder.job.sequence
 
     def depth_at(index: int, pixel: np.ndarray) -> np.ndarray | None:
         if index not in records:
@@ -84,7 +84,7 @@ def _depth_fit(job: RunJob, folder: RunFolder, done: Records) -> DepthFit | None
         v, u = np.where(inside, v, 0), np.where(inside, u, 0)
         return np.where(inside & stored["valid"][v, u], stored["depth"][v, u], 0.0)
 
-    return depth_fit(job.sequence, job.corners, depth_at)
+    return depth_fit(sequence, folder.job.corners, depth_at)
 
 
 def _warnings(job: RunJob, depth: DepthFit | None, done: Records) -> list[str]:
