@@ -93,14 +93,15 @@ class RunFolder(FrameSink):
             unit = write_pngs(self.path, name, arrays, unit)
         done = perf_counter()
         line = _line(frame_record(result, UFM, 1000 * (done - started), self._saving))
+        frames, seconds = result.number + 1 - self._first, monotonic() - self._started
+        sessions = [*self._earlier, {"first": self._first, "frames": frames, "seconds": seconds}]
+        sums = self.metrics.sums()
+        checkpoint = Checkpoint(result.number + 1, unit, dict(result.state[UFM]), sums, sessions)
         with (self.path / RECORDS).open("ab") as file:
             file.write(line)
         # Through JSON, so that this run and one that is continued compute with the same numbers.
         self.records.append(json.loads(line))
-        frames, seconds = result.number + 1 - self._first, monotonic() - self._started
-        sessions = [*self._earlier, {"first": self._first, "frames": frames, "seconds": seconds}]
-        state = dict(result.state[UFM])
-        self.checkpoint = Checkpoint(result.number + 1, unit, state, self.metrics.sums(), sessions)
+        self.checkpoint = checkpoint
         if monotonic() - self._stored_at >= CHECKPOINT_EVERY:
             self.store()
         self._saving = 1000 * (perf_counter() - done)
