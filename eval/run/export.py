@@ -67,8 +67,7 @@ class RunFrame:
 
 def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[RunFrame]:
     """The finished frames of a run. Pixels of a larger sigma [m], or a larger one as a share of the depth, are left
-    out. Raises ValueError: no run's folder, one without a finished frame, or one of an earlier version, without
-    poses."""
+    out. Raises ValueError: no run's folder, or one without a finished frame."""
     if not (out / RECORDS).is_file():
         raise ValueError(f"{out} is no output of `ufmstar run`: it has no {RECORDS}")
     records = read_records((out / RECORDS).read_bytes(), out / RECORDS)
@@ -80,8 +79,6 @@ def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iter
 
 def _gated(out: Path, record: Mapping[str, Any], max_sigma: float, max_relative_sigma: float) -> RunFrame:
     maps = read_frame(frame_file(out, record["name"]))
-    if "T_world_cam" not in maps:
-        raise ValueError(f"{out}: the run is of an earlier version, whose frames have no poses; run it again")
     prefix = "posterior_" if "posterior_depth" in maps else ""
     depth, variance = maps[f"{prefix}depth"], maps[f"{prefix}variance"]
     with np.errstate(invalid="ignore"):
