@@ -21,7 +21,6 @@ from ufmstar_torch.eval.engine.predictions import CacheError
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.suite.evaluate import with_references
-from ufmstar_torch.eval.suite.folder import EvalFolder
 from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.work_items import content_digest
 
@@ -32,10 +31,6 @@ def whole(rooms, tmp_path_factory):
     out = tmp_path_factory.mktemp("whole")
     go(job_on(rooms, out))
     return kept(out)
-
-
-def folder_of(job):
-    return EvalFolder(job.out)
 
 
 def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
@@ -59,7 +54,7 @@ def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
     networks = job.load(torch.device("cpu"))
     for item in job.items:
         for slug, result in evaluate(item.open(), job.suite.rows, networks, limit=job.frames).items():
-            record = folder_of(job).records(item)[slug]
+            record = job.folder.records(item)[slug]
             assert record.frames["done"] == 2
             assert {k: v for k, v in record.figures.items() if v is not None} == {
                 k: v for k, v in result.figures.items() if np.isfinite(v)
@@ -97,13 +92,13 @@ def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path, whole):
     failed = json.loads((job.out / "records" / "rooms" / "birch" / "failed.json").read_text())
     assert (failed["sequence"], failed["dataset"], len(failed["rows"])) == ("birch", "rooms", 4)
     assert "poses.txt" in failed["reason"]
-    assert folder_of(job).failures(job.items).keys() == {"rooms/birch"}
+    assert job.folder.failures(job.items).keys() == {"rooms/birch"}
     # Mended, it is tried again.
     write_rooms(root, ["birch"])
     stub = Stub()
     assert go(job, stub, resume=True)[0].finished
     assert [name for name, _ in stub.asked] == ["birch"]
-    assert not folder_of(job).failures(job.items)
+    assert not job.folder.failures(job.items)
     assert kept(job.out) == whole
 
 
@@ -118,9 +113,9 @@ def test_what_the_judge_cannot_use_is_broken_and_what_it_cannot_write_ends_all(r
 
     job = job_on(rooms, tmp_path / "out")
     go(job, fails(SequenceError("no frame has ground truth")))
-    assert folder_of(job).failures(job.items) == {"rooms/birch": "no frame has ground truth"}
+    assert job.folder.failures(job.items) == {"rooms/birch": "no frame has ground truth"}
     go(job, fails(RuntimeError("out of memory")), resume=True)
-    assert folder_of(job).failures(job.items) == {"rooms/birch": "out of memory"}
+    assert job.folder.failures(job.items) == {"rooms/birch": "out of memory"}
     for error in (CacheError("disk full"), OSError("disk full"), TypeError("a mistake of ours")):
         with pytest.raises(type(error)):
             go(job, fails(error), resume=True)
@@ -132,7 +127,7 @@ def test_images_without_poses_are_for_networks_alone(tmp_path):
     job = job_on(root, tmp_path / "out")
     outcome, message = go(job, evaluate_sequence)
     assert outcome.finished
-    folder, (item,) = folder_of(job), job.items
+    folder, (item,) = job.folder, job.items
     done = sorted(path.stem for path in folder.sequence_folder(item).glob("*.json") if path.stem != "failed")
     assert done == ["DepthOnly"]
     failure = json.loads((folder.sequence_folder(item) / "failed.json").read_text())
@@ -188,7 +183,7 @@ def test_a_kill_loses_the_sequence_at_work_alone(rooms, tmp_path, whole):
     child.join(60)
     assert child.exitcode == -signal.SIGKILL
     assert {path.split("/")[2] for path in kept(job.out)} == {"ash"}
-    place = folder_of(job).sequence_folder(job.items[1])
+    place = job.folder.sequence_folder(job.items[1])
     begun, own = place / ".A.pt.0123456789ab.tmp", place / ".mine.tmp"
     for file in (begun, own):
         file.write_text("x")

@@ -19,7 +19,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.folder import FolderError, hold
-from ufmstar_torch.eval.suite.folder import EvalFolder, evaluation_folder
+from ufmstar_torch.eval.suite.folder import evaluation_folder
 from ufmstar_torch.eval.suite.work_items import Shard, WorkItem, find_work, read_names
 
 # ---- work list ----
@@ -184,7 +184,7 @@ def test_resuming_adds_rows_sequences_and_networks(tmp_path):
 def test_a_row_without_its_sums_or_with_half_a_record_is_missing(tmp_path):
     job = job_on(write_rooms(tmp_path / "rooms", ["ash"]), tmp_path / "out")
     go(job)
-    folder, item, rows = EvalFolder(job.out), job.items[0], job.suite.rows
+    folder, item, rows = job.folder, job.items[0], job.suite.rows
     assert folder.missing(item, rows) == []
     assert folder.missing(item, [Row(rows[3].method, Setting(skip=1))]) == [Row(rows[3].method, Setting(skip=1))]
     (folder.sequence_folder(item) / "DepthOnly.pt").unlink()

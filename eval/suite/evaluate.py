@@ -18,7 +18,6 @@ from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.eval.suite.examples import ExampleWriter
-from ufmstar_torch.eval.suite.folder import EvalFolder
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.work_items import WorkItem, content_digest
@@ -55,7 +54,7 @@ def evaluate_item(
     """
     if stop():
         raise Stopped
-    folder, started = EvalFolder(job.out), time.monotonic()
+    folder, started = job.folder, time.monotonic()
     missing = folder.begin(item, job.suite.rows)
     try:
         sequence = item.open()

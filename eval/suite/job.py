@@ -16,7 +16,7 @@ from ufmstar_torch.eval.methods.method import FUSIONS
 from ufmstar_torch.eval.methods.suite import Suite
 from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.eval.sequences.plugins import load_plugins
-from ufmstar_torch.eval.suite.folder import CACHE
+from ufmstar_torch.eval.suite.folder import CACHE, EvalFolder
 from ufmstar_torch.eval.suite.work_items import WorkItem
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.recalibrate import Recalibration
@@ -43,6 +43,11 @@ class EvalJob:
     # runtime, precision: of the networks (``Inference``).
     runtime: str = "auto"
     precision: str = "float32"
+
+    @property
+    def folder(self) -> EvalFolder:
+        """The records in its output folder."""
+        return EvalFolder(self.out)
 
     @property
     def unused(self) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.run.machine import available_cores, device_of
 from ufmstar_torch.eval.suite.evaluate import evaluate_item
-from ufmstar_torch.eval.suite.folder import EvalFolder, evaluation_folder
+from ufmstar_torch.eval.suite.folder import evaluation_folder
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.work_items import Shard, WorkItem
 
@@ -83,7 +83,7 @@ def evaluate_suite(
     if overwrite and shard.count > 1:
         raise ValueError("--overwrite goes without shards: another one may have begun")
     device = torch.device(device_of(job.device, local) if processes == 1 else "cpu")
-    networks, items, folder = job.load(device), shard.of(job.items), EvalFolder(job.out)
+    networks, items, folder = job.load(device), shard.of(job.items), job.folder
     how = {"resume": resume or shard.count > 1, "overwrite": overwrite}
     with evaluation_folder(job.out, job.about(networks), shard=shard, **how), warned_once():
         if processes > 1:
