@@ -1,21 +1,5 @@
 """Command lines from frozen dataclasses: an option for every field, its help from the class's docstring.
 
-```python
-@dataclass(frozen=True, kw_only=True)
-class GreetOptions:
-    \"""Greet a person.
-
-    Attributes:
-        name: of the person.
-        times: how often.
-    \"""
-
-    name: str = positional()
-    times: int = 1
-
-options = parse(GreetOptions, ["Ada", "--times", "2"], "greet")
-```
-
 The form of an option follows from its field:
 
 - ``positional()``: an argument without a name; a field without a default is an option that must be given;
