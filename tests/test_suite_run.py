@@ -195,13 +195,13 @@ def test_a_kill_loses_the_sequence_at_work_alone(rooms, tmp_path, whole):
 
 
 def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, whole, monkeypatch):
-    job, saved, whole = job_on(rooms, tmp_path / "out"), [], Record.save
+    job, saved, write = job_on(rooms, tmp_path / "out"), [], Record.save
 
     def save(self, path):
         if len(saved) == 6:
             raise KeyboardInterrupt
         saved.append(path)
-        whole(self, path)
+        write(self, path)
 
     monkeypatch.setattr(Record, "save", save)
     with pytest.raises(KeyboardInterrupt):

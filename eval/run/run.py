@@ -22,7 +22,8 @@ from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
 from ufmstar_torch.eval.run.summary import FAILED, FINISHED, INTERRUPTED, write_summary
 from ufmstar_torch.stream_warnings import LOGGER
 
-Show, Stop = Callable[[Progress], None], Callable[[], bool]
+Show = Callable[[Progress], None]
+Stop = Callable[[], bool]
 
 
 def run(
