@@ -10,7 +10,7 @@ import numpy as np
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.generic import has_images_and_depth, open_unposed
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.eval.sequences.layout import detect_layout
+from ufmstar_torch.eval.sequences.layout import layout_of
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.train.data_config import Part
@@ -75,7 +75,7 @@ def open_rgbd(source: str | Path) -> FrameSequence:
     path = Path(source)
     if has_images_and_depth(path):
         try:
-            detect_layout(path)
+            layout_of("auto", path)
         except ValueError:  # no layout with poses
             return open_unposed(path, Options())
     return open_sequence(source)

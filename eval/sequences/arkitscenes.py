@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped
-from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, depth_loader, list_files, list_images
+from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, depth_loader, list_files
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import associate, read_matrix, trajectory_of
@@ -46,7 +46,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     called by its time, or no usable frame."""
     root = _root(path)
     assert root is not None
-    images, cameras = list_images(root / _IMAGES), list_files(root / _CAMERAS, _PINCAM)
+    images, cameras = list_files(root / _IMAGES), list_files(root / _CAMERAS, _PINCAM)
     depths = list_files(root / _DEPTHS, DEPTH_SUFFIXES) if (root / _DEPTHS).is_dir() else []
     times = _times(images)
     camera_of = associate(times, _times(cameras), _SAME_FRAME)
@@ -74,9 +74,8 @@ def _times(files: list[Path]) -> np.ndarray:
 def _lens(file: Path) -> Lens:
     values = read_matrix(file).ravel()
     if len(values) != 6 or not np.isfinite(values).all() or min(values) <= 0 or not (values[:2] % 1 == 0).all():
-        raise ValueError(
-            f"{file}: expected width height fx fy cx cy [px], the size in whole ones, got {values.tolist()}"
-        )
+        expected = "width height fx fy cx cy [px], the size in whole ones"
+        raise ValueError(f"{file}: expected {expected}, got {values.tolist()}")
     width, height, fx, fy, cx, cy = values.tolist()
     return Lens((fx, fy, cx, cy), (int(height), int(width)))
 

@@ -80,11 +80,10 @@ def frame_of_files(
 ) -> Entry | Skipped:
     """A frame with a pose file of its own, which is not read where ``options.trajectory`` replaces it; skipped where
     the image or the pose is missing (None). Raises ValueError: a malformed pose file."""
-    if options.trajectory is not None:
-        return frame_of_image(name, image, load_depth)
-    if pose is None:
+    if pose is None and options.trajectory is None:
         return Skipped(name, "missing pose file")
-    return frame_of_image(name, image, load_depth, read_pose(pose))
+    T_world_cam = UNKNOWN if pose is None or options.trajectory is not None else read_pose(pose)
+    return frame_of_image(name, image, load_depth, T_world_cam)
 
 
 def frame_of_image(
@@ -106,10 +105,8 @@ def _poses(
     """The pose [4, 4] of each image, None where the trajectory has none."""
     if trajectory.timestamps is None:
         if len(trajectory) != len(frames):
-            raise ValueError(
-                f"trajectory has {len(trajectory)} poses for {len(frames)} images: without timestamps, there "
-                "must be one for each"
-            )
+            counts = f"{len(trajectory)} poses for {len(frames)} images"
+            raise ValueError(f"trajectory has {counts}: without timestamps, there must be one for each")
         return list(trajectory.T_world_cam)
     times, stamps = _in_one_unit([frame.name for frame in frames], times, trajectory.timestamps, options.fps)
     trajectory = replace(trajectory, timestamps=stamps)

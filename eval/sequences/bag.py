@@ -223,9 +223,8 @@ def _choose(bag: Bag, options: Options) -> _Topics:
     depth = one("the depth", so_called or same_view)
     other = [name for name in named if name in depths and name not in same_view]
     if other:
-        raise ValueError(
-            f"topics: {other[0]!r} shows another camera's view ({depths[other[0]]!r}, not {images[image]!r})"
-        )
+        view = f"({depths[other[0]]!r}, not {images[image]!r})"
+        raise ValueError(f"topics: {other[0]!r} shows another camera's view {view}")
     if depths and not depth:
         name, frame = next(iter(depths.items()))
         LOGGER.warning("%s: no depth: %s is of %r and not registered to %r", bag.path, name, frame, images[image])
@@ -288,18 +287,16 @@ class _Content:
         if self._trajectory is None:  # tf
             self._body = topics.frame or chain[-1]
             if self._body not in chain or not self._tree.moves(chain[: chain.index(self._body)]):
-                raise ValueError(
-                    f"{self.bag.path}: tf does not say how the image's frame {self._camera!r} moves in "
-                    f"{self._body!r}; it has {', '.join(chain)}; name another one by --topics {topics.pose}=FRAME"
-                )
+                other = f"it has {', '.join(chain)}; name another one by --topics {topics.pose}=FRAME"
+                how = f"how the image's frame {self._camera!r} moves in {self._body!r}"
+                raise ValueError(f"{self.bag.path}: tf does not say {how}; {other}")
             return
         of_odometry = self.bag.topics[topics.pose] == _ODOMETRY
         self._body = topics.frame or (self._body if of_odometry else self._camera)
         if self._body != self._camera and not set(self._tree.chain(self._body)) & set(chain):
-            raise ValueError(
-                f"{self.bag.path}: tf does not connect {self._body!r}, whose poses {topics.pose} has, with the image's "
-                f"frame {self._camera!r}; if they are the camera's, say --topics {topics.pose}={self._camera}"
-            )
+            what = f"{self._body!r}, whose poses {topics.pose} has, with the image's frame {self._camera!r}"
+            remedy = f"if they are the camera's, say --topics {topics.pose}={self._camera}"
+            raise ValueError(f"{self.bag.path}: tf does not connect {what}; {remedy}")
 
     def pose(self, time: float, max_gap: float) -> np.ndarray | None:
         """[4, 4] camera-to-world at ``time`` [s]; None where there is none."""

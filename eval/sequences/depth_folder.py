@@ -101,9 +101,7 @@ def _paired(files: list[Path], names: Sequence[str], orders: Sequence[Sequence[s
         if order is None:
             shown = ", ".join(missing[:10]) + (", ..." if len(missing) > 10 else "")
             folder, first = files[0].parent, files[0].name
-            raise ValueError(
-                f"{folder}: no map for {len(missing)} of {len(names)} frames ({shown}); its {len(files)} files are "
-                f"named {first}, ..., and there are not as many as frames, so that order does not pair them"
-            )
+            found = f"its {len(files)} files are named {first}, ..., and there are not as many as frames"
+            raise ValueError(f"{folder}: no map for {len(missing)} of {len(names)} frames ({shown}); {found}")
         pairs = dict(zip(order, files, strict=True))
     return tuple(pairs[name] for name in names)

@@ -183,8 +183,7 @@ def make_sequence(
         reasons = Counter(frame.reason for frame in skipped).most_common(3)
         summary = "; ".join(f"{count} x {reason}" for reason, count in reasons) or "no frame was found"
         raise ValueError(f"{layout} sequence {name!r} has no usable frame: {summary}")
-    repeated = [frame_name for frame_name, count in Counter(names).items() if count > 1]
-    if repeated:
+    if repeated := [frame_name for frame_name, count in Counter(names).items() if count > 1]:
         raise ValueError(f"{layout} sequence {name!r}: frame names must be unique, {repeated[:3]} occur twice")
     check_intrinsics("intrinsics", intrinsics, image_size)
     if depth_intrinsics is not None:
@@ -192,19 +191,8 @@ def make_sequence(
     for entry in entries:
         if entry.intrinsics is not None:
             check_intrinsics(f"intrinsics of {entry.name}", entry.intrinsics, entry.image_size or image_size)
-    return FrameSequence(
-        name,
-        layout,
-        tuple(entries),
-        intrinsics,
-        image_size,
-        depth_intrinsics,
-        depth_size,
-        tuple(skipped),
-        tuple(names),
-        posed,
-        metric=metric,
-    )
+    cameras = (intrinsics, image_size, depth_intrinsics, depth_size)
+    return FrameSequence(name, layout, tuple(entries), *cameras, tuple(skipped), tuple(names), posed, metric=metric)
 
 
 def in_memory(sequence: FrameSequence, progress: Callable[[int], object] = lambda _: None) -> FrameSequence:
@@ -239,10 +227,8 @@ def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:
     if np.abs(K[2] - [0, 0, 1]).max() > 1e-9 or abs(K[1, 0]) > 1e-9:
         raise ValueError(f"{argument} must have rows (fx s cx), (0 fy cy), (0 0 1), got {K.tolist()}")
     if size is not None and not fits(K, size):
-        raise ValueError(
-            f"{argument} with principal point ({K[0, 2]:g}, {K[1, 2]:g}) px do not fit images of "
-            f"{size[1]}x{size[0]}: were they given for another image size?"
-        )
+        fitting = f"principal point ({K[0, 2]:g}, {K[1, 2]:g}) px do not fit images of {size[1]}x{size[0]}"
+        raise ValueError(f"{argument} with {fitting}: were they given for another image size?")
 
 
 def fits(K: np.ndarray, size: Size) -> bool:
@@ -254,9 +240,6 @@ def fits(K: np.ndarray, size: Size) -> bool:
 def _load(name: str, what: str, load: Loader | None, size: Size | None) -> np.ndarray | None:
     array = None if load is None else load()
     if array is not None and size is not None and array.shape[:2] != size:
-        raise FrameError(
-            name,
-            f"the {what} is {array.shape[1]}x{array.shape[0]}, the sequence's are {size[1]}x{size[0]} "
-            "(its intrinsics hold for that size only)",
-        )
+        sizes = f"the {what} is {array.shape[1]}x{array.shape[0]}, the sequence's are {size[1]}x{size[0]}"
+        raise FrameError(name, f"{sizes} (its intrinsics hold for that size only)")
     return array

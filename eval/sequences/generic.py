@@ -22,7 +22,6 @@ from ufmstar_torch.eval.sequences.images import (
     depth_loader,
     first_image_size,
     list_files,
-    list_images,
     read_color,
 )
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
@@ -122,7 +121,7 @@ def open_images(path: Path, options: Options) -> tuple[list[Entry], Size]:
         loaders = [partial(video.read, i) for i in range(len(video))]
         images = [Entry(f"{i:06d}", UNKNOWN, loaders[i], None, time) for i, time in enumerate(times.tolist())]
         return images, video.size
-    files = list_images(source)
+    files = list_files(source)
     size = first_image_size(files)
     if size is None:
         raise ValueError(f"{source} holds no image that can be read ({', '.join(IMAGE_SUFFIXES)})")
@@ -139,7 +138,7 @@ def open_images(path: Path, options: Options) -> tuple[list[Entry], Size]:
 def _image_sources(path: Path) -> list[Path]:
     """Folders with images, or else the folder itself, or else its video files."""
     folders = [path / name for name in IMAGES if (path / name).is_dir()]
-    return folders or ([path] if list_images(path) else list_files(path, VIDEO_SUFFIXES))
+    return folders or ([path] if list_files(path) else list_files(path, VIDEO_SUFFIXES))
 
 
 def listed_times(folder: Path, files: list[Path]) -> np.ndarray | None:

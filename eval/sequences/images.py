@@ -127,16 +127,9 @@ def first_depth_size(frames: Iterable[Entry | Skipped]) -> Size | None:
     return None
 
 
-def list_images(folder: Path) -> list[Path]:
-    """The folder's images, as :func:`list_files`."""
-    return list_files(folder, IMAGE_SUFFIXES)
-
-
-def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """The folder's files with one of the suffixes, numbers in names sorted by value (2 before 10).
-
-    Links whose file is missing are among them, so that their frames are skipped and counted.
-    """
+def list_files(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
+    """The folder's files with one of the suffixes, numbers in names sorted by value (2 before 10). Links whose file is
+    missing are among them, so that their frames are skipped and counted."""
     named = (path for path in folder.iterdir() if path.suffix.lower() in suffixes)
     return sorted((p for p in named if p.is_file() or (p.is_symlink() and not p.exists())), key=natural_key)
 
@@ -161,9 +154,7 @@ def within(load: Loader, most: float) -> np.ndarray:
 def check_scale(depth_scale: float | None) -> None:
     """Raises ValueError unless metres per unit is a positive number of at most 1, or None."""
     if depth_scale is not None and not 0 < depth_scale <= 1:
-        raise ValueError(
-            f"depth_scale is in metres per unit (0.001 for millimetres, 1/5000 for TUM), got {depth_scale}"
-        )
+        raise ValueError(f"depth_scale is in metres per unit (0.001: millimetres, 1/5000: TUM), got {depth_scale}")
 
 
 def positive(depth: np.ndarray) -> np.ndarray:

@@ -70,8 +70,6 @@ def scale_intrinsics(K: np.ndarray, old: Size | None, new: Size | None) -> np.nd
     if old is None or new is None or old == new:
         return K.copy()
     if abs((new[1] / new[0]) / (old[1] / old[0]) - 1) > _ASPECT_TOLERANCE:
-        raise ValueError(
-            f"intrinsics are known for {old[1]}x{old[0]} images, these are {new[1]}x{new[0]}, which is not "
-            "only a resize: pass intrinsics"
-        )
+        sizes = f"{old[1]}x{old[0]} images, these are {new[1]}x{new[0]}"
+        raise ValueError(f"intrinsics are known for {sizes}, which is not only a resize: pass intrinsics")
     return resize_intrinsics(torch.from_numpy(K), old, new).numpy()

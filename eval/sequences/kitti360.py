@@ -31,7 +31,7 @@ from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN, frame_of_image, pair_depth
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.ground_truth import project
-from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, list_images
+from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, list_files
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import numbered_lines, read_matrix, read_trajectory
@@ -71,7 +71,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     if folder is None or folder.name not in _CAMERAS:
         raise ValueError(f"{path}: of KITTI-360, {' and '.join(_CAMERAS)} can be read; the others are fisheye cameras")
     root, drive, camera = folder.parents[2], folder.parent.name, folder.name.removeprefix("image_")
-    images = list_images(folder / "data_rect")
+    images = list_files(folder / "data_rect")
     if not images:
         raise ValueError(f"{folder / 'data_rect'} holds no image")
     size = first_image_size(images)
@@ -96,6 +96,8 @@ def read(path: Path, options: Options) -> FrameSequence:
     lens, name = Lens.of(P[:, :3], (height, width)), drive if camera == "00" else f"{drive}_{folder.name}"
     sequence = assemble("kitti360", folder, frames, lens, options, name=name, size=size)
     if options.depth is None:
+        if options.depth_intrinsics is not None:
+            raise ValueError("depth_intrinsics goes with a folder of depth maps, not with depth from the laser")
         return _with_laser(sequence, root, drive, camera, poses, options)
     if options.scans is not None:
         raise ValueError("scans goes with depth from the laser, not with a folder of depth maps")

@@ -1,4 +1,4 @@
-"""The layouts of recordings on disk: ``detect_layout`` by their files, ``find_sequences`` lists all below a folder."""
+"""The layouts of recordings on disk: ``layout_of`` a path, and ``find_sequences`` below a folder."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 from ufmstar_torch.eval.sequences.plugins import load_plugins
 
-# Each module has ``detect(path)``, ``read(path, options)`` and LOOKED_FOR, the files that it detects.
+# Each module has ``detect(path)``, ``read(path, options)`` and LOOKED_FOR, the files that it detects; where a path may
+# hold several sequences, ``parts(path)``.
 _MODULES = (
     *("tum", "seven_scenes", "scannet", "sens", "tartanair", "kitti360", "nyu", "colmap", "transforms", "euroc"),
     *("bag", "stray", "arkitscenes", "generic"),
@@ -18,9 +19,6 @@ READERS: dict[str, Any] = {
     "7scenes" if name == "seven_scenes" else name: import_module(f"ufmstar_torch.eval.sequences.{name}")
     for name in _MODULES
 }
-_WITH_PARTS = ("tartanair", "kitti360", "nyu")
-# Folders within one another have one name: ROOT/chess/seq-01 is "chess__seq-01".
-_BETWEEN = "__"
 
 
 def readers(plugin: Sequence[str] = ()) -> dict[str, Any]:
@@ -38,30 +36,23 @@ def require_layout(layout: str, plugin: Sequence[str] = ()) -> None:
         raise ValueError(f"layout must be one of {', '.join(names)}, got {layout!r}")
 
 
-def layout_of(layout: str, path: Path, explicit: bool, plugin: Sequence[str] = ()) -> str:
-    """The layout by name, or detected for "auto". Raises ValueError: unknown, ambiguous, or not that of the path."""
+def layout_of(layout: str, path: Path, explicit: bool = False, plugin: Sequence[str] = ()) -> str:
+    """The layout of a name, or for "auto" the one whose files lie in ``path``; ``generic`` where there is none and
+    ``explicit``: the user names the images or the trajectory. Raises ValueError: unknown, none or several fit."""
     require_layout(layout, plugin)
-    if layout == "auto":
-        return detect_layout(path, explicit, plugin)
-    reader = readers(plugin)[layout]
-    if layout != "generic" and not reader.detect(path):
-        raise ValueError(f"{path} has not the layout {layout!r}: looked for {reader.LOOKED_FOR}")
-    return layout
-
-
-def detect_layout(path: Path, explicit: bool = False, plugin: Sequence[str] = ()) -> str:
-    """The one layout whose files lie in ``path``; ``generic`` where no other fits, always if ``explicit``: the user
-    names the images or the trajectory. Raises ValueError: none or several fit."""
-    fitting = layouts_of(path, plugin)
-    if not fitting and explicit:
-        return "generic"
-    if len(fitting) == 1:
-        return fitting[0]
-    if fitting:
+    known = readers(plugin)
+    if layout != "auto":
+        if layout != "generic" and not known[layout].detect(path):
+            raise ValueError(f"{path} has not the layout {layout!r}: looked for {known[layout].LOOKED_FOR}")
+        return layout
+    fitting = layouts_of(path, plugin) or ["generic"] * explicit
+    if len(fitting) > 1:
         raise ValueError(f"{path} fits the layouts {', '.join(fitting)}: pass layout")
-    expected = "\n".join(f"  {name}: {reader.LOOKED_FOR}" for name, reader in readers(plugin).items())
-    inside = sorted(p.name for p in path.iterdir())[:8] if path.is_dir() else [path.name]
-    raise ValueError(f"{path} has no known layout. Looked for\n{expected}\nand found {inside}")
+    if not fitting:
+        expected = "\n".join(f"  {name}: {reader.LOOKED_FOR}" for name, reader in known.items())
+        inside = sorted(p.name for p in path.iterdir())[:8] if path.is_dir() else [path.name]
+        raise ValueError(f"{path} has no known layout. Looked for\n{expected}\nand found {inside}")
+    return fitting[0]
 
 
 def layouts_of(path: Path, plugin: Sequence[str] = ()) -> list[str]:
@@ -72,8 +63,8 @@ def layouts_of(path: Path, plugin: Sequence[str] = ()) -> list[str]:
 
 def parts_of(path: Path, layout: str) -> list[Path]:
     """The single sequences of a path that has this layout: itself, or folders in it that hold one each."""
-    parts: list[Path] = READERS[layout].parts(path) if layout in _WITH_PARTS else [path]
-    return parts
+    reader = READERS.get(layout)
+    return list(reader.parts(path)) if hasattr(reader, "parts") else [path]
 
 
 class Found(NamedTuple):
@@ -143,4 +134,4 @@ def _folders(path: Path) -> list[Path]:
 def _name(path: Path, root: Path) -> str:
     if path == root:
         return path.resolve().stem if path.is_file() else path.resolve().name
-    return _BETWEEN.join(path.relative_to(root).parts)
+    return "__".join(path.relative_to(root).parts)

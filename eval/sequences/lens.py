@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 
@@ -83,9 +84,8 @@ def parse_distortion(words: str | Sequence[str | float]) -> tuple[tuple[float, .
     try:
         return tuple(float(word) for word in listed[fisheye:]), fisheye
     except ValueError:
-        raise ValueError(
-            f"distortion must be k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or none, got {words!r}"
-        ) from None
+        forms = "k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or none"
+        raise ValueError(f"distortion must be {forms}, got {words!r}") from None
 
 
 def _undistorted(load: Loader, lens: Lens, size: Size, nearest: bool) -> np.ndarray:
@@ -122,12 +122,9 @@ def _zoom(lens: Lens) -> float:
     pixels = np.stack([np.concatenate(axis) for axis in zip(*sides, strict=True)], axis=-1)[:, None]
     K, coefficients, still = pinhole(fx, fy, cx, cy), np.array(lens.coefficients), np.zeros(3)
     until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-9)
-    if lens.fisheye:
-        rays = cv2.fisheye.undistortPoints(pixels, K, coefficients, criteria=until)
-        again, _ = cv2.fisheye.projectPoints(cv2.convertPointsToHomogeneous(rays), still, still, K, coefficients)
-    else:
-        rays = cv2.undistortPoints(pixels, K, coefficients, criteria=until)
-        again, _ = cv2.projectPoints(cv2.convertPointsToHomogeneous(rays), still, still, K, coefficients)
+    model: Any = cv2.fisheye if lens.fisheye else cv2
+    rays = model.undistortPoints(pixels, K, coefficients, criteria=until)
+    again, _ = model.projectPoints(cv2.convertPointsToHomogeneous(rays), still, still, K, coefficients)
     apart = np.abs(again.reshape(-1, 2) - pixels.reshape(-1, 2)).max()
     rays = rays.reshape(4, _BORDER_POINTS, 2)
     left, right, top, bottom = -rays[0, :, 0], rays[1, :, 0], -rays[2, :, 1], rays[3, :, 1]

@@ -64,10 +64,8 @@ class Options:
         """Raises ValueError where an option was given that the layout has no use for."""
         for name in names:
             if getattr(self, name) is not None:
-                raise ValueError(
-                    f"layout {layout!r} takes no {name}: its files hold that; use layout='generic' to combine "
-                    "images, depth and a trajectory freely"
-                )
+                other = "use layout='generic' to combine images, depth and a trajectory freely"
+                raise ValueError(f"layout {layout!r} takes no {name}: its files hold that; {other}")
 
 
 def resolve(root: Path, given: str | Path) -> Path:

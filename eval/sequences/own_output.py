@@ -49,12 +49,13 @@ def read_records(content: bytes, file: Path) -> list[dict]:
             record = None
         match record:
             case {"name": str(), "state": "skipped", "reason": str()}:
-                records.append(record)
+                pass
             case {"name": str(), "state": "done", "intrinsics": [_, _, _, _] as K} if all(map(_is_number, K)):
-                records.append(record)
+                pass
             case _:
                 shown = line[:60].decode(errors="replace")
                 raise ValueError(f"{file}, line {number} is not the record of a frame: {shown}")
+        records.append(record)
     return records
 
 

@@ -225,10 +225,9 @@ def _require_consistent(T_world_cam: np.ndarray, first: np.ndarray, same: np.nda
     bad = np.flatnonzero((distance > apart) | (angle > _SAME_DIRECTION))
     if bad.size:
         i = bad[0]
-        raise ValueError(
-            f"{lines[i]}: the pose has the timestamp of line {lines[first[same[i]]].rpartition(':')[2]}, but lies "
-            f"{distance[i]:.3g} and {angle[i]:.3g} degrees from it ({bad.size} such poses); leave one of each out"
-        )
+        other, far = lines[first[same[i]]].rpartition(":")[2], f"{distance[i]:.3g} and {angle[i]:.3g} degrees from it"
+        many = f"({bad.size} such poses); leave one of each out"
+        raise ValueError(f"{lines[i]}: the pose has the timestamp of line {other}, but lies {far} {many}")
 
 
 def _numbers(path: str | Path, commas: bool = False) -> tuple[list[list[float]], list[str]]:

@@ -181,27 +181,21 @@ class FrameTree:
         """True if any of these frames moves in its parent."""
         return any(len(self._edge(frame)) > 1 for frame in frames)
 
-    def _at(self, frame: str, above: str, time: float, max_gap: float) -> np.ndarray | None:
-        """[4, 4] the pose of ``frame`` in ``above``, one of its chain."""
-        T, listed = np.eye(4), self.chain(frame)
-        for child in listed[: listed.index(above)]:
-            edge = self._edge(child)
-            step = edge.T_world_cam[0] if len(edge) == 1 else interpolate_pose(edge, time, max_gap)
-            if step is None:
-                return None
-            T = step @ T
-        return T
-
     def between(self, frame: str, other: str, time: float, max_gap: float) -> np.ndarray | None:
         """[4, 4] the pose of ``frame`` in ``other``, with which tf connects it, at ``time`` [s]; None where a sample is
         missing (``interpolate_pose``)."""
         above = self.chain(other)
         common = next(name for name in self.chain(frame) if name in above)
-        T_common_frame = self._at(frame, common, time, max_gap)
-        T_common_other = self._at(other, common, time, max_gap)
-        if T_common_frame is None or T_common_other is None:
-            return None
-        return np.asarray(np.linalg.inv(T_common_other) @ T_common_frame)
+        poses = []
+        for start in (frame, other):
+            T, listed = np.eye(4), self.chain(start)
+            for edge in map(self._edge, listed[: listed.index(common)]):
+                step = edge.T_world_cam[0] if len(edge) == 1 else interpolate_pose(edge, time, max_gap)
+                if step is None:
+                    return None
+                T = step @ T
+            poses.append(T)
+        return np.asarray(np.linalg.inv(poses[1]) @ poses[0])
 
     def _edge(self, child: str) -> Trajectory:
         """A frame's poses in its parent: one, where it does not move."""

@@ -13,7 +13,7 @@ import numpy as np
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_files
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, fits
-from ufmstar_torch.eval.sequences.images import depth_loader, first_depth_size, first_image_size, list_images
+from ufmstar_torch.eval.sequences.images import depth_loader, first_depth_size, first_image_size, list_files
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
@@ -31,7 +31,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     """Opens a SensReader export. Depth maps keep their own camera, ``depth_intrinsics``. Exports with resized images
     have the original ``intrinsic_color.txt``: intrinsics that fit 1296x968 (depth: 640x480) but not the files' size are
     scaled to it. Raises ValueError: no usable frame, intrinsics that fit neither size, a malformed pose file."""
-    images = list_images(path / "color")
+    images = list_files(path / "color")
     frames = [_frame(path, image, options) for image in images]
     if not images:
         raise ValueError(f"scannet sequence {path.name!r}: the folder color/ holds no image")

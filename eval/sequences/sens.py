@@ -98,22 +98,14 @@ def _read_header(file: BinaryIO, path: Path) -> np.void:
     header = np.frombuffer(_take(file, path, _HEADER.itemsize), _HEADER)[0]
     (color_w, color_h), (depth_w, depth_h) = header["color_size"], header["depth_size"]
     frames, units = header["frames"], header["units_per_metre"]
-    if (
-        not 0 < int(depth_w) * int(depth_h) <= _MAX_PIXELS
-        or min(color_w, color_h) == 0
-        or not 1 <= units < np.inf
-        or frames > _MAX_FRAMES
-    ):
-        raise ValueError(
-            f"{path}: broken header: {frames} frames, images of {color_w}x{color_h}, depth of {depth_w}x{depth_h}, "
-            f"{units:g} units per metre"
-        )
+    sizes_fit = 0 < int(depth_w) * int(depth_h) <= _MAX_PIXELS and min(color_w, color_h) > 0
+    if not (sizes_fit and 1 <= units < np.inf and frames <= _MAX_FRAMES):
+        found = f"images of {color_w}x{color_h}, depth of {depth_w}x{depth_h}, {units:g} units per metre"
+        raise ValueError(f"{path}: broken header: {frames} frames, {found}")
     kinds = _COLOR.get(int(header["color"]), "unknown"), _DEPTH.get(int(header["depth"]), "unknown")
     if kinds[0] not in ("jpeg", "png") or kinds[1] != "zlib_ushort":
-        raise ValueError(
-            f"{path}: colour is {kinds[0]} and depth {kinds[1]}; of a .sens file, jpeg or png with zlib_ushort can be "
-            "read: export it with ScanNet's SensReader"
-        )
+        known = "jpeg or png with zlib_ushort can be read: export it with ScanNet's SensReader"
+        raise ValueError(f"{path}: colour is {kinds[0]} and depth {kinds[1]}; of a .sens file, {known}")
     return header
 
 

@@ -38,9 +38,8 @@ def read(path: Path, options: Options) -> FrameSequence:
     rows = csv_rows(path / _ODOMETRY)
     names = [word.lower() for word in rows[0][0]] if rows else []
     if missing := [name for name in _COLUMNS if name not in names]:
-        raise ValueError(
-            f"{path / _ODOMETRY}: the first line must name the column {missing[0]!r}, got {', '.join(names)[:99]!r}"
-        )
+        found = ", ".join(names)[:99]
+        raise ValueError(f"{path / _ODOMETRY}: the first line must name the column {missing[0]!r}, got {found!r}")
     lines = [where for _, where in rows[1:]]
     for words, where in rows[1:]:
         if len(words) != len(names):

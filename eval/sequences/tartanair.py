@@ -11,7 +11,7 @@ from pathlib import Path
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import frame_of_image
 from ufmstar_torch.eval.sequences.frame import FrameSequence
-from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, list_images
+from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, list_files
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, read_trajectory
@@ -36,7 +36,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     trajectory = read_trajectory(folder / "pose_left.txt")
     if trajectory.timestamps is not None:
         raise ValueError(f"{folder / 'pose_left.txt'}: expected 7 numbers in a line, tx ty tz qx qy qz qw")
-    images = list_images(folder / "image_left")
+    images = list_files(folder / "image_left")
     by_number: dict[int, Path] = {}
     for image in images:
         digits = image.stem.split("_")[0]

@@ -83,10 +83,7 @@ def _robot(path: Path) -> str:
     """1, 2 or 3, known from ``freiburgN`` in the folder's name or in the header of rgb.txt."""
     header = "\n".join(text for _, text in numbered_lines(path / "rgb.txt"))[:500]
     for text in (path.resolve().name, header):
-        found = re.search(r"freiburg([123])", text)
-        if found:
+        if found := re.search(r"freiburg([123])", text):
             return found[1]
-    raise ValueError(
-        f"intrinsics: neither the folder name {path.resolve().name!r} nor rgb.txt names the camera "
-        "(freiburg1, 2 or 3); pass intrinsics as fx fy cx cy"
-    )
+    known = "names the camera (freiburg1, 2 or 3); pass intrinsics as fx fy cx cy"
+    raise ValueError(f"intrinsics: neither the folder name {path.resolve().name!r} nor rgb.txt {known}")

@@ -21,16 +21,6 @@ _FROM_WALL = 0.02  # the skirting board stands between [m]
 _HALL_FROM = 7.0  # rooms with a side from here on are furnished as halls [m]
 
 
-@dataclass(frozen=True, eq=False)
-class Light:
-    """A lamp's or a window's light."""
-
-    position: Array  # [3] [m]
-    color: Array  # [3] linear RGB at the distance ``reach``, facing it
-    reach: float  # [m]
-    size: float  # how far its parts lie apart, which softens shadows [m]
-
-
 def furnish(room: Room, doors: list[Door], way: Array, palette: Palette, rng: np.random.Generator) -> Furnished:
     """Furnishes a room, whose doors are given, clear of ``way`` [M, 2], x and z of all points where a camera may be
     [m]."""
@@ -57,7 +47,9 @@ class Furnished:
     palette: Palette
     rng: np.random.Generator
     parts: list[Part] = field(default_factory=list)  # primitives
-    lights: list[Light] = field(default_factory=list)  # at most ``LIGHTS``
+    # At most ``LIGHTS`` of lamps and windows: position [m], linear RGB at the distance ``reach`` [m], facing it, reach,
+    # and how far its parts lie apart, which softens shadows [m].
+    lights: list[list[float]] = field(default_factory=list)
     taken: list[Array] = field(default_factory=list)  # [2, 3] lower and upper corners of the space that is taken [m]
 
     def place_furniture(self) -> None:
@@ -117,8 +109,7 @@ class Furnished:
             if drop > 0.02:
                 self.parts.append(tube((x, -room.height + drop / 2, z), 0.012, drop / 2, metal))
             power = float(rng.uniform(*style.brightness)) / count**0.7
-            position = np.array([x, -room.height + drop + 0.16, z])
-            self.lights.append(Light(position, color * power, 0.5 * size.mean(), 0.25))
+            self.lights.append([x, -room.height + drop + 0.16, z, *color * power, 0.5 * size.mean(), 0.25])
 
     def lay_rug(self) -> None:
         """A rug, round or not, near the middle."""
@@ -156,7 +147,7 @@ class Furnished:
                 if len(self.lights) < LIGHTS:
                     power = 0.55 * float(rng.uniform(*self.room.style.brightness))
                     reach = 0.45 * float((self.room.upper - self.room.lower).mean())
-                    self.lights.append(Light(at, np.array([0.88, 0.97, 1.15]) * power, reach, 0.5))
+                    self.lights.append([*at, *np.array([0.88, 0.97, 1.15]) * power, reach, 0.5])
                 return
 
     def hang_picture(self) -> None:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.eval.tour.furnish import LIGHTS, Light, furnish
+from ufmstar_torch.eval.tour.furnish import LIGHTS, furnish
 from ufmstar_torch.eval.tour.palette import Palette
 from ufmstar_torch.eval.tour.rooms import Door, Room, frame, lay_out, shell
 from ufmstar_torch.eval.tour.route import ways
@@ -21,8 +21,7 @@ from ufmstar_torch.eval.tour.volume import light_volumes
 
 Array = NDArray[np.float64]
 
-# Streams of random numbers: each part of a tour has its own, so that one can change without the others.
-_PLAN, _HEIGHT, _LOOKS, _THINGS, _SHIFTS = range(5)
+_DARK = [*[0.0] * 6, 1.0, 0.0]  # a light that is none, see ``Furnished.lights``
 # A doorway lets see at most what its opening and its frame enclose, and a bit more [m].
 _FRAME = 0.12
 _SHADOWLESS = ("window", "picture", "clock", "skirting")  # flat on the wall
@@ -51,21 +50,16 @@ def make_tour(seed: int, style: str = "home") -> Tour:
     if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
         raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
     chosen = style_of(style)
-
-    def stream(number: int) -> np.random.Generator:
-        return np.random.default_rng([seed, number])
-
-    rooms, doors = lay_out(chosen, stream(_PLAN))
+    # Each part of a tour has its own random numbers, so that one can change without the others.
+    plan, height, looks, things, shifts = (np.random.default_rng([seed, number]) for number in range(5))
+    rooms, doors = lay_out(chosen, plan)
     routes = ways(rooms, doors)
-    parts, lights = _fill(rooms, doors, np.concatenate(routes), stream(_LOOKS), stream(_THINGS))
-    table = surfaces(parts, stream(_SHIFTS))
+    parts, lights = _fill(rooms, doors, np.concatenate(routes), looks, things)
+    table = surfaces(parts, shifts)
     corners = torch.tensor(np.array([room.box for room in rooms]))
     openings = [door.box(_FRAME, door.thickness / 2 + _FRAME, _FRAME, _FRAME) for door in doors]
-    dark = Light(np.zeros(3), np.zeros(3), 1.0, 0.0)
-    lights = [[*of_room, *[dark] * (LIGHTS - len(of_room))] for of_room in lights]
-    rows = [[[*light.position, *light.color, light.reach] for light in of_room] for of_room in lights]
-    light_table = torch.tensor(rows, dtype=torch.float32)
-    sizes = torch.tensor([[light.size for light in of_room] for of_room in lights])
+    rows = torch.tensor([[*own, *[_DARK] * (LIGHTS - len(own))] for own in lights], dtype=torch.float32)
+    light_table, sizes = rows[..., :7].contiguous(), rows[..., 7]
     casts = torch.tensor([p.kind != QUAD and p.finish.glow == 0 and p.label not in _SHADOWLESS for p in parts])
     return Tour(
         seed=seed,
@@ -77,16 +71,16 @@ def make_tour(seed: int, style: str = "home") -> Tour:
         volumes=light_volumes(corners, table, light_table, sizes, casts),
         noise=noise_table(),
         ways=tuple(torch.from_numpy(way) for way in routes),
-        camera_height=float(stream(_HEIGHT).uniform(*chosen.camera_height)),
+        camera_height=float(height.uniform(*chosen.camera_height)),
     )
 
 
 def _fill(
     rooms: list[Room], doors: list[Door], way: Array, looks: np.random.Generator, things: np.random.Generator
-) -> tuple[list[Part], list[list[Light]]]:
+) -> tuple[list[Part], list[list[list[float]]]]:
     """All primitives, and the lights of each room."""
     parts: list[Part] = []
-    lights: list[list[Light]] = []
+    lights: list[list[list[float]]] = []
     palettes = [Palette(room.style, looks) for room in rooms]
     for index, room in enumerate(rooms):
         own = [door for door in doors if index in door.rooms]
