@@ -147,10 +147,10 @@ def write_tartanair(root, frames=6):
     return path, scene
 
 
-def write_generic(root, frames=6, folder="walk"):
+def write_generic(root, frames=6, folder="walk", size=SIZE):
     """``images/N.png depth/N.png K.txt poses.txt``: numbers without leading zeros, one 4x4 pose in a line."""
     path = root / folder
-    scene = truth(resized(500, 510, 310, 245, (480, 640)), frames)
+    scene = truth(resized(500, 510, 310, 245, (480, 640), size), frames, size)
     for i in range(frames):
         write_image(path / "images" / f"{i + 7}.png", scene.images[i])
         write_depth_png(path / "depth" / f"{i + 7}.png", scene.depths[i], 1000)

@@ -92,20 +92,24 @@ def test_depth_ten_times_too_large(tour, capsys):
     assert command(capsys, tour, "--pairs", 2, "--truth-scale", 0.1)[0] == 0
 
 
-def test_depth_in_smaller_units_than_metres_can_say(tour):
-    """Depth a tenth as large would need 10 m per unit; only positions can be changed."""
-    spoil_depth(tour, lambda depth: depth / 10)
-    result = check_data(tour, pairs=2)
-    assert result.remedies[0].startswith("divide the positions of the poses by ")
-    assert float(result.remedies[0].split()[-1]) == pytest.approx(10, rel=0.1)
+def shrink_positions(path):
+    spoil_poses(path, lambda T: np.concatenate([T[..., :3], T[..., 3:] * [[0.2], [0.2], [0.2], [1]]], axis=-1))
 
 
-def test_a_trajectory_without_scale(tour):
-    spoil_poses(tour, lambda T: np.concatenate([T[..., :3], T[..., 3:] * [[0.2], [0.2], [0.2], [1]]], axis=-1))
-    result = check_data(tour, pairs=2, trajectory="poses.txt")
-    assert "depth looks too large" in result.problems[0]
-    assert result.remedies[0].startswith("a single camera's trajectory has no scale: divide the positions")
-    assert float(result.remedies[0].split()[-1]) == pytest.approx(0.2, rel=0.1)
+@pytest.mark.parametrize(
+    ("spoil", "options", "remedy", "factor"),
+    [
+        # Depth a tenth as large would need 10 m per unit; only positions can be changed.
+        (lambda path: spoil_depth(path, lambda depth: depth / 10), {}, "divide the positions of the poses by ", 10),
+        (shrink_positions, {"trajectory": "poses.txt"}, "a single camera's trajectory has no scale: divide the p", 0.2),
+    ],
+)
+def test_positions_that_cannot_be_mended_by_the_depths_scale(tour, spoil, options, remedy, factor):
+    spoil(tour)
+    result = check_data(tour, pairs=2, **options)
+    assert "depth looks too" in result.problems[0]
+    assert result.remedies[0].startswith(remedy)
+    assert float(result.remedies[0].split()[-1]) == pytest.approx(factor, rel=0.1)
 
 
 def test_unregistered_depth(tour):
@@ -203,13 +207,7 @@ def test_the_shared_recordings_are_right(name, layout, frames, worst):
 
 def write_page_files(folder):
     """Write the files that docs/data.md calls walk, scans, slam.txt and KITTI-360."""
-    K = layouts.resized(500, 500, 320, 240, (480, 640), SIZE)
-    truth = layouts.truth(K, 12, SIZE)
-    for i in range(12):
-        layouts.write_image(folder / "walk" / "images" / f"{i}.png", truth.images[i])
-        layouts.write_depth_png(folder / "walk" / "depth" / f"{i}.png", truth.depths[i], 1000)
-    np.savetxt(folder / "walk" / "K.txt", K)
-    np.savetxt(folder / "walk" / "poses.txt", [T.ravel() for T in truth.T_world_cam])
+    layouts.write_generic(folder, 12, size=SIZE)
     _, _, scannet = layouts.write_scannet(folder / "scans", frames=7)
     lines = [f"{i} {layouts.quaternion_line(T)}" for i, T in enumerate(scannet.T_world_cam)]
     (folder / "slam.txt").write_text("\n".join(lines))

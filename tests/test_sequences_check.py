@@ -14,8 +14,6 @@ from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.poses import OURS
 
-SIZE = (120, 160)
-
 
 def with_poses(sequence, convert):
     entries = tuple(dataclasses.replace(e, T_world_cam=convert(e.T_world_cam)) for e in sequence.entries)
@@ -25,15 +23,7 @@ def with_poses(sequence, convert):
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
     """A rendered walk of 20 frames in the generic layout, 160x120."""
-    path = tmp_path_factory.mktemp("walk")
-    K = layouts.resized(500, 500, 320, 240, (480, 640), SIZE)
-    truth = layouts.truth(K, 20, SIZE)
-    for i in range(20):
-        layouts.write_image(path / "images" / f"{i}.png", truth.images[i])
-        layouts.write_depth_png(path / "depth" / f"{i}.png", truth.depths[i], 1000)
-    np.savetxt(path / "K.txt", K)
-    np.savetxt(path / "poses.txt", [T.ravel() for T in truth.T_world_cam])
-    return path
+    return layouts.write_generic(tmp_path_factory.mktemp("data"), 20, size=(120, 160))[0]
 
 
 def test_nonsense_poses_fit_no_reading(walk):

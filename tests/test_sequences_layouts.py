@@ -6,6 +6,7 @@ import pickle
 import shutil
 
 import layouts
+import layouts_more
 import numpy as np
 import pytest
 from layouts import truncate, write_depth_png, write_image
@@ -68,17 +69,6 @@ def test_seven_scenes_registers_depth_to_colour(tmp_path):
         assert 0.65 < valid.mean() < 0.9  # the colour camera sees further to all sides: (525 / 585)^2 = 0.8
 
 
-def test_seven_scenes_unregistered(tmp_path):
-    path, of_color, of_depth = layouts.write_seven_scenes(tmp_path)
-    sequence = open_sequence(path, register=False)
-    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K, atol=1e-12)
-    np.testing.assert_allclose(sequence.intrinsics, of_color.K, atol=1e-12)
-    for i, frame in enumerate(sequence):
-        np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i], atol=1e-12)
-        np.testing.assert_allclose(frame.depth, of_depth.depths[i], atol=5e-4 + 1e-6)
-        np.testing.assert_allclose(frame.depth_intrinsics, of_depth.K, atol=1e-12)
-
-
 def test_register_depth_closed_form():
     K = np.array([[10.0, 0, 2], [0, 10.0, 1], [0, 0, 1]])
     T = np.eye(4)
@@ -94,25 +84,37 @@ def test_register_depth_closed_form():
     np.testing.assert_array_equal(register_depth(np.zeros((3, 5)), K, K, T, (2, 2)), np.zeros((2, 2)))
 
 
-# ---- ScanNet
+# ---- depth maps with a camera of their own
 
 
-def test_scannet(tmp_path):
-    path, of_color, of_depth = layouts.write_scannet(tmp_path, frames=11)
-    sequence = open_sequence(path)
-    assert sequence.layout == "scannet"
-    assert sequence.names == tuple(str(i) for i in range(11))  # 10 after 9
-    np.testing.assert_allclose(sequence.intrinsics, of_color.K, atol=1e-12)
-    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K, atol=1e-12)
-    for i in (0, 5, 10):
-        frame = sequence[i]
-        assert (frame.image.shape, frame.depth.shape) == ((121, 162, 3), (48, 64))
+OWN_DEPTH = {
+    "7scenes": (layouts.write_seven_scenes, {"register": False}),
+    "scannet": (layouts.write_scannet, {}),
+    "sens": (lambda root, frames: layouts_more.write_sens(root / "a.sens", frames), {}),
+}
+
+
+@pytest.mark.parametrize("layout", OWN_DEPTH)
+def test_depth_has_a_camera_of_its_own(tmp_path, layout):
+    write, options = OWN_DEPTH[layout]
+    path, of_color, of_depth = write(tmp_path, frames=11)
+    sequence = open_sequence(path, **options)
+    assert (sequence.layout, sequence.depth_size) == (layout, layouts.SIZE)
+    assert sequence.image_size == of_color.images[0].shape[:2]
+    assert [int(name.split("-")[-1]) for name in sequence.names] == list(range(11))  # 10 after 9
+    np.testing.assert_allclose(sequence.intrinsics, of_color.K, rtol=1e-6)
+    for i, frame in enumerate(sequence):
+        np.testing.assert_allclose(frame.depth_intrinsics, of_depth.K, rtol=1e-6)  # float32 in .sens
         np.testing.assert_allclose(frame.depth, of_depth.depths[i], atol=5e-4 + 1e-6)
-        np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i], atol=1e-12)
+        np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i], atol=1e-6)
         # JPEG keeps a smoothed image of the cells, with its noise
         difference = np.abs(frame.image.astype(int) - of_color.images[i]).mean()
         other = np.abs(frame.image.astype(int) - of_color.images[(i + 5) % 11]).mean()
         assert difference < 0.5 * other
+    of_lens = open_sequence(path, distortion=(0.2, -0.3, 0, 0), **options)[5]  # the colour camera's
+    assert (of_lens.image != sequence[5].image).any()
+    np.testing.assert_array_equal(of_lens.depth, sequence[5].depth)
+    np.testing.assert_array_equal(of_lens.depth_intrinsics, sequence[5].depth_intrinsics)
 
 
 def test_scannet_resized_export_keeps_the_original_intrinsics_file(tmp_path):

@@ -43,22 +43,12 @@ def frame_offsets(path):
     return result
 
 
-def test_what_is_read_is_what_was_written(written):
-    path, of_color, of_depth = written
-    sequence = open_sequence(path)
+def test_times_and_frames_that_were_not_tracked(written):
+    sequence = open_sequence(written[0])
     assert (sequence.layout, sequence.name) == ("sens", "scene0000_00")
     assert sequence.names == ("0", "1", "3", "4", "5")
     assert [(f.name, f.reason) for f in sequence.skipped] == [("2", "non-finite pose")]
-    assert (sequence.image_size, sequence.depth_size) == ((121, 162), (48, 64))
-    np.testing.assert_allclose(sequence.intrinsics, of_color.K, rtol=1e-6)  # float32
-    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K, rtol=1e-6)
-    for frame in sequence:
-        i = int(frame.name)
-        np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i], atol=1e-6)
-        np.testing.assert_allclose(frame.depth, of_depth.depths[i], atol=5e-4 + 1e-6)
-        assert np.abs(frame.image.astype(int) - of_color.images[i]).mean() < 4  # JPEG
-        assert frame.timestamp == pytest.approx(10 + i / 30, abs=1e-6)
-        assert frame.depth.dtype == np.float32
+    assert [frame.timestamp for frame in sequence] == pytest.approx([10 + i / 30 for i in (0, 1, 3, 4, 5)], abs=1e-6)
 
 
 def test_a_folder_that_holds_one(written, tmp_path):

@@ -73,8 +73,6 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
         FileNotFoundError: no such path.
         ValueError: ``pairs`` is not positive.
     """
-    if pairs < 1:
-        raise ValueError(f"pairs must be at least 1, got {pairs}")
     if not str(path).startswith("tour:") and not Path(path).exists():
         raise FileNotFoundError(f"no such file or folder: {path}")
     try:

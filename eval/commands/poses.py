@@ -23,7 +23,7 @@ from ufmstar_torch.eval.reconstruct.reconstruct import (
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError, output_folder
 from ufmstar_torch.eval.run.machine import available_cores
-from ufmstar_torch.eval.sequences.frame import check_intrinsics, parse_slice
+from ufmstar_torch.eval.sequences.frame import parse_slice
 from ufmstar_torch.eval.sequences.generic import INTRINSICS, open_images
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics, read_intrinsics
 from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
@@ -178,10 +178,7 @@ def _lens(options: PosesOptions, root: Path, size: tuple[int, int]) -> Any:
         source = next((str(root / name) for name in INTRINSICS if (root / name).is_file()), None)
     if source is None:
         return None
-    K = read_intrinsics(source)
-    check_intrinsics("intrinsics", K, size)
-    coefficients, fisheye = parse_distortion(options.distortion)
-    return Lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), size, coefficients, fisheye)
+    return Lens.of(read_intrinsics(source), size, *parse_distortion(options.distortion))
 
 
 def _report(found: dict[str, Any], out: Path) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -134,10 +135,8 @@ def scale_model(
         return {"scale_from": "length", "metres_per_unit": metres}
     if trajectory is None:
         return {"scale_from": None}
-    known = attach(images, trajectory, options or Options())
-    position = {
-        f.name: f.T_world_cam[:3, 3] for f in known if isinstance(f, Entry) and np.isfinite(f.T_world_cam).all()
-    }
+    known = (f for f in attach(images, trajectory, options or Options()) if isinstance(f, Entry))
+    position = {frame.name: frame.T_world_cam[:3, 3] for frame in known if np.isfinite(frame.T_world_cam).all()}
     centres = {Path(i.name).stem: i.projection_center() for i in model.images.values()}
     both = sorted(position.keys() & centres.keys())
     pairs = (np.array([values[name] for name in both]).reshape(-1, 3) for values in (centres, position))
@@ -172,13 +171,8 @@ def landmarks(model: Any) -> tuple[np.ndarray, np.ndarray]:
 def gaps(keyframes: Sequence[str], model: Any) -> list[tuple[str, str]]:
     """The first and last name of each run of keyframes without a pose in a model."""
     posed = {Path(image.name).stem for image in model.images.values()}
-    result: list[tuple[str, str]] = []
-    before = True
-    for name in keyframes:
-        if name not in posed:
-            result = [*result, (name, name)] if before else [*result[:-1], (result[-1][0], name)]
-        before = name in posed
-    return result
+    runs = [list(run) for has_pose, run in groupby(keyframes, posed.__contains__) if not has_pose]
+    return [(run[0], run[-1]) for run in runs]
 
 
 # A known point is the nearest landmark in its image, at most this share of the image's width away.
@@ -223,9 +217,7 @@ def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarra
     for _ in range(2):
         x, y = source[kept], target[kept]
         if len(x) < 3:
-            raise ValueError(
-                f"--trajectory: {len(x)} keyframes have a pose in it and in the model, at least 3 are needed"
-            )
+            raise ValueError(f"--trajectory: {len(x)} keyframes have a pose there and in the model, 3 are needed")
         dx, dy = x - x.mean(0), y - y.mean(0)
         variance = float(np.square(dx).sum())
         if variance <= 0 or not np.square(dy).sum() > 0:

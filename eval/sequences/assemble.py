@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import attach, number_times
-from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, check_intrinsics, make_sequence
 from ufmstar_torch.eval.sequences.images import first_depth_size
 from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
@@ -58,13 +58,14 @@ def assemble(
         frames = attach(number_times(frames, options.fps), read_trajectory(resolve(root, options.trajectory)), options)
     elif own is not None:
         frames = attach(frames, own(), options)
+    several = isinstance(lenses, Mapping)
     if isinstance(lenses, Mapping):
         lens_of = {frame.name: _lens(lenses[frame.name], size, options) for frame in frames if isinstance(frame, Entry)}
-        frames = [_with_camera(frame, lens_of) for frame in frames]
-        first = next(iter(lens_of.values()), Lens((1.0, 1.0, 0.0, 0.0), (1, 1)))
     else:
-        first = _lens(lenses, size, options)
-        lens_of = dict.fromkeys((frame.name for frame in frames), first)
+        lens_of = dict.fromkeys((frame.name for frame in frames), _lens(lenses, size, options))
+    for lens in set(lens_of.values()):
+        check_intrinsics("intrinsics", pinhole(*lens.intrinsics), lens.size)
+    first = next(iter(lens_of.values()), Lens((1.0, 1.0, 0.0, 0.0), (1, 1)))
     sequence = make_sequence(
         name or (path.resolve().name if path.is_dir() else path.stem),
         layout,
@@ -76,34 +77,26 @@ def assemble(
         posed=posed,
         metric=metric or options.trajectory is not None,
     )
-    return undistort(sequence, lambda entry: lens_of[entry.name])
+    return undistort(sequence, lambda entry: lens_of[entry.name], several)
 
 
-def undistort(sequence: FrameSequence, lens_of: Callable[[Entry], Lens]) -> FrameSequence:
-    """The sequence with the images that its lenses made undistorted; depth maps without a camera of their own too.
-    Raises ValueError: no lens has these coefficients."""
+def undistort(sequence: FrameSequence, lens_of: Callable[[Entry], Lens], several: bool) -> FrameSequence:
+    """The sequence without the distortion of its lenses (``several``: more than one), also in depth maps that have no
+    camera of their own. Raises ValueError: no lens has these coefficients."""
+    own, size = sequence.depth_intrinsics, sequence.depth_size
 
     def K_depth(lens: Lens) -> np.ndarray | None:
-        if sequence.depth_intrinsics is not None or sequence.depth_size in (None, lens.size):
-            return sequence.depth_intrinsics
-        return scale_intrinsics(lens.K, lens.size, sequence.depth_size)
+        return own if own is not None or size in (None, lens.size) else scale_intrinsics(lens.K, lens.size, size)
 
-    depth_size = None if sequence.depth_intrinsics is not None else sequence.depth_size
-    entries = []
-    for entry in sequence.entries:
+    def seen(entry: Entry) -> Entry:
         lens = lens_of(entry)
-        seen = lens.see(entry, depth_size)
-        own = seen.intrinsics is not None
-        entries.append(replace(seen, intrinsics=lens.K, depth_intrinsics=K_depth(lens)) if own else seen)
+        entry = lens.see(entry, size if own is None else None)
+        if not several:
+            return entry
+        return replace(entry, intrinsics=lens.K, image_size=lens.size, depth_intrinsics=K_depth(lens))
+
     first = lens_of(sequence.entries[0])
-    return replace(sequence, entries=tuple(entries), intrinsics=first.K, depth_intrinsics=K_depth(first))
-
-
-def _with_camera(frame: Entry | Skipped, lens_of: Mapping[str, Lens]) -> Entry | Skipped:
-    if isinstance(frame, Skipped):
-        return frame
-    lens = lens_of[frame.name]
-    return replace(frame, intrinsics=pinhole(*lens.intrinsics), image_size=lens.size)
+    return replace(sequence.changed(seen), intrinsics=first.K, depth_intrinsics=K_depth(first))
 
 
 def _lens(known: Lens | None, size: Size | None, options: Options) -> Lens:

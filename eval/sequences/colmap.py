@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from ufmstar_torch.eval.sequences.generic import depth_folder, listed_times
 from ufmstar_torch.eval.sequences.images import depth_loader, natural_key
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options, resolve
-from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_quaternions
+from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_columns
 
 LOOKED_FOR = "cameras and images (.bin or .txt) in sparse/0/, sparse/ or the folder itself"
 SCALE_FILE, MODEL = "poses.json", "sparse/0"
@@ -35,7 +36,6 @@ _MODELS: tuple[tuple[str, int, int | None], ...] = (
     *(("OPENCV_FISHEYE", 2, 4), ("FULL_OPENCV", 2, 8), ("FOV", 2, None), ("SIMPLE_RADIAL_FISHEYE", 1, 1)),
     *(("RADIAL_FISHEYE", 1, 2), ("THIN_PRISM_FISHEYE", 2, None)),
 )
-_NORM_TOLERANCE = 0.02  # of a quaternion
 _NO_POINT = 2**64 - 1
 
 
@@ -118,10 +118,9 @@ def _metric(root: Path) -> bool:
 
 def _pose(view: _View, model: Path) -> np.ndarray:
     """[4, 4] camera-to-world, NaN where it is not finite."""
-    quaternion, position = np.array(view.pose[:4]), np.array(view.pose[4:])
-    if np.isfinite(view.pose).all() and abs(np.linalg.norm(quaternion) - 1) > _NORM_TOLERANCE:
-        raise ValueError(f"{model}: the quaternion of image {view.name!r} is {quaternion}, expected a norm of 1")
-    return np.asarray(np.linalg.inv(poses_from_quaternions(position[None], np.roll(quaternion, -1)[None])[0]))
+    qw, *quaternion = view.pose[:4]
+    values = np.array([[*view.pose[4:], *quaternion, qw]])
+    return np.asarray(np.linalg.inv(poses_from_columns(values, [f"{model}: image {view.name!r}"])[0]))
 
 
 def _lens(file: Path, model: str, size: tuple[int, int], values: tuple[float, ...]) -> Lens:
@@ -139,30 +138,17 @@ def _lens(file: Path, model: str, size: tuple[int, int], values: tuple[float, ..
     return Lens((fx, fy, cx - 0.5, cy - 0.5), (size[1], size[0]), coefficients, "FISHEYE" in model)
 
 
-class _Bytes:
-    """The values of a binary file, one after the other. Raises ValueError: the file ends before."""
+def _values_of(file: Path) -> Callable[[str], tuple[Any, ...]]:
+    """The next values of a binary file, by a format of ``struct``. Raises ValueError: the file ends before them."""
+    stored = BytesIO(file.read_bytes())
 
-    def __init__(self, file: Path) -> None:
-        self.file, self.data, self.at = file, file.read_bytes(), 0
+    def take(form: str) -> tuple[Any, ...]:
+        try:
+            return struct.unpack(f"<{form}", stored.read(struct.calcsize(f"<{form}")))
+        except struct.error:
+            raise ValueError(f"{file} is truncated or damaged at byte {stored.tell():,}") from None
 
-    def take(self, form: str) -> tuple[Any, ...]:
-        """The values of a format of ``struct``."""
-        return struct.unpack("<" + form, self.bytes(struct.calcsize("<" + form)))
-
-    def bytes(self, size: int) -> bytes:
-        """The next bytes as they are."""
-        if self.at + size > len(self.data):
-            raise ValueError(f"{self.file} is truncated: {len(self.data):,} bytes, more are stated")
-        self.at += size
-        return self.data[self.at - size : self.at]
-
-    def text(self) -> str:
-        """Up to a zero."""
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
-            raise ValueError(f"{self.file} is truncated within an image's name")
-        self.at, start = end + 1, self.at
-        return self.data[start:end].decode()
+    return take
 
 
 def _cameras(file: Path) -> dict[int, Lens]:
@@ -173,13 +159,13 @@ def _cameras(file: Path) -> dict[int, Lens]:
                 key, width, height, *values = _numbers([words[0], *words[2:]], file, number, whole=3)
                 cameras[int(key)] = _lens(file, words[1], (int(width), int(height)), tuple(values))
         return cameras
-    stored, cameras = _Bytes(file), {}
-    for _ in range(stored.take("Q")[0]):
-        key, model, width, height = stored.take("IiQQ")
+    take, cameras = _values_of(file), {}
+    for _ in range(take("Q")[0]):
+        key, model, width, height = take("IiQQ")
         if not 0 <= model < len(_MODELS):
             raise ValueError(f"{file}: unknown camera model {model}")
         name, focal, count = _MODELS[model]
-        cameras[key] = _lens(file, name, (width, height), stored.take(f"{focal + 2 + (count or 0)}d"))
+        cameras[key] = _lens(file, name, (width, height), take(f"{focal + 2 + (count or 0)}d"))
     return cameras
 
 
@@ -187,11 +173,12 @@ def _views(file: Path) -> Iterator[_View]:
     if file.suffix == ".txt":
         yield from _views_of_text(file)
         return
-    stored = _Bytes(file)
-    for _ in range(stored.take("Q")[0]):
-        _, *pose, camera = stored.take("I7dI")
-        name, count = stored.text(), stored.take("Q")[0]
-        points = np.frombuffer(stored.bytes(24 * count), "<u8")[2::3]  # x, y and the point's id
+    take = _values_of(file)
+    for _ in range(take("Q")[0]):
+        _, *pose, camera = take("I7dI")
+        name = b"".join(iter(lambda: take("c")[0], b"\0")).decode()
+        stored = take(f"{24 * take('Q')[0]}s")[0]
+        points = np.frombuffer(stored, "<u8")[2::3]  # x, y and the point's id
         yield _View(name, camera, tuple(pose), points[points != _NO_POINT].astype(np.int64))
 
 
@@ -221,10 +208,10 @@ def _points(file: Path) -> dict[int, np.ndarray]:
                 key, *position = _numbers(words[:4], file, number, whole=1)
                 points[int(key)] = np.array([*position, np.nan, np.nan, np.nan])[:3]
         return points
-    stored = _Bytes(file)
-    for _ in range(stored.take("Q")[0]):
-        key, x, y, z, *_, length = stored.take("Q3d3BdQ")
-        stored.bytes(8 * length)
+    take = _values_of(file)
+    for _ in range(take("Q")[0]):
+        key, x, y, z, *_, length = take("Q3d3BdQ")
+        take(f"{8 * length}s")
         points[key] = np.array([x, y, z])
     return points
 

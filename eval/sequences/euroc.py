@@ -21,7 +21,7 @@ from ufmstar_torch.eval.sequences.frame import FrameSequence, Size
 from ufmstar_torch.eval.sequences.images import first_image_size
 from ufmstar_torch.eval.sequences.lens import FISHEYE, Lens
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import csv_numbers, csv_rows, read_matrix, trajectory_of
+from ufmstar_torch.eval.sequences.poses import csv_rows, number, read_matrix, trajectory_of
 from ufmstar_torch.trajectory import Trajectory
 
 LOOKED_FOR = "mav0/cam0/data.csv and sensor.yaml (also in mav0, or in a camera's folder itself)"
@@ -45,7 +45,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     images, frames = [], []
     for words, where in csv_rows(folder / "data.csv"):
         images.append(folder / "data" / (words[1] if len(words) > 1 else f"{words[0]}.png"))
-        time = csv_numbers(words[:1], where)[0] * _NANOSECOND
+        time = number(words[0], where) * _NANOSECOND
         frames.append(frame_of_image(images[-1].stem, images[-1], timestamp=time))
     lens = _lens(folder / "sensor.yaml", first_image_size(images))
     name = folder.parent.parent.resolve().name if folder.parent.name == "mav0" else folder.resolve().name

@@ -117,6 +117,10 @@ class FrameSequence:
         """Names of the frames that have a pose but no depth map."""
         return tuple(entry.name for entry in self.entries if entry.load_depth is None)
 
+    def changed(self, change: Callable[[Entry], Entry]) -> FrameSequence:
+        """The sequence with changed entries."""
+        return replace(self, entries=tuple(map(change, self.entries)))
+
     def __len__(self) -> int:
         return len(self.entries)
 

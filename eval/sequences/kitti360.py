@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.eval.sequences.assemble import assemble
 from ufmstar_torch.eval.sequences.attach import UNKNOWN, frame_of_image, pair_depth
-from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence, Size, Skipped
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, Skipped
 from ufmstar_torch.eval.sequences.ground_truth import project
 from ufmstar_torch.eval.sequences.images import depth_loader, first_image_size, list_files
 from ufmstar_torch.eval.sequences.lens import Lens
@@ -121,18 +121,12 @@ def _drive(path: Path, drive: str | int | None) -> Path:
         if drive is not None:
             raise ValueError(f"drive goes with the dataset's root, which holds {_RAW}; {path} does not")
         return path
-    number = int(drive) if drive is not None and str(drive).isdecimal() else -1
-    fitting = [d for d in parts(path) if drive is None or str(drive) == d.name or number == _number(d)]
+    number = rf"drive_0*{int(drive)}(?!\d)" if drive is not None and str(drive).isdecimal() else "$^"
+    fitting = [d for d in parts(path) if drive is None or str(drive) == d.name or re.search(number, d.name)]
     if len(fitting) != 1:
         known = [d.name for d in parts(path)]
         raise ValueError(f"{path}: drive must name one of {known}, by name or number: {drive!r}")
     return fitting[0]
-
-
-def _number(drive: Path) -> int | None:
-    """The number behind "drive_" in a drive's name."""
-    found = re.search(r"drive_(\d+)", drive.name)
-    return int(found[1]) if found else None
 
 
 def _times(path: Path, numbers: list[int]) -> Sequence[float | None]:
@@ -175,11 +169,12 @@ def _with_laser(
     assert sequence.image_size is not None
     T_cam_laser = _T_rect_laser(calibration, camera)
     laser = _Laser(scans, poses, T_cam_laser, sequence.intrinsics, sequence.image_size, options.scans or 0)
-    entries = tuple(
-        replace(entry, load_depth=partial(laser.depth, int(entry.name))) if laser.sees(int(entry.name)) else entry
-        for entry in sequence.entries
-    )
-    return replace(sequence, entries=entries, depth_intrinsics=None, depth_size=sequence.image_size)
+
+    def with_depth(entry: Entry) -> Entry:
+        number = int(entry.name)
+        return replace(entry, load_depth=partial(laser.depth, number)) if laser.sees(number) else entry
+
+    return replace(sequence.changed(with_depth), depth_size=sequence.image_size)
 
 
 @dataclass(frozen=True, eq=False)

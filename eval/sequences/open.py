@@ -80,21 +80,17 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
                 raise ValueError(f"distortion: the reader {layout!r} does not state the images' size")
             return Lens.of(sequence.intrinsics_of(entry), size, coefficients, fisheye)
 
-        sequence = undistort(sequence, lens_of)
+        sequence = undistort(sequence, lens_of, several=True)
     sequence = convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), poses)
     if chosen.max_truth is not None:
-        entries = []
-        for entry in sequence.entries:
-            load_depth = entry.load_depth and partial(within, entry.load_depth, chosen.max_truth)
-            entries.append(replace(entry, load_depth=load_depth))
-        sequence = replace(sequence, entries=tuple(entries))
+        sequence = sequence.changed(partial(_within, most=chosen.max_truth))
     return sequence if chosen.pose_scale is None else scale_poses(sequence, chosen.pose_scale)
 
 
 def scale_poses(sequence: FrameSequence, metres: float) -> FrameSequence:
     """The sequence with positions in metres, of which a unit of its poses has ``metres``."""
-    scaled = tuple(replace(entry, T_world_cam=in_metres(entry.T_world_cam, metres)) for entry in sequence.entries)
-    return replace(sequence, entries=scaled, metric=True, pose_scale=metres * sequence.pose_scale)
+    scaled = sequence.changed(lambda entry: replace(entry, T_world_cam=in_metres(entry.T_world_cam, metres)))
+    return replace(scaled, metric=True, pose_scale=metres * sequence.pose_scale)
 
 
 def convert_poses(sequence: FrameSequence, convention: str) -> FrameSequence:
@@ -105,4 +101,8 @@ def convert_poses(sequence: FrameSequence, convention: str) -> FrameSequence:
     if not sequence.posed:
         raise ValueError(f"sequence {sequence.name!r} has no poses to convert from {convention}")
     convert = CONVENTIONS[convention].convert
-    return replace(sequence, entries=tuple(replace(e, T_world_cam=convert(e.T_world_cam)) for e in sequence.entries))
+    return sequence.changed(lambda entry: replace(entry, T_world_cam=convert(entry.T_world_cam)))
+
+
+def _within(entry: Entry, most: float) -> Entry:
+    return replace(entry, load_depth=entry.load_depth and partial(within, entry.load_depth, most))

@@ -99,7 +99,7 @@ def parse_pose(text: str, where: str) -> tuple[float, np.ndarray] | None:
     tokens = _tokens(text)
     if not tokens:
         return None
-    row = np.array([_number(token, where) for token in tokens])
+    row = np.array([number(token, where) for token in tokens])
     if len(row) not in (8, 13, 17) or not np.isfinite(row[0]):
         raise ValueError(f"{where}: expected a timestamp and a pose of 7, 12 or 16 numbers, got {text.strip()!r:.60}")
     return float(row[0]), poses_from_columns(row[None, 1:], [where])[0]
@@ -175,20 +175,12 @@ def numbered_lines(path: str | Path) -> list[tuple[int, str]]:
 def csv_rows(path: str | Path) -> list[tuple[list[str], str]]:
     """The words of each line that has any, and FILE:LINE of each, of a table with commas; ``#`` starts a comment line.
     Raises ValueError: it is no text file."""
-    lines = ((text.strip(), f"{path}:{number}") for number, text in numbered_lines(path))
+    lines = ((text.strip(), f"{path}:{line}") for line, text in numbered_lines(path))
     return [
         ([word.strip() for word in text.replace(";", ",").split(",")], where)
         for text, where in lines
         if text and not text.startswith("#")
     ]
-
-
-def csv_numbers(words: list[str], where: str) -> list[float]:
-    """The words of :func:`csv_rows` as numbers. Raises ValueError: one is none."""
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        raise ValueError(f"{where}: expected numbers separated by commas, got {','.join(words)[:60]!r}") from None
 
 
 def poses_from_columns(values: np.ndarray, lines: list[str]) -> np.ndarray:
@@ -234,10 +226,10 @@ def _numbers(path: str | Path, commas: bool = False) -> tuple[list[list[float]],
     """The numbers of each line that has any, and FILE:LINE of each; a ``#`` inside a token (Windows' 1.#IND) starts no
     comment."""
     rows, lines = [], []
-    for number, text in numbered_lines(path):
-        tokens, where = _tokens(re.sub("[,;]", " ", text) if commas else text), f"{path}:{number}"
+    for line, text in numbered_lines(path):
+        tokens, where = _tokens(re.sub("[,;]", " ", text) if commas else text), f"{path}:{line}"
         if tokens:
-            rows.append([_number(token, where) for token in tokens])
+            rows.append([number(token, where) for token in tokens])
             lines.append(where)
     return rows, lines
 
@@ -247,10 +239,11 @@ def _tokens(text: str) -> list[str]:
     return re.split(r"(?:^|\s)#", text, maxsplit=1)[0].split()
 
 
-def _number(token: str, where: str) -> float:
-    if _WINDOWS_NON_FINITE.fullmatch(token):
+def number(word: str, where: str) -> float:
+    """A word as a number, NaN as Windows writes it too. Raises ValueError: it is none; ``where`` names the line."""
+    if _WINDOWS_NON_FINITE.fullmatch(word):
         return float("nan")
     try:
-        return float(token)
+        return float(word)
     except ValueError:
-        raise ValueError(f"{where}: expected a number, got {token[:60]!r}") from None
+        raise ValueError(f"{where}: expected a number, got {word[:60]!r}") from None

@@ -18,7 +18,7 @@ from ufmstar_torch.eval.sequences.images import read_color, read_depth
 from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
 from ufmstar_torch.eval.sequences.lens import Lens
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import csv_numbers, csv_rows, poses_from_columns, read_matrix
+from ufmstar_torch.eval.sequences.poses import csv_rows, number, poses_from_columns, read_matrix
 from ufmstar_torch.eval.sequences.video import Video
 
 _VIDEO, _ODOMETRY, _CAMERA = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
@@ -35,40 +35,35 @@ def detect(path: Path) -> bool:
 def read(path: Path, options: Options) -> FrameSequence:
     """Opens a recording; frames are called by their number. Rows beyond the video's end are skipped. Raises ValueError:
     a malformed file (named by line), no video, or no usable frame."""
-    rows = csv_rows(path / _ODOMETRY)
-    names = [word.lower() for word in rows[0][0]] if rows else []
+    (names, _), *rows = csv_rows(path / _ODOMETRY) or [([], "")]
+    names = [name.lower() for name in names]
     if missing := [name for name in _COLUMNS if name not in names]:
         found = ", ".join(names)[:99]
         raise ValueError(f"{path / _ODOMETRY}: the first line must name the column {missing[0]!r}, got {found!r}")
-    lines = [where for _, where in rows[1:]]
-    for words, where in rows[1:]:
-        if len(words) != len(names):
-            raise ValueError(f"{where}: expected {len(names)} numbers as in the first line, got {len(words)}")
-    table = np.array([csv_numbers(*row) for row in rows[1:]], dtype=np.float64).reshape(-1, len(names))
-    column = {name: table[:, names.index(name)] for name in names}
-    poses = poses_from_columns(np.stack([column[name] for name in _COLUMNS[2:]], axis=-1), lines)
     video, K = Video(path / _VIDEO), read_matrix(path / _CAMERA, commas=True)
     if K.shape != (3, 3):
         raise ValueError(f"{path / _CAMERA}: expected 3 lines of 3 numbers")
-    own = np.stack([column[name] for name in _FOCAL], axis=-1) if set(_FOCAL) <= set(names) else None
     frames: list[Entry | Skipped] = []
     lenses = {}
-    for row, T in enumerate(poses):
-        number = column["frame"][row]
-        if not (0 <= number < np.inf and number == np.floor(number)):
-            raise ValueError(f"{lines[row]}: the frame must be a number from 0 on, got {number}")
-        if not np.isfinite(column["timestamp"][row]):
-            raise ValueError(f"{lines[row]}: the timestamp must be finite [s], got {column['timestamp'][row]}")
-        name = f"{int(number):06d}"
-        if number >= len(video):
+    for words, where in rows:
+        if len(words) != len(names):
+            raise ValueError(f"{where}: expected {len(names)} numbers as in the first line, got {len(words)}")
+        value = {name: number(word, where) for name, word in zip(names, words, strict=True)}
+        T = poses_from_columns(np.array([[value[name] for name in _COLUMNS[2:]]]), [where])[0]
+        index, time = value["frame"], value["timestamp"]
+        if not (0 <= index < np.inf and index == np.floor(index)):
+            raise ValueError(f"{where}: the frame must be a number from 0 on, got {index}")
+        if not np.isfinite(time):
+            raise ValueError(f"{where}: the timestamp must be finite [s], got {time}")
+        name = f"{int(index):06d}"
+        if index >= len(video):
             frames.append(Skipped(name, "beyond the end of the video"))
             continue
-        fx, fy, cx, cy = pinhole_values(K) if own is None else own[row].tolist()
-        lenses[name] = Lens((fx, fy, cx, cy), video.size)
+        camera = tuple(value[name] for name in _FOCAL) if set(_FOCAL) <= value.keys() else pinhole_values(K)
+        lenses[name] = Lens(camera, video.size)
         file = path / "depth" / f"{name}.png"
         load = partial(_depth, file, path / "confidence" / file.name, options.depth_scale) if file.is_file() else None
-        time = float(column["timestamp"][row])
-        frames.append(Entry(name, T, partial(video.read, int(number)), load, time))
+        frames.append(Entry(name, T, partial(video.read, int(index)), load, time))
     return assemble("stray", path, frames, lenses, options)
 
 
