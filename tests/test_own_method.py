@@ -15,6 +15,7 @@ import pytest
 from ufmstar_torch import cli
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.sequences import find_sequences, open_sequence, plugins
+from ufmstar_torch.eval.sequences.lens import Lens
 
 FOLDER = Path(example.__file__).parent
 PLUGIN = str(FOLDER / "own_method.py")
@@ -58,6 +59,10 @@ def test_the_reader_is_everywhere(walk, tmp_path, capfd):
     sequence = open_sequence(path, plugin=[PLUGIN])
     assert sequence.layout == "npz"
     np.testing.assert_array_equal(sequence[3].image, scene.images[3])
+    lens = Lens.of(scene.K, layouts.SIZE, (0.2, -0.3, 0.0, 0.0))
+    undistorted = open_sequence(path, plugin=[PLUGIN], distortion=(0.2, -0.3, 0, 0))[3]
+    np.testing.assert_allclose(undistorted.intrinsics, lens.K, atol=1e-12)
+    assert (undistorted.image != scene.images[3]).any()
     np.testing.assert_allclose(sequence[3].depth, scene.depths[3], rtol=1e-6)
     assert [one.layout for one in find_sequences(path.parent, plugin=[PLUGIN])] == []  # files are none below a folder
     assert [one.layout for one in find_sequences(path, plugin=[PLUGIN])] == ["npz"]

@@ -165,20 +165,17 @@ def test_the_frame_of_a_pose_can_be_named(tmp_path, capfd):
     assert "--topics /pose=optical" in capfd.readouterr().out
 
 
-def loop(bag):
-    bag.write("/tf_static", written.START, bag.tf(written.START, ("optical", "map", np.eye(4))))
-
-
-def two_parents(bag):
-    bag.write("/tf_static", written.START, bag.tf(written.START, ("map", "optical", np.eye(4))))
+def static(parent, child):
+    """Write a further transform that does not move."""
+    return lambda bag: bag.write("/tf_static", written.START, bag.tf(written.START, (parent, child, np.eye(4))))
 
 
 @pytest.mark.parametrize(
     ("how", "options", "message"),
     [
         ({"poses": ""}, {}, "has no poses: pass trajectory"),
-        ({"poses": "tf", "change": loop}, {}, "are a loop"),
-        ({"poses": "tf", "change": two_parents}, {}, "'optical' has the parents 'base' and 'map'"),
+        ({"poses": "tf", "change": static("optical", "map")}, {}, "are a loop"),
+        ({"poses": "tf", "change": static("map", "optical")}, {}, "'optical' has the parents 'base' and 'map'"),
         ({"camera": {"size": (480, 640)}}, {}, "principal point|do not fit"),
         ({}, {"images": "x"}, "layout 'bag' takes no images"),
     ],

@@ -181,7 +181,7 @@ SPOILED = {
 @pytest.mark.parametrize("layout", SPOILED)
 def test_lost_frames_are_counted_and_shift_no_other(tmp_path, layout):
     spoil, lost, without_depth = SPOILED[layout]
-    path = WRITERS[layout](tmp_path)[0]
+    path = LAYOUTS[layout][0](tmp_path)[0]
     whole = {entry.name: entry.T_world_cam for entry in open_sequence(path).entries}
     spoil(path)
     sequence = open_sequence(path)
@@ -211,39 +211,28 @@ def test_an_image_beyond_tartanairs_poses_is_refused(tmp_path):
         open_sequence(path)
 
 
-WRITERS = {
-    "tum": layouts.write_tum,
-    "7scenes": layouts.write_seven_scenes,
-    "scannet": layouts.write_scannet,
-    "tartanair": layouts.write_tartanair,
-    "generic": layouts.write_generic,
-}
-IMAGES = {
-    "tum": "rgb/10.066667.png",
-    "7scenes": "frame-000002.color.png",
-    "scannet": "color/2.jpg",
-    "tartanair": "image_left/000002_left.png",
-    "generic": "images/9.png",
-}
-DEPTHS = {
-    "tum": "depth/10.071667.png",
-    "7scenes": "frame-000002.depth.png",
-    "scannet": "depth/2.png",
-    "tartanair": "depth_left/000002_left_depth.npy",
-    "generic": "depth/9.png",
+# Writer, and the files of the third frame.
+LAYOUTS = {
+    "tum": (layouts.write_tum, "rgb/10.066667.png", "depth/10.071667.png"),
+    "7scenes": (layouts.write_seven_scenes, "frame-000002.color.png", "frame-000002.depth.png"),
+    "scannet": (layouts.write_scannet, "color/2.jpg", "depth/2.png"),
+    "tartanair": (layouts.write_tartanair, "image_left/000002_left.png", "depth_left/000002_left_depth.npy"),
+    "generic": (layouts.write_generic, "images/9.png", "depth/9.png"),
 }
 
 
-@pytest.mark.parametrize("layout", WRITERS)
-@pytest.mark.parametrize("files", [IMAGES, DEPTHS], ids=["image", "depth"])
-def test_truncated_files_are_found_when_decoding(tmp_path, layout, files):
-    path = WRITERS[layout](tmp_path)[0]
-    truncate(path / files[layout])
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("kind", ["image", "depth"])
+def test_truncated_files_are_found_when_decoding(tmp_path, layout, kind):
+    write, image, depth = LAYOUTS[layout]
+    path = write(tmp_path)[0]
+    file = path / (image if kind == "image" else depth)
+    truncate(file)
     sequence = open_sequence(path)
     assert len(sequence) == 6
     with pytest.raises(FrameError) as caught:
         sequence[2]
-    assert caught.value.path.name == (path / files[layout]).name
+    assert caught.value.path.name == file.name
     errors = []
     readable = list(sequence.readable(errors.append))
     assert [frame.index for frame in readable] == [0, 1, 3, 4, 5]
@@ -252,10 +241,11 @@ def test_truncated_files_are_found_when_decoding(tmp_path, layout, files):
         list(sequence)
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_maps_of_another_size_are_refused(tmp_path, layout):
-    path = WRITERS[layout](tmp_path)[0]
-    image, depth = path / IMAGES[layout], path / DEPTHS[layout]
+    write, *names = LAYOUTS[layout]
+    path = write(tmp_path)[0]
+    image, depth = (path / name for name in names)
     content = image.read_bytes()
     write_image(image, np.zeros((30, 40, 3), np.uint8))
     with pytest.raises(FrameError, match="the image is 40x30, the sequence's are"):
@@ -291,9 +281,9 @@ def test_unknown_and_ambiguous_layouts(tmp_path):
         open_sequence(scannet, "scannet", fps=30)
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_no_frames_at_all(tmp_path, layout):
-    path = WRITERS[layout](tmp_path)[0]
+    path = LAYOUTS[layout][0](tmp_path)[0]
     for file in path.rglob("*"):
         if file.suffix in (".png", ".jpg"):
             file.unlink()
@@ -323,9 +313,9 @@ def test_options_out_of_range(tmp_path, options, message):
         open_sequence(path, **options)
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_frames_are_copies_and_sequences_can_be_sent_to_workers(tmp_path, layout):
-    sequence = open_sequence(WRITERS[layout](tmp_path)[0])
+    sequence = open_sequence(LAYOUTS[layout][0](tmp_path)[0])
     frame = sequence[0]
     frame.T_world_cam[:] = 0
     frame.intrinsics[:] = 0

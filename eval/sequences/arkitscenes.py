@@ -60,7 +60,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         lenses[image.stem] = _lens(cameras[camera_of[number]])
         load_depth = depth_loader(depths[depth_of[number]] if number in depth_of else None, options.depth_scale)
         frames.append(frame_of_image(image.stem, image, load_depth, timestamp=float(times[number])))
-    return assemble("arkitscenes", path, frames, lenses, options, own=partial(_trajectory, root / _POSES))
+    return assemble("arkitscenes", path, frames, lenses, options, read_poses=partial(_trajectory, root / _POSES))
 
 
 def _times(files: list[Path]) -> np.ndarray:

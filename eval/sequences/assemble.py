@@ -27,7 +27,7 @@ def assemble(
     *,
     name: str | None = None,
     size: Size | None = None,
-    own: Callable[[], Trajectory] | None = None,
+    read_poses: Callable[[], Trajectory] | None = None,
     K_depth: np.ndarray | None = None,
     depth_size: Size | None = None,
     posed: bool = True,
@@ -43,7 +43,7 @@ def assemble(
         options: ``trajectory``, ``fps``, ``intrinsics``, ``depth_intrinsics`` and ``distortion`` replace the layout's.
         name: of the sequence; None: that of the path.
         size: (H, W) of the images where they may be resized; None: the lenses'.
-        own: reads the layout's trajectory; None: the frames have poses.
+        read_poses: reads the layout's trajectory; None: the frames have poses.
         K_depth: [3, 3] of the camera of the depth maps [px]; None: they show what the images show.
         depth_size: (H, W) of the depth maps; None: of the first that can be read.
         posed: whether poses are known.
@@ -56,8 +56,8 @@ def assemble(
     if options.trajectory is not None:
         root = path if path.is_dir() else path.parent
         frames = attach(number_times(frames, options.fps), read_trajectory(resolve(root, options.trajectory)), options)
-    elif own is not None:
-        frames = attach(frames, own(), options)
+    elif read_poses is not None:
+        frames = attach(frames, read_poses(), options)
     several = isinstance(lenses, Mapping)
     if isinstance(lenses, Mapping):
         lens_of = {frame.name: _lens(lenses[frame.name], size, options) for frame in frames if isinstance(frame, Entry)}
@@ -83,14 +83,16 @@ def assemble(
 def undistort(sequence: FrameSequence, lens_of: Callable[[Entry], Lens], several: bool) -> FrameSequence:
     """The sequence without the distortion of its lenses (``several``: more than one), also in depth maps that have no
     camera of their own. Raises ValueError: no lens has these coefficients."""
-    own, size = sequence.depth_intrinsics, sequence.depth_size
+    depth_size, registered = sequence.depth_size, sequence.depth_intrinsics is None
 
     def K_depth(lens: Lens) -> np.ndarray | None:
-        return own if own is not None or size in (None, lens.size) else scale_intrinsics(lens.K, lens.size, size)
+        if not registered or depth_size in (None, lens.size):
+            return sequence.depth_intrinsics
+        return scale_intrinsics(lens.K, lens.size, depth_size)
 
     def seen(entry: Entry) -> Entry:
         lens = lens_of(entry)
-        entry = lens.see(entry, size if own is None else None)
+        entry = lens.see(entry, depth_size if registered else None)
         if not several:
             return entry
         return replace(entry, intrinsics=lens.K, image_size=lens.size, depth_intrinsics=K_depth(lens))
@@ -99,15 +101,15 @@ def undistort(sequence: FrameSequence, lens_of: Callable[[Entry], Lens], several
     return replace(sequence.changed(seen), intrinsics=first.K, depth_intrinsics=K_depth(first))
 
 
-def _lens(known: Lens | None, size: Size | None, options: Options) -> Lens:
-    """The camera of images of a ``size``, of the options where they have one."""
-    if options.intrinsics is not None:
-        own_size = known.size if size is None and known is not None else size
-        assert own_size is not None
-        lens = Lens.of(read_intrinsics(options.intrinsics), own_size)
+def _lens(calibrated: Lens | None, size: Size | None, options: Options) -> Lens:
+    """The camera of images of a ``size``, by the options where they have one."""
+    if options.intrinsics is None:
+        assert calibrated is not None
+        lens = calibrated if size is None else calibrated.resized(size)
     else:
-        assert known is not None
-        lens = known if size is None else known.resized(size)
+        image_size = size if calibrated is None else size or calibrated.size
+        assert image_size is not None
+        lens = Lens.of(read_intrinsics(options.intrinsics), image_size)
     if options.distortion is None:
         return lens
     coefficients, fisheye = parse_distortion(options.distortion)

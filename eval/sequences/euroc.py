@@ -29,7 +29,7 @@ _TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "leica0")
 _RADIAL = ("radial-tangential", "radtan", "plumb_bob", "none", "")
 _FISHEYES = ("equidistant", FISHEYE)
 _NANOSECOND = 1e-9
-_LARGEST_YAML = 100_000  # [bytes]
+_LARGEST_YAML, _DEEPEST_YAML = 100_000, 8  # [bytes], [levels]
 
 
 def detect(path: Path) -> bool:
@@ -49,7 +49,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         frames.append(frame_of_image(images[-1].stem, images[-1], timestamp=time))
     lens = _lens(folder / "sensor.yaml", first_image_size(images))
     name = folder.parent.parent.resolve().name if folder.parent.name == "mav0" else folder.resolve().name
-    return assemble("euroc", path, frames, lens, options, name=name, own=partial(_trajectory, folder))
+    return assemble("euroc", path, frames, lens, options, name=name, read_poses=partial(_trajectory, folder))
 
 
 def _camera_folder(path: Path) -> Path | None:
@@ -105,15 +105,18 @@ def _lens(file: Path, size: Size | None) -> Lens:
 def _yaml(file: Path) -> dict[str, Any]:
     import yaml
 
-    raw, content = file.read_bytes()[: _LARGEST_YAML + 1], None
+    expected = f"a sensor's YAML of names and values without aliases, below {_LARGEST_YAML:,} bytes"
+    raw, depth = file.read_bytes()[: _LARGEST_YAML + 1], 0
     try:
         text = raw.decode().removeprefix("%YAML:1.0")  # as OpenCV writes it, which is no directive of YAML
-        # Aliases of aliases would become gigabytes where they are printed or made an array.
-        if len(raw) <= _LARGEST_YAML and not any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-            content = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        # Aliases of aliases would become gigabytes where they are printed or made an array; deep nesting takes minutes.
+        for event in yaml.parse(text):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if len(raw) > _LARGEST_YAML or depth > _DEEPEST_YAML or isinstance(event, yaml.AliasEvent):
+                raise ValueError(f"{file}: expected {expected}")
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{file}: expected YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
-        expected = f"a sensor's YAML of names and values without aliases, below {_LARGEST_YAML:,} bytes"
         raise ValueError(f"{file}: expected {expected}")
     return content

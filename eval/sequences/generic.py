@@ -65,11 +65,11 @@ def read(path: Path, options: Options) -> FrameSequence:
     """
     root = path if path.is_dir() else path.parent
     images, size = open_images(path, options)
-    own = partial(read_trajectory, _given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
+    read_poses = partial(read_trajectory, _given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
     frames = _with_depth(images, root, options, options.depth_scale)
     # Of a generic sequence, ``fps`` counts images, whatever their names.
     counted = replace(options, trajectory=None)
-    return assemble("generic", path, frames, _lens(root, options, size), counted, size=size, own=own)
+    return assemble("generic", path, frames, _lens(root, options, size), counted, size=size, read_poses=read_poses)
 
 
 def has_images_and_depth(path: Path) -> bool:

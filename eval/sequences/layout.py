@@ -63,7 +63,7 @@ def layouts_of(path: Path, plugin: Sequence[str] = ()) -> list[str]:
 
 def parts_of(path: Path, layout: str) -> list[Path]:
     """The single sequences of a path that has this layout: itself, or folders in it that hold one each."""
-    reader = READERS.get(layout)
+    reader: Any = READERS.get(layout)
     return list(reader.parts(path)) if hasattr(reader, "parts") else [path]
 
 

@@ -50,8 +50,8 @@ def read(path: Path, options: Options) -> FrameSequence:
     ]
     lens = _LENSES[_robot(path)] if options.intrinsics is None else None
     size = first_image_size(path / file for file in files) or _NATIVE_SIZE
-    own = partial(read_trajectory, path / "groundtruth.txt")
-    return assemble("tum", path, frames, lens, options, size=size, own=own)
+    read_poses = partial(read_trajectory, path / "groundtruth.txt")
+    return assemble("tum", path, frames, lens, options, size=size, read_poses=read_poses)
 
 
 def read_file_list(path: Path) -> tuple[np.ndarray, list[str]]:

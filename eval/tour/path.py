@@ -41,8 +41,7 @@ def tour_path(tour: Tour, frames: int, seed: int | None = None, *, pan: bool = F
         way, share = _way_within(tour, frames)
         s = _samples(way, frames, share)
     else:
-        way = tour.ways[-1].numpy()
-        way = way if rng.random() < 0.5 else way[::-1].copy()
+        way = tour.ways[-1] if rng.random() < 0.5 else tour.ways[-1][::-1].copy()
         way = np.roll(way, -int(rng.integers(len(way))), axis=0)
         s = _samples(way, frames, min(1.0, frames / _effort(way)[-1]))
     poses = _poses(tour, way, s, rng)
@@ -55,13 +54,12 @@ def tour_path(tour: Tour, frames: int, seed: int | None = None, *, pan: bool = F
 
 def _way_within(tour: Tour, frames: int) -> tuple[Array, float]:
     """The way that leads farthest within a number of frames, and which share of it to walk."""
-    ways = [way.numpy() for way in tour.ways]
-    shares = [_FASTEST * frames / float(_effort(way)[-1]) for way in ways]
+    shares = [_FASTEST * frames / float(_effort(way)[-1]) for way in tour.ways]
     if len(set(tour.room_styles)) > 1:  # the last room is the point of such a tour: see it at any pace
-        k = len(ways) - (1 if shares[-1] >= _ONCE_MORE else 2)
-        return ways[k], min(_ONCE_MORE, max(shares[k], _ENOUGH_TO_SEE))
+        k = len(tour.ways) - (1 if shares[-1] >= _ONCE_MORE else 2)
+        return tour.ways[k], min(_ONCE_MORE, max(shares[k], _ENOUGH_TO_SEE))
     k = max((k for k, share in enumerate(shares) if share >= _ENOUGH_TO_RETURN), default=0)
-    return ways[k], min(_ONCE_MORE, shares[k])
+    return tour.ways[k], min(_ONCE_MORE, shares[k])
 
 
 def _effort(way: Array) -> Array:

@@ -39,7 +39,7 @@ class Tour:
     lights: Tensor  # [R, L, 7] float32: position [m], linear RGB, reach [m]; unused ones are dark
     volumes: Tensor  # [R, L, Y, Z, X] float32 share of each light that reaches a grid of points in the room
     noise: Tensor  # behind the textures, see ``texture.noise_table``
-    ways: tuple[Tensor, ...]  # [M, 2] float64 closed ways of x and z [m], see ``route.ways``
+    ways: tuple[Array, ...]  # [M, 2] float64 closed ways of x and z [m], see ``route.ways``
     camera_height: float  # above the floor [m]
 
 
@@ -70,7 +70,7 @@ def make_tour(seed: int, style: str = "home") -> Tour:
         lights=light_table,
         volumes=light_volumes(corners, table, light_table, sizes, casts),
         noise=noise_table(),
-        ways=tuple(torch.from_numpy(way) for way in routes),
+        ways=routes,
         camera_height=float(height.uniform(*chosen.camera_height)),
     )
 
