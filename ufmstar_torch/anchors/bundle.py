@@ -98,16 +98,15 @@ class PoseRefinement(SavedState):
         try:
             for _ in range(_STEPS):
                 A, b, by_error, alone = equations(ray, precision, poses, rho, 1 / depth, _STUDENT)
-                L = np.linalg.cholesky(_INFORMATION * A + np.diag(prior))
-                step = np.linalg.solve(L.T, np.linalg.solve(L, _INFORMATION * b - prior * error))
+                A = _INFORMATION * A + np.diag(prior)
+                step = np.linalg.solve(A, _INFORMATION * b - prior * error)
                 poses, error = moved(poses, step), error + step
                 rho = (rho + alone - by_error @ step).clip(FAR / depth, NEAR / depth)
-        except np.linalg.LinAlgError:  # not positive definite: numbers that are far out of scale
+            covariance = np.linalg.inv(A)
+        except np.linalg.LinAlgError:  # singular: numbers that are far out of scale
             return T_world_cam
-        inverse = np.linalg.inv(L)  # the covariance is its square
-        self.shared = float(np.median(np.square(by_error @ inverse.T).sum(1)))
-        remains = np.square(inverse[-6:, -6:]).sum(0).reshape(2, 3)
-        self._learn(error[-6:].reshape(2, 3) / unit, remains / unit**2)
+        self.shared = float(np.median((by_error @ covariance * by_error).sum(1)))
+        self._learn(error[-6:].reshape(2, 3) / unit, covariance.diagonal()[-6:].reshape(2, 3) / unit**2)
         refined = T_world_cam.copy()
         refined[views] = poses
         return refined

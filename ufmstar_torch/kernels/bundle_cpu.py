@@ -48,7 +48,7 @@ def equations(
         student: degrees of freedom of the positions' distribution.
 
     Returns:
-        A [6 W, 6 W], whose lower triangle counts, and b [6 W] of A d = b for the errors d of the poses; h [N, 6 W] and
+        A [6 W, 6 W] and b [6 W] of A d = b for the errors d of the poses; h [N, 6 W] and
         v [N]: a track's inverse depth changes by v - h d.
     """
     n, views = precision.shape
@@ -57,7 +57,7 @@ def equations(
     into, moved = _between(T_world_cam)
     to_view = np.ascontiguousarray(T_world_cam[:, :3, :3].transpose(0, 2, 1))
     _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, h, v)
-    return A, b, h, v
+    return A + np.tril(A, -1).T, b, h, v
 
 
 def _between(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
