@@ -154,3 +154,33 @@ def test_depths_stand_noisy_poses(kind):
     assert found >= 6
     assert np.median(errors) < 0.12
     assert result.pose_error > 1, "the given poses' error is reported"
+
+
+def test_a_pose_that_jumps_once_starts_a_new_trajectory_and_teaches_nothing():
+    rng, refinement, jumps = np.random.default_rng(0), PoseRefinement(), []
+    for i in range(20):
+        truth, pixel = scene(rng, noise=0.2)
+        off = truth.copy()
+        if i == 12:
+            off[-1, :3, 3] += [0.1, 0, 0]
+            before = {name: value.clone() for name, value in refinement.state().items()}
+        poses = refinement.refine(pixel, np.ones(pixel.shape[:2], bool), off, K, 2.0)
+        jumps.append(refinement.jumped)
+        if i == 12:
+            np.testing.assert_array_equal(poses, off)
+            assert refinement.state()["given_pose_variance"].equal(before["given_pose_variance"])
+    assert jumps == [i == 12 for i in range(20)]
+
+
+@pytest.mark.parametrize("kind", [LandmarkTracker, DenseEvidence])
+def test_depths_are_right_again_soon_after_the_poses_have_jumped(kind):
+    frames, source, after = walk(), kind(), []
+    for i, frame in enumerate(frames):
+        T = frame.T_world_cam.copy()
+        T[:3, 3] += [0.1, 0, 0] if i >= 6 else 0
+        result = source.update(frame.image, T, frame.intrinsics)
+        if i >= 6:
+            after.append(np.abs(np.log(result.depth / true_depth(frame, result.pixel))))
+    assert len(after[0]) == 0, "nothing is measured across the jump"
+    assert all(len(errors) < 20 or np.median(errors) < 0.1 for errors in after), "and nothing wrong later"
+    assert all(len(errors) > 20 for errors in after[4:])

@@ -84,7 +84,6 @@ def test_images_that_contradict_the_poses_give_no_depth_and_a_warning(tour, kind
 def test_a_late_trajectory_gives_no_depth_or_one_as_uncertain_as_it_is_wrong(tour, kind):
     poses = [f.T_world_cam for f in tour]
     results = run(landmark_source(kind), tour, [*poses[:3], *poses[:-3]])
-    assert sum(r.contradicted for r in results) >= 4
     assert sum(len(r.depth) for r in results if r.contradicted) == 0
     sizes = np.concatenate([surprise(f, r) for f, r in zip(tour, results, strict=True)])
     assert np.median(sizes) < 2.5 * 0.6745

@@ -8,7 +8,8 @@ errors of tracking add up. Gauss-Newton steps on poses and inverse depths, the l
 
 sigma_w and sigma_s are learnt (EM): the error d of the newest pose has the prior variance sigma^2 and, given the
 images, the posterior variance c; so d^2 should be sigma^2 - c on average. Independent errors show in the images. Errors
-that successive poses share, as those of a late trajectory, hardly do; the mean product of successive d measures them.
+that successive poses share, as those of a late trajectory, hardly do; the mean product of successive d measures them. A
+single pose that is off by far more than the others starts another trajectory: SLAM has closed a loop.
 """
 
 from __future__ import annotations
@@ -32,6 +33,10 @@ _INFORMATION = 0.15
 _MEMORY = 0.8
 # Degrees of freedom of a position's distribution; Gauss-Newton steps, and those for inverse depths alone before.
 _STUDENT, _STEPS, _DEPTH_STEPS = 4.0, 4, 6
+# A pose begins another trajectory where the score test of its error, chi-squared with six degrees of freedom, exceeds
+# the one, and the error's mean square, as shifts of a position, the other [px^2]. Where this happens again within so
+# many frames, poses are noisier than is known.
+_SURPRISE, _SHIFT, _APART = 60.0, 1.0, 10
 # Corners and views from which on poses are refined.
 _ENOUGH, _VIEWS = 8, 3
 
@@ -43,11 +48,13 @@ class PoseRefinement(SavedState):
         shared: variance of the corners' inverse depths by the errors that remain in the refined poses, the median over
             the corners [1/m^2]; one error for all of them. 0 where nothing was refined.
         correlated: variance of a position by the errors that successive given poses share [px^2].
+        jumped: the newest given pose does not follow from those before.
     """
 
     HELD: ClassVar = {
         "_variance": "given_pose_variance",
         "_last": "last_pose_error",
+        "_since": "frames_since_jump",
         "correlated": "correlated_pose_variance",
         "shared": "remaining_pose_variance",
     }
@@ -59,7 +66,8 @@ class PoseRefinement(SavedState):
         """Forget everything."""
         self._variance = np.full(2, _FIRST**2 / 2)  # of a position, by w and by s [px^2]
         self._last = np.zeros((2, 3))  # w and s of the last pose as shifts of a position [px]
-        self.correlated = self.shared = 0.0
+        self.correlated, self.shared, self.jumped = 0.0, 0.0, False
+        self._since = _APART
 
     @property
     def given(self) -> float:
@@ -80,11 +88,11 @@ class PoseRefinement(SavedState):
             depth: median of the scene [m].
 
         Returns:
-            [W, 4, 4] refined poses; the given ones where too few corners are seen.
+            [W, 4, 4] refined poses; the given ones where too few corners are seen, or after a jump.
         """
         from ufmstar_torch.kernels.bundle_cpu import FAR, NEAR, equations, inverse_depths  # compiles when first needed
 
-        self.shared = 0.0
+        self.shared, self.jumped, self._since = 0.0, False, min(self._since + 1, _APART)
         tracks, views = seen[:, -1] & (seen.sum(1) > 1), np.flatnonzero(seen.any(0))
         if tracks.sum() < _ENOUGH or len(views) < _VIEWS:
             return T_world_cam
@@ -98,8 +106,13 @@ class PoseRefinement(SavedState):
         try:
             for _ in range(_STEPS):
                 A, b, by_error, alone = equations(ray, precision, poses, rho, 1 / depth, _STUDENT)
-                A = _INFORMATION * A + np.diag(prior)
-                step = np.linalg.solve(A, _INFORMATION * b - prior * error)
+                A, b = _INFORMATION * A, _INFORMATION * b
+                if not error.any() and self._surprising(A[-6:, -6:], b[-6:], prior[-6:], unit):
+                    self.jumped, self._since = self._since == _APART, 0
+                    if self.jumped:
+                        return T_world_cam
+                A = A + np.diag(prior)
+                step = np.linalg.solve(A, b - prior * error)
                 poses, error = moved(poses, step), error + step
                 rho = (rho + alone - by_error @ step).clip(FAR / depth, NEAR / depth)
             covariance = np.linalg.inv(A)
@@ -110,6 +123,15 @@ class PoseRefinement(SavedState):
         refined = T_world_cam.copy()
         refined[views] = poses
         return refined
+
+    @staticmethod
+    def _surprising(
+        A: NDArray[np.float64], b: NDArray[np.float64], prior: NDArray[np.float64], unit: NDArray[np.float64]
+    ) -> bool:
+        """Score test of the newest pose by its part of the equations A d = b at the given poses."""
+        surprise = b @ np.linalg.solve(A + 2 * A / prior @ A, b)  # the views before have errors too
+        shift = np.linalg.solve(A, b).reshape(2, 3) / unit
+        return bool(surprise > _SURPRISE and np.square(shift).sum() > 3 * _SHIFT)
 
     def _learn(self, error: NDArray[np.float64], remains: NDArray[np.float64]) -> None:
         """Follow the given poses' errors by the newest one's [2, 3] and its posterior variance, in pixels."""

@@ -172,13 +172,19 @@ class DenseEvidence(SavedState):
         corners = self._tracker.update(small, T, scale @ K)
         T, (number, poses) = self._tracker.pose, self._tracker.refined
         self._keyframes.correct(number, poses)
+        if self._tracker.jumped:
+            self._forget()
         result = self._measured(small, scale, T, scale @ K, corners)
         if self._contradicted >= _JUMPED:
-            self._contradicted = 0
-            self._keyframes.reset()
-            self._memory.forget()
+            self._forget()
         self._keyframes.add(small, T, self._depth, int(number.max()))
         return result
+
+    def _forget(self) -> None:
+        """Forget keyframes and landmarks: those of other poses."""
+        self._contradicted = 0
+        self._keyframes.reset()
+        self._memory.forget()
 
     def _measured(
         self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray, corners: Landmarks

@@ -277,6 +277,11 @@ class LandmarkTracker(SavedState):
         return np.array(self._poses[self._view])
 
     @property
+    def jumped(self) -> bool:
+        """True where the last pose begins another trajectory: what was seen before is of no use."""
+        return self._refinement.jumped
+
+    @property
     def refined(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Numbers [W] of the images in the window, the first one 0, and their refined poses [W, 4, 4]."""
         return self._number, self._poses
@@ -312,6 +317,8 @@ class LandmarkTracker(SavedState):
         order = (self._view + 1 + np.arange(self.config.window)) % self.config.window
         views = self._pixel[:, order], self._seen[:, order], self._given[order]
         self._poses[order] = self._refinement.refine(*views, self._K, self._depth)
+        if self.jumped:
+            self._seen[:, order[:-1]] = False
 
     def _compare_with_poses(self) -> None:
         """Follow how far corners lie from where the poses allow them to be, each in the first view that has it."""
