@@ -88,7 +88,6 @@ def test_large_images(size):
     for depth, pose in zip(depths, poses, strict=True):
         given = torch.tensor(depth)[None].float(), torch.tensor(pose), torch.tensor(K)
         a, b = gpu(*(v.cuda() for v in given)), cpu(*given)
-        assert torch.equal(a.labels.cpu(), b.labels)
         torch.testing.assert_close(a.variance.cpu(), b.variance, rtol=1e-3, atol=1e-6, equal_nan=True)
     assert a.variance.shape == (1, *size)
 

@@ -61,7 +61,6 @@ def test_late_growth():
     for i, (depth, pose, K, _) in enumerate(walks(1, 4)):
         given = torch.full_like(depth, torch.nan) if i == 1 else depth
         a, e = (module(given, pose, K, (given / 100).nan_to_num()) for module in modules)
-        assert torch.equal(a.labels.cpu(), e.labels)
         late.append(bool((a.statistics.components < e.statistics.components).any()))
         if not late[-1]:
             close(a.variance, e.variance, 1e-8, 1e-10)

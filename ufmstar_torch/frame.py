@@ -7,8 +7,8 @@ raises or skips. What is wrong with single pixels becomes ``valid = False`` and 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -76,25 +76,6 @@ class FrameInput:
         return self.depth.shape[-2], self.depth.shape[-1]
 
 
-class CheckKernel(Protocol):
-    """The check of values; see :func:`check_values`."""
-
-    def __call__(
-        self,
-        depth: Tensor,
-        pose: Tensor,
-        intrinsics: Tensor,
-        aleatoric: Tensor | None,
-        epistemic: Tensor | None,
-        features: Tensor | None,
-        mask: Tensor | None,
-        /,
-        *,
-        rotation_tolerance: float,
-        max_depth: float,
-    ) -> FrameInput: ...
-
-
 def check_values(
     depth: Tensor,
     pose: Tensor,
@@ -142,6 +123,9 @@ def check_values(
         safe_depth, T_safe, K_safe, aleatoric, epistemic, features, use, fault, _moved(deviation, device),
         beyond.sum((1, 2)), (near & ~use).sum((1, 2)), known,
     )  # fmt: skip
+
+
+CheckKernel = Callable[..., FrameInput]  # as ``check_values``
 
 
 def check_frame(

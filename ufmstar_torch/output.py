@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import cached_property
 
 from torch import Tensor
 
@@ -79,7 +77,7 @@ class FrameStatistics:
         return f"FrameStatistics({', '.join(shown)})"
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class StepOutput:
     """The regressed disagreement and what led to it.
 
@@ -87,7 +85,6 @@ class StepOutput:
         disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid; [B, n] on a subset.
         features: regressed features [B, H, W, F] or [B, n, F].
         measured: [B, H, W] or [B, n] share in [0, 1] of M that rests on surfaces seen from two views or more.
-        read_labels: returns ``labels``; a GPU writes them when they are asked for.
         current_cam: C_i in the camera frame.
         statistics: of this frame.
     """
@@ -95,18 +92,8 @@ class StepOutput:
     disagreement: Tensor
     features: Tensor
     measured: Tensor
-    read_labels: Callable[[], Tensor]
     current_cam: GaussianMixture
     statistics: FrameStatistics
-
-    def __repr__(self) -> str:
-        """Shape and counts in a line."""
-        return f"StepOutput({_size(self.disagreement)}, {self.statistics!r})"
-
-    @cached_property
-    def labels(self) -> Tensor:
-        """[B, H, W] int64 the segment of every pixel, -1 = none."""
-        return self.read_labels()
 
 
 @dataclass(frozen=True, repr=False)
@@ -131,7 +118,6 @@ class UfMStarOutput:
         measured: share in [0, 1] of M that rests on surfaces seen from two views or more; below one half the pixel
             counts as not measured (``config.unmeasured``). NaN where not valid.
         valid: True where the pixel was used.
-        read_labels: returns ``labels``; a GPU writes them when they are asked for.
         current_cam: C_i, the segments of this frame in the camera frame, float64.
         statistics: per-stream counts of this frame.
     """
@@ -144,7 +130,6 @@ class UfMStarOutput:
     features: Tensor
     measured: Tensor
     valid: Tensor
-    read_labels: Callable[[], Tensor]
     current_cam: GaussianMixture
     statistics: FrameStatistics
     anchored: Tensor | None = None
@@ -157,17 +142,12 @@ class UfMStarOutput:
     def __repr__(self) -> str:
         """Shape, median standard deviation and counts in a line."""
         std = "" if self.variance.device.type == "meta" else f", median std {float(self.std.nanmedian()):.3g} m"
-        return f"UfMStarOutput({_size(self.variance)}{std}, {self.statistics!r})"
+        return f"UfMStarOutput({' x '.join(map(str, self.variance.shape))}{std}, {self.statistics!r})"
 
     @property
     def std(self) -> Tensor:
         """sqrt(variance) [m]."""
         return self.variance.sqrt()
-
-    @cached_property
-    def labels(self) -> Tensor:
-        """[B, H, W] int64 the pixel's segment in ``current_cam``, -1 = none."""
-        return self.read_labels()
 
     def posterior(self) -> tuple[Tensor, Tensor]:
         """p(depth | network, UfM*, anchors): depth [m] and its variance [m^2], NaN where not valid
@@ -241,15 +221,6 @@ class MeanUncertainty:
         """Means, errors and counts in a line."""
         counts = f"pixels={_short(self.pixels)}, measured={_short(self.measured)}"
         return f"MeanUncertainty(mean={_short(self.mean)} m^2, {counts}, {self.statistics!r})"
-
-
-def given(value: Tensor) -> Tensor:
-    """The tensor itself: ``partial(given, labels)`` is the ``read_labels`` of labels that are there already."""
-    return value
-
-
-def _size(value: Tensor) -> str:
-    return " x ".join(map(str, value.shape))
 
 
 def _any(value: Tensor) -> bool:

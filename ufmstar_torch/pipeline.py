@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import torch
@@ -17,7 +17,7 @@ from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.networks_in_turn import NetworksInTurn, Preprocess, in_unit_range, modules_of, own_preprocess
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty, UfMStarOutput
 from ufmstar_torch.prediction import DepthPrediction
-from ufmstar_torch.recalibrate import CONFIDENCE, Recalibration
+from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.stateful import outliving
 from ufmstar_torch.ufmstar import UfMStar
 
@@ -157,7 +157,6 @@ class UncertainDepth(NetworksInTurn):
             config = config.replace(anchors=sections[0], posterior=sections[1])
             anchors = "dense" if anchors is None and networks is not None else anchors
         mapped = () if recalibration is None else (recalibration,)
-        self._maps_confidence = recalibration is not None and recalibration.covariate == CONFIDENCE
         self.ufm = UfMStar(config.within(self.max_depth, self.states_confidence), extensions=mapped)
         if anchors is not None and self.ufm.config.anchors is None:
             raise ValueError("anchors go with UfMStarConfig(anchors=AnchorConfig())")
@@ -253,9 +252,8 @@ class UncertainDepth(NetworksInTurn):
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.forward`; the images are not counted then.
         """
-        a, e = prediction.aleatoric_variance, prediction.epistemic_variance
-        inputs = {"anchors": anchors, "confidence": self._confidence(prediction)}
-        out = self.ufm(prediction.depth, pose, intrinsics, a, e, valid, features=features, **inputs)
+        maps = maps_of(prediction, self.ufm)
+        out = self.ufm(pose=pose, intrinsics=intrinsics, valid=valid, features=features, anchors=anchors, **maps)
         self._count(self._next + 1)
         return out
 
@@ -286,19 +284,13 @@ class UncertainDepth(NetworksInTurn):
         predicted = self._predicted(image, pose, intrinsics, features)
         sample: dict[str, Any] = {"pixels": pixels, "fraction": fraction, "seed": seed, "average": average}
         with self._anchored(predicted, anchors) as found:
-            p = predicted.prediction
             mean = self.ufm.mean_uncertainty(
-                p.depth, predicted.pose, p.K, p.aleatoric_variance, p.epistemic_variance, valid, anchors=found,
-                confidence=self._confidence(p), features=predicted.features, **sample,
+                pose=predicted.pose, intrinsics=predicted.prediction.K, valid=valid, features=predicted.features,
+                anchors=found, **maps_of(predicted.prediction, self.ufm), **sample,
             )  # fmt: skip
         self._undo(mean.statistics)
         self._count(self._next + 1)
         return mean
-
-    def _confidence(self, prediction: DepthPrediction) -> Tensor | None:
-        """The confidence, where UfM* uses one."""
-        used = self.ufm.config.confidence is not None or self._maps_confidence
-        return prediction.confidence if used else None
 
     def _fused(
         self, predicted: _Predicted, valid: Array | None = None, anchors: Anchors | None = None
@@ -358,12 +350,12 @@ class UncertainDepth(NetworksInTurn):
         with torch.no_grad():
             x, K = self.prepare(picture, K_image.expand(len(picture), 3, 3))
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
-        H = None if features is None else as_tensor("features", features)
-        own = (prediction.aleatoric_variance, prediction.epistemic_variance, prediction.confidence)
-        (depth, a, e, confidence, K_there, H), ready = _copied((prediction.depth, *own, K, H), self.multiview_device)
-        assert depth is not None
-        there = DepthPrediction(depth, a, e, confidence, K_there)
-        return _Predicted(picture, T, K_image, there, member, H, ready)
+        tensors = {name: value for name, value in vars(prediction).items() if isinstance(value, Tensor)}
+        if features is not None:
+            tensors["features"] = as_tensor("features", features)
+        there, ready = _copied(tensors, self.multiview_device)
+        H = there.pop("features", None)
+        return _Predicted(picture, T, K_image, replace(prediction, **there), member, H, ready)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """The networks move; UfM* stays on its own device, if it has one."""
@@ -423,29 +415,32 @@ class UncertainDepth(NetworksInTurn):
             raise
 
 
+def maps_of(prediction: DepthPrediction, ufm: UfMStar) -> dict[str, Any]:
+    """The arguments of :meth:`UfMStar.forward` that a prediction has: depth, A, E, and the confidence if it is used."""
+    maps = {
+        "depth": prediction.depth,
+        "aleatoric": prediction.aleatoric_variance,
+        "epistemic": prediction.epistemic_variance,
+    }
+    return maps | ({"confidence": prediction.confidence} if ufm.takes("confidence") else {})
+
+
 def _require_count(value: object) -> None:
     """Raise a ValueError unless it is a number of images."""
     if not isinstance(value, Tensor) or value.dtype != torch.int64 or value.dim() or bool(value < 0):
         raise ValueError(f"image_index must be a whole number of images, got {value}")
 
 
-def _copied(
-    values: Sequence[Tensor | None], device: torch.device | None
-) -> tuple[list[Tensor | None], torch.cuda.Event | None]:
+def _copied(values: dict[str, Tensor], device: torch.device | None) -> tuple[dict[str, Any], torch.cuda.Event | None]:
     """The values on ``device`` (None: where they are), and when copies from CUDA into pinned memory will have ended."""
-    source = values[0]
-    pinned = source is not None and source.device.type == "cuda" and device is not None and device.type == "cpu"
-
-    def copy(value: Tensor | None) -> Tensor | None:
-        if value is None or device is None:
-            return value
-        if not pinned or value.device.type != "cuda":
-            return value.to(device, non_blocking=True)
-        return torch.empty(value.shape, dtype=value.dtype, pin_memory=True).copy_(value.detach(), non_blocking=True)
-
-    copies = [copy(value) for value in values]
-    if source is None or not pinned:
-        return copies, None
+    if device is None:
+        return values, None
+    source = values["depth"].device
+    if source.type != "cuda" or device.type != "cpu":
+        return {name: value.to(device, non_blocking=True) for name, value in values.items()}, None
+    copies = {name: torch.empty(value.shape, dtype=value.dtype, pin_memory=True) for name, value in values.items()}
+    for name, value in values.items():
+        copies[name].copy_(value.detach(), non_blocking=True)
     ready = torch.cuda.Event()
-    ready.record(torch.cuda.current_stream(source.device))
+    ready.record(torch.cuda.current_stream(source))
     return copies, ready

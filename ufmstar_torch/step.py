@@ -10,7 +10,6 @@ float64, so large world coordinates never reach the float32 state, and what a fr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Protocol
 
 import torch
@@ -25,7 +24,7 @@ from ufmstar_torch.extension import NONE, FrameExtensions
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import pixel_footprint, storage_floor
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.output import FrameStatistics, StepOutput, given
+from ufmstar_torch.output import FrameStatistics, StepOutput
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step_parts import REFERENCE, Kernels, StepObserver
@@ -79,7 +78,7 @@ def step(
     fine = frame.fault == 0
     first = torch.where((fine & ~state.started)[:, None, None], frame.T_world_cam, state.T_world_first)
 
-    current_cam, labels = _segment(frame, config, kernels, state.covariance.dtype)
+    current_cam = _segment(frame, config, kernels, state.covariance.dtype)
     stage("segment")
 
     mixture = state.mixture
@@ -134,7 +133,7 @@ def step(
         "frames": state.frames + fine, "skipped": state.skipped + ~fine, "smoothed": smoothed,
     })  # fmt: skip
     statistics = frame_statistics(frame, counts)
-    out = StepOutput(disagreement, result.features, measured, partial(given, labels), current_cam, statistics)
+    out = StepOutput(disagreement, result.features, measured, current_cam, statistics)
     stage("average")
     return updated, out
 
@@ -154,23 +153,20 @@ def unobserved(name: str) -> None:
     """Without an observer nothing happens between stages."""
 
 
-def _segment(
-    frame: FrameInput, config: UfMStarConfig, kernels: Kernels, stored: torch.dtype
-) -> tuple[GaussianMixture, Tensor]:
-    """Step 2: C_i in the camera frame, float64, and its labels.
+def _segment(frame: FrameInput, config: UfMStarConfig, kernels: Kernels, stored: torch.dtype) -> GaussianMixture:
+    """Step 2: C_i in the camera frame, float64.
 
     SPGF's raw moments have no floor: eigenvalues are lifted to the variance across one pixel at that depth, (z/f)^2/12,
     and to what the dtype ``stored`` of the mixture holds, as the fusion does.
     """
-    mixture, labels = kernels.spgf(SegmentInput.of_frame(frame, config))
-    mixture = mixture.to(torch.float64)
+    mixture = kernels.spgf(SegmentInput.of_frame(frame, config))[0].to(torch.float64)
     fx, fy, _, _ = focal_and_centre(frame.intrinsics)
     # Nearer than the near plane nothing is ever matched; the footprint there keeps the floor above zero.
     z = mixture.mean[..., 2].clamp_min(config.near_plane)
     floor = pixel_footprint(z, torch.minimum(fx, fy)[:, None])
     floor = torch.maximum(floor, storage_floor(mixture.covariance, stored))
     floor = torch.where(mixture.valid, floor, torch.zeros_like(floor))  # an empty slot holds zeros
-    return mixture.replace(covariance=kernels.floor_covariance(mixture.covariance, floor)), labels
+    return mixture.replace(covariance=kernels.floor_covariance(mixture.covariance, floor))
 
 
 def _room(

@@ -31,53 +31,19 @@ class StepObserver(Protocol):
         ...
 
 
-# Step 2: C_i in the camera frame without a floor, and labels [B, H, W] (segment.segment).
+# C_i in the camera frame, and labels [B, H, W].
 SegmentKernel = Callable[[SegmentInput], tuple[GaussianMixture, Tensor]]
-# Covariances [..., 3, 3] whose eigenvalues are at least a floor [...] [m^2] (gaussian.floor_covariance).
-FloorKernel = Callable[[Tensor, Tensor], Tensor]
-# Step 3: M_(i-1) and C_i in the camera frame, K, (H, W) -> pairs (correspond.correspond).
-CorrespondKernel = Callable[[GaussianMixture, GaussianMixture, Tensor, tuple[int, int], UfMStarConfig], Correspondence]
-
-
-class FuseKernel(Protocol):
-    """Step 4 for the matched pairs (:func:`ufmstar_torch.fuse.fuse`)."""
-
-    def __call__(
-        self,
-        mixture: GaussianMixture,
-        current: GaussianMixture,
-        pairs: Correspondence,
-        config: UfMStarConfig,
-        /,
-        *,
-        rounds: int | None = None,
-    ) -> GaussianMixture: ...
-
-
-class RegressKernel(Protocol):
-    """Step 5 at every pixel, or at some (:func:`ufmstar_torch.regress.regress_image`)."""
-
-    def __call__(
-        self,
-        mixture_cam: GaussianMixture,
-        depth: Tensor,
-        intrinsics: Tensor,
-        valid: Tensor,
-        config: UfMStarConfig,
-        /,
-        pixels: Tensor | None = None,
-    ) -> Regression: ...
 
 
 @dataclass(frozen=True)
 class Kernels:
-    """The replaceable parts of :func:`step`; all take checked input."""
+    """The replaceable parts of :func:`step`; all take checked input, as the functions of ``REFERENCE``."""
 
-    spgf: SegmentKernel
-    floor_covariance: FloorKernel
-    correspond: CorrespondKernel
-    fuse: FuseKernel
-    regress_image: RegressKernel
+    spgf: SegmentKernel  # step 2, without a floor
+    floor_covariance: Callable[[Tensor, Tensor], Tensor]
+    correspond: Callable[[GaussianMixture, GaussianMixture, Tensor, tuple[int, int], UfMStarConfig], Correspondence]
+    fuse: Callable[..., GaussianMixture]
+    regress_image: Callable[..., Regression]
 
 
 REFERENCE = Kernels(

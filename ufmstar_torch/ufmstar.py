@@ -137,7 +137,6 @@ class UfMStar(StatefulModule):
             features=out.features[..., : self.config.features],
             measured=shaped(out.measured),
             valid=shaped(frame.valid),
-            read_labels=out.read_labels,
             current_cam=out.current_cam,
             statistics=out.statistics,
         )
@@ -258,6 +257,10 @@ class UfMStar(StatefulModule):
             else:
                 new = old.restarted(self._chosen(streams, b))
             self._store(new.tensors() | (dict(old.by_stream) if keep_evidence else {}))
+
+    def takes(self, name: str) -> bool:
+        """True if a frame may bring an input of this name for an extension."""
+        return any(one.argument == name for one in self._extensions.each)
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         self._empty.with_tensors(state).require(self.config, self._empty)

@@ -19,9 +19,10 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.pipeline import UncertainDepth
+from ufmstar_torch.pipeline import maps_of
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.recalibrate import Recalibration
+from ufmstar_torch.ufmstar import UfMStar
 
 # The maps of an answer [1, h, w] on the estimator's device, by the names of ``RowResult``; "statistics" of UfM*.
 Answer = dict[str, Any]
@@ -153,13 +154,13 @@ class Gaussians(Estimator):
         uses_variances: bool = True,
         recalibration: Recalibration | None = None,
     ) -> None:
-        self.model = UncertainDepth(None, config, recalibration=recalibration).to(device)
-        self.module = self.ufm = self.model.ufm
+        extensions = () if recalibration is None else (recalibration,)
+        self.module = self.ufm = UfMStar(config, extensions=extensions, device=device)
         self._setting, self._uses_variances, self._anchors = setting, uses_variances, 0
 
     def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
         used = _used(prediction, self._uses_variances)
-        out = self.model.update(used, T_world_cam, prediction.K, anchors=anchors)
+        out = self.ufm(pose=T_world_cam, intrinsics=prediction.K, anchors=anchors, **maps_of(used, self.ufm))
         anchors_used = out.statistics.anchors_used
         self._anchors = 0 if anchors_used is None else int(anchors_used[0])
         answer = {name: getattr(out, name) for name in _OF_OUTPUT} | {"confidence": used.confidence}

@@ -7,7 +7,7 @@ of threads changes a bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
@@ -81,7 +81,7 @@ def step(
 ) -> tuple[UfMStarState, StepOutput]:
     """As :func:`ufmstar_torch.step.step`, for CPU tensors."""
     stage = unobserved if observer is None else observer.stage
-    segments, labels = _segment(frame, array(frame.intrinsics), config, state.covariance.dtype)
+    segments = _segment(frame, array(frame.intrinsics), config, state.covariance.dtype)
     current_cam = GaussianMixture(*map(torch.from_numpy, segments))
     stage("segment")
 
@@ -115,22 +115,22 @@ def step(
     followed = dict(zip(names, map(torch.from_numpy, cameras), strict=True))
     updated = state.with_tensors({**joined.mixture, **joined.sums, **changed, **followed, "smoothed": smoothed})
     statistics = frame_statistics(frame, _counts(frame, pairs, joined, unmeasured))
-    out = StepOutput(disagreement, result.features, measured, labels, current_cam, statistics)
+    out = StepOutput(disagreement, result.features, measured, current_cam, statistics)
     stage("average")
     return updated, out
 
 
 def _segment(
     frame: FrameInput, intrinsics: Floats, config: UfMStarConfig, stored: torch.dtype
-) -> tuple[tuple[NDArray[Any], ...], Callable[[], Tensor]]:
+) -> tuple[NDArray[Any], ...]:
     """Step 2: the fields of C_i in the camera frame, float64, its covariances lifted to the floor that the reference
-    states, and its labels."""
-    mixture, labels = gaussians(SegmentInput.of_frame(frame, config))
+    states."""
+    mixture, _ = gaussians(SegmentInput.of_frame(frame, config))
     segments = tuple(map(array, mixture.to(torch.float64).tensors().values()))
     epsilon = 8 * torch.finfo(stored).eps
     for K, *written in zip(intrinsics.tolist(), *segments[:3], strict=True):
         lift(*written, config.near_plane, min(K[0][0], K[1][1]), PIXEL_VARIANCE, epsilon)
-    return segments, labels
+    return segments
 
 
 def _match(

@@ -181,7 +181,7 @@ def device_step(
     stored = state.covariance.dtype
     eps = 8 * torch.finfo(stored).eps
     given = SegmentInput.of_frame(frame, config)
-    current, read_labels = fit(given, floor=Floor(config.near_plane, eps))
+    current, _ = fit(given, floor=Floor(config.near_plane, eps))
     here = cameras(state, frame)
     camera = frame.intrinsics.contiguous()
     previous, new = candidates(state.mixture, here.to_camera, current, camera, frame.size, config)
@@ -218,7 +218,7 @@ def device_step(
         **mixture.tensors(), "T_world_first": here.first, "started": here.started, "frames": here.frames,
         "skipped": here.skipped, "smoothed": result.memory,
     })  # fmt: skip
-    out = StepOutput(result.disagreement, result.features, result.measured, read_labels, current, statistics)
+    out = StepOutput(result.disagreement, result.features, result.measured, current, statistics)
     return updated, out, waiting
 
 
