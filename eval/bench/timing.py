@@ -10,13 +10,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 import torch
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.eval.engine.clock import StageTimer
+from ufmstar_torch.eval.engine.clock import synchronize
 from ufmstar_torch.eval.run.machine import available_cores
 
 # Every moment of a step belongs to one of these; see ``ufmstar_torch.step_parts.StepObserver``.
@@ -78,22 +79,21 @@ class StagedStep:
     device, which ``step`` runs once. The output's assembly after the last stage belongs to none."""
 
     def __init__(self, module: UfMStar, step: Callable[..., Any], device: torch.device = _CPU) -> None:
-        self.module, self._step, self._timer = module, step, StageTimer(device)
+        self.module, self._step, self._device = module, step, device
         self.stages: dict[str, list[float]] = {name: [] for name in STAGES}
         module.observer = self
 
     def __call__(self, *args: Any) -> Any:
         """Run one step."""
-        self._timer.take()
+        self._before = perf_counter()
         return self._step(*args)
 
     def stage(self, name: str) -> None:
-        """A stage has ended; the last one ends the step."""
-        self._timer.lap(name)
-        if name == STAGES[-1]:
-            ms = self._timer.take()
-            for stage, times in self.stages.items():
-                times.append(ms.get(stage, 0.0))
+        """A stage has ended."""
+        synchronize(self._device)
+        now = perf_counter()
+        self.stages[name].append(1000 * (now - self._before))
+        self._before = now
 
     def summary(self, *, warm_up: int) -> dict[str, Any]:
         """Spread of every stage and of the steps' sums; the first ``warm_up`` steps do not count."""

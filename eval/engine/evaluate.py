@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import torch
 
@@ -79,8 +78,8 @@ def evaluate_sequence(
     for row in rows:
         source = sources[row.method.base, row.setting.preprocess]
         estimator = make_estimator(row, judge.device, source, judge.plugins.methods)
-        how: dict[str, Any] = {"every": row.method.every_member, "setting": row.setting, "device": judge.device}
-        runners.append(RowRunner(row.slug, source, estimator, anchors=anchors.get(row), **how))
+        every, setting = row.method.every_member, row.setting
+        runners.append(RowRunner(row.slug, source, estimator, every=every, setting=setting, anchors=anchors.get(row)))
         named = {other.slug: other.method.name for other in references(row, rows)}
         judges.append(RowJudge(row, named, judge.bins, judge.plugins.metrics))
     tracked = any(row.setting.anchors in (CORNERS, DENSE) for row in rows)

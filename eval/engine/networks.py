@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.eval.engine.clock import StageTimer
+from ufmstar_torch.eval.engine.clock import timed
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.setting import CROP, OF_NETWORK, RESIZE
 from ufmstar_torch.eval.sequences.frame import Frame
@@ -56,7 +56,6 @@ class NetworkSource(DepthSource):
         self.max_depth, self.passes = self._turns.max_depth, self._turns.passes
         self.states_confidence = self._turns.states_confidence
         self._device, self._precision = device, precision
-        self._timer = StageTimer(device)
         self._generator = torch.Generator(device)
         self._inputs: WeakKeyDictionary[Frame, tuple[Tensor, Tensor]] = WeakKeyDictionary()
         for network in stochastic(networks.networks):
@@ -80,7 +79,7 @@ class NetworkSource(DepthSource):
             return self
         other = copy.copy(self)
         other._turns = NetworksInTurn(self.networks, samples=self._turns.samples, preprocess=changed)
-        other._inputs, other._timer = WeakKeyDictionary(), StageTimer(self._device)
+        other._inputs = WeakKeyDictionary()
         other.identity = {**self.identity, "preprocess": how}
         other.digest = self.digest and hashlib.sha256(f"{self.digest} {how}".encode()).hexdigest()
         return other
@@ -94,10 +93,11 @@ class NetworkSource(DepthSource):
         with torch.no_grad():
             x, K = self._input(frame)
             self._generator.manual_seed(frame.index + _SAMPLE_STRIDE * n)
-            reduced = self._precision == BF16
-            with self._timer.stage("network"), torch.autocast(self._device.type, torch.bfloat16, enabled=reduced):
+            reduced, ms = self._precision == BF16, dict[str, float]()
+            autocast = torch.autocast(self._device.type, torch.bfloat16, enabled=reduced)
+            with timed(ms, "network", self._device), autocast:
                 maps = self._turns.member(x, K, n)
-        made = replace(maps, intrinsics=K.cpu().double(), ms=self._timer.take()["network"])
+        made = replace(maps, intrinsics=K.cpu().double(), ms=ms["network"])
         return made.to(torch.float32) if reduced else made
 
     def prepare(self, frame: Frame) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.tracker import Landmarks
 from ufmstar_torch.eval.engine.anchors import AnchorSource
-from ufmstar_torch.eval.engine.clock import StageTimer
+from ufmstar_torch.eval.engine.clock import timed
 from ufmstar_torch.eval.engine.estimators import Estimator
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
@@ -84,7 +84,7 @@ class RowRunner:
     Args:
         key: its name, unique in its stream.
         source: of its depth.
-        estimator: of its variance, in its initial state, on ``device``.
+        estimator: of its variance, in its initial state.
         every: all members (or samples) predict on every image, instead of one in turn.
         setting: which images it leaves out, and how poses and anchors are disturbed.
         anchors: None = it has none.
@@ -101,13 +101,11 @@ class RowRunner:
         setting: Setting = DEFAULT,
         anchors: AnchorSource | None = None,
         skips_faults: bool = False,
-        device: torch.device | None = None,
     ) -> None:
         self.key, self.source, self.estimator, self.every, self.setting = key, source, estimator, every, setting
         self.anchors, self._skips_faults = anchors, skips_faults
         self._tracks = None if anchors is None else anchors.tracks
         self.images = 0
-        self._timer = StageTimer(device or torch.device("cpu"))
         self._drift = Drift(setting)
 
     def update(self, frame: Frame, prediction: DepthPrediction, truth: NDArray[np.float32] | None) -> RowResult:
@@ -118,10 +116,11 @@ class RowRunner:
             (None, None, None) if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
         )
         member = self.source.turn(self.images) if self.source.networks and not self.every else None
-        with self._timer.stage("uncertainty"):
+        ms = {"network": prediction.ms, "anchors": tracking_ms}
+        times = {stage: time for stage, time in ms.items() if time is not None}
+        with timed(times, "uncertainty", prediction.depth.device):
             answer = self.estimator.update(prediction, torch.from_numpy(T), anchors)
             answer = {name: value[0].cpu() if isinstance(value, Tensor) else value for name, value in answer.items()}
-        times = {"network": prediction.ms, "anchors": tracking_ms, **self._timer.take()}
         self.images += 1
         statistics, network_variance = answer.get("statistics"), prediction.variance
         if self._skips_faults and statistics is not None and int(statistics.fault[0]):
@@ -136,7 +135,7 @@ class RowRunner:
             T_world_cam=T,
             member=member,
             landmarks=landmarks,
-            ms={stage: time for stage, time in times.items() if time is not None},
+            ms=times,
         )
 
     def memory(self) -> dict[str, float]:

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.clock import StageTimer
+from ufmstar_torch.eval.engine.clock import timed
 from ufmstar_torch.eval.engine.predictions import FramePredictions, PredictionCache, sequence_digest
 from ufmstar_torch.eval.engine.rows import RowResult, RowRunner
 from ufmstar_torch.eval.methods.perturb import selects
@@ -91,7 +91,6 @@ class FrameStream:
         self._store, self._device, self._check = store, device or torch.device("cpu"), check
         self._names = sequence.names
         self._digest = "" if store is None else sequence_digest(sequence)
-        self._timer = StageTimer(self._device)
         self.position = start
 
     def drive(self, sinks: Sequence[FrameSink], *, stop: Callable[[], bool] = lambda: False) -> None:
@@ -123,25 +122,24 @@ class FrameStream:
         number, index = self.position, self.indices[self.position]
         name = self._names[index]
         active = [row for row in self.rows if selects(row.setting, number)]
-        self._timer.take()
         self.position += 1
         if self.rows and not active:
             return FrameResult(number, index, name)
+        ms: dict[str, float] = {}
         try:
-            with self._timer.stage("read"):
+            with timed(ms, "read", self._device):
                 frame = next(frames).result()
                 if self._check is not None:
                     self._check(frame)
             cached = FramePredictions(frame, self._device, self._store, self._digest)
-            with self._timer.stage("predict"):
+            with timed(ms, "predict", self._device):
                 predictions = {row.key: cached.of(row.source, row.images, row.every) for row in active}
-            with self._timer.stage("truth"):
+            with timed(ms, "truth", self._device):
                 truths = _truths(frame, predictions)
         except FrameError as error:
             if not self.rows:
                 raise
             return FrameResult(number, index, name, skipped={row.key: error.reason for row in active})
-        ms = self._timer.take()
         results: dict[str, RowResult] = {}
         skipped: dict[str, str] = {}
         for row in active:

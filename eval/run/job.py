@@ -77,8 +77,7 @@ class RunJob:
         anchors = None
         if self.config.anchors is not None:
             anchors = AnchorSource(Setting(anchors=CORNERS), Tracks(landmark_source(self.landmarks)))
-        how: dict[str, Any] = {"every": self.every, "anchors": anchors, "device": self.device}
-        row = RowRunner(UFM, self.source, estimator, skips_faults=True, **how)
+        row = RowRunner(UFM, self.source, estimator, every=self.every, anchors=anchors, skips_faults=True)
         if checkpoint.state:
             row.load_state(checkpoint.state)
         return row
