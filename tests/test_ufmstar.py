@@ -147,18 +147,6 @@ def test_a_place_never_seen_starts_afresh():
     assert outputs[3].statistics.matched.item() > 0
 
 
-def test_moving_average():
-    depths, poses, K = scenes.sequence(5, HEIGHT, WIDTH, 0.06)
-    _, raw = run(CONFIG.replace(ema_alpha=1.0), depths, poses, K)
-    _, smoothed = run(CONFIG.replace(ema_alpha=0.3), depths, poses, K)
-    expected = raw[0].disagreement
-    for a, b in zip(raw[1:], smoothed[1:], strict=True):
-        both = 0.7 * expected + 0.3 * a.disagreement
-        expected = torch.where(expected.isnan(), a.disagreement, torch.where(a.disagreement.isnan(), expected, both))
-        shown = torch.where(b.valid, expected, torch.nan)
-        torch.testing.assert_close(b.disagreement, shown, rtol=1e-12, atol=0, equal_nan=True)
-
-
 @pytest.mark.parametrize("which", ["none", "a", "e", "both", "off"])
 def test_total_variance(which):
     depths, poses, K = scenes.sequence(2, HEIGHT, WIDTH, 0.06)

@@ -29,7 +29,6 @@ class Warner(Extension):
     """Warns once the step is through, where ``loud``."""
 
     loud = False
-    covariate = "variance"
 
     def map_variance(self, variance):
         if self.loud:
