@@ -6,11 +6,11 @@ hardly moves, and the minimum are reported.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -85,13 +85,13 @@ class StagedStep:
 
     def __call__(self, *args: Any) -> Any:
         """Run one step."""
-        self._before = perf_counter()
+        self._before = time.perf_counter()
         return self._step(*args)
 
     def stage(self, name: str) -> None:
         """A stage has ended."""
         synchronize(self._device)
-        now = perf_counter()
+        now = time.perf_counter()
         self.stages[name].append(1000 * (now - self._before))
         self._before = now
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from time import perf_counter
 
 import torch
 
@@ -14,10 +14,10 @@ def timed(ms: dict[str, float], stage: str, device: torch.device) -> Iterator[No
     """Note the time of a block as that of a stage [ms], with the work that it queues on a device; a block that raises
     has none."""
     synchronize(device)
-    started = perf_counter()
+    started = time.perf_counter()
     yield
     synchronize(device)
-    ms[stage] = 1000 * (perf_counter() - started)
+    ms[stage] = 1000 * (time.perf_counter() - started)
 
 
 def synchronize(device: torch.device) -> None:

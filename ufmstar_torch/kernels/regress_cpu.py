@@ -112,7 +112,7 @@ def fill_and_smooth(
     given = [array(value) for value in (disagreement, depth, memory)]
     after, shown = np.empty_like(given[2]), np.empty_like(given[0])
     share = given[0].dtype.type(config.unmeasured_relative**2 if config.unmeasured == "relative" else 0)
-    settings = share, config.unmeasured == "nan", alpha
+    settings = share, config.unmeasured == "nan", float(alpha)
     maps = (*given, array(measured), after, shown)
     counts = each(_fill_and_smooth, [(*(value[b].reshape(-1) for value in maps), *settings) for b in range(len(after))])
     return torch.from_numpy(after), torch.from_numpy(shown), counts
