@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.arguments import Array, CameraLike, as_intrinsics, as_pose, as_tensor, require_float, require_mask
-from ufmstar_torch.camera import POLAR_STEPS as POLAR_STEPS
 from ufmstar_torch.camera import focal_and_centre, nearest_rotation, rotation_deviation
 
 # Index = code. Each text finishes the sentence "stream b: ...".

@@ -16,7 +16,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured
+from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.pipeline import maps_of
@@ -40,6 +40,15 @@ class Estimator(ABC):
     """
 
     module: nn.Module = nn.Identity()
+
+    def __init__(self, *, uses_variances: bool = True) -> None:
+        self._uses_variances = uses_variances
+
+    def used(self, prediction: DepthPrediction) -> DepthPrediction:
+        """The prediction, without A and E unless the row uses them."""
+        if self._uses_variances:
+            return prediction
+        return replace(prediction, aleatoric_variance=None, epistemic_variance=None)
 
     @abstractmethod
     def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
@@ -75,11 +84,11 @@ def make_estimator(
         ValueError: a recalibration that was fitted under other settings, or no method of that name.
         FileNotFoundError: the setting's recalibration does not exist.
     """
-    method, setting = row.method, row.setting
+    method, setting, uses = row.method, row.setting, row.method.uses_aleatoric
     if method.fusion == ALONE:
-        return Alone(uses_variances=method.uses_aleatoric)
+        return Alone(uses_variances=uses)
     if method.fusion == UFM:
-        return Pointwise(method.max_points, uses_variances=method.uses_aleatoric)
+        return Pointwise(method.max_points, uses_variances=uses)
     if method.fusion != UFM_STAR:
         if method.fusion not in own:
             raise ValueError(f"row {method.name}: no method is called {method.fusion!r}: --plugin FILE.py adds yours")
@@ -88,7 +97,7 @@ def make_estimator(
     fitted = Recalibration.from_json(setting.recalibration) if setting.recalibration else None
     config = ufm_star_config(row)
     config = config if source is None else config.within(source.max_depth, source.states_confidence)
-    return Gaussians(config, device, setting, uses_variances=method.uses_aleatoric, recalibration=fitted)
+    return Gaussians(config, device, posterior=setting.posterior, uses_variances=uses, recalibration=fitted)
 
 
 def ufm_star_config(row: Row) -> UfMStarConfig:
@@ -105,11 +114,8 @@ def ufm_star_config(row: Row) -> UfMStarConfig:
 class Alone(Estimator):
     """The network's own variance, A + E where it states them; without ``uses_variances`` none."""
 
-    def __init__(self, *, uses_variances: bool = True) -> None:
-        self._uses_variances = uses_variances
-
     def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
-        used = _used(prediction, self._uses_variances)
+        used = self.used(prediction)
         a, e, variance = used.aleatoric_variance, used.epistemic_variance, used.variance
         valid = (used.depth > 0) & used.depth.isfinite()
         for part in (a, e):
@@ -122,11 +128,11 @@ class Pointwise(Estimator):
     """UfM. Without ``uses_variances``, A and E are left aside."""
 
     def __init__(self, max_points: int | None, *, uses_variances: bool = True) -> None:
+        super().__init__(uses_variances=uses_variances)
         self.ufm = UfM(max_points)
-        self._uses_variances = uses_variances
 
     def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
-        used = _used(prediction, self._uses_variances)
+        used = self.used(prediction)
         a, e = used.aleatoric_variance, used.epistemic_variance
         out = self.ufm(used.depth, T_world_cam, prediction.K, a, e)
         return {"depth": used.depth, "variance": out.variance, "valid": out.valid, "aleatoric": a, "epistemic": e}
@@ -143,28 +149,29 @@ class Pointwise(Estimator):
 
 
 class Gaussians(Estimator):
-    """UfM*; ``setting`` is the row's: whether it answers with the posterior."""
+    """UfM*; with ``posterior``, depth and variance are the posterior's."""
 
     def __init__(
         self,
         config: UfMStarConfig,
         device: torch.device,
-        setting: Setting = DEFAULT,
         *,
+        posterior: bool = False,
         uses_variances: bool = True,
         recalibration: Recalibration | None = None,
     ) -> None:
+        super().__init__(uses_variances=uses_variances)
         extensions = () if recalibration is None else (recalibration,)
         self.module = self.ufm = UfMStar(config, extensions=extensions, device=device)
-        self._setting, self._uses_variances, self._anchors = setting, uses_variances, 0
+        self._posterior, self._anchors = posterior, 0
 
     def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
-        used = _used(prediction, self._uses_variances)
+        used = self.used(prediction)
         out = self.ufm(pose=T_world_cam, intrinsics=prediction.K, anchors=anchors, **maps_of(used, self.ufm))
         anchors_used = out.statistics.anchors_used
         self._anchors = 0 if anchors_used is None else int(anchors_used[0])
         answer = {name: getattr(out, name) for name in _OF_OUTPUT} | {"confidence": used.confidence}
-        if self._setting.posterior:
+        if self._posterior:
             answer["depth"], answer["variance"] = out.posterior()
         return answer
 
@@ -181,8 +188,3 @@ class Gaussians(Estimator):
         size = count * component + sum(value.nbytes for value in state.by_stream.values())
         memory: dict[str, float] = {"bytes": size, "count": count, "smoothing_bytes": self.ufm.smoothed.nbytes}
         return memory if self.ufm.config.anchors is None else memory | {"anchors": self._anchors}
-
-
-def _used(prediction: DepthPrediction, uses_variances: bool) -> DepthPrediction:
-    """The prediction, without A and E unless the row uses them."""
-    return prediction if uses_variances else replace(prediction, aleatoric_variance=None, epistemic_variance=None)

@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.frame import DEPTH_RANGE, FARTHEST, FOCAL_RANGE, LARGEST, POLAR_STEPS, FrameInput
+from ufmstar_torch.camera import POLAR_STEPS
+from ufmstar_torch.frame import DEPTH_RANGE, FARTHEST, FOCAL_RANGE, LARGEST, FrameInput
 from ufmstar_torch.kernels.arrays_cpu import array
 
 _Matrix = list[list[float]]
