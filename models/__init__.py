@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.alignment import AlignedNetwork as AlignedNetwork
     from ufmstar_torch.models.alignment import Alignment as Alignment
     from ufmstar_torch.models.alignment import AlignmentFit as AlignmentFit
-    from ufmstar_torch.models.alignment import AlignmentSums as AlignmentSums
     from ufmstar_torch.models.alignment import fit_affine_depth as fit_affine_depth
     from ufmstar_torch.models.alignment import fit_inverse_depth as fit_inverse_depth
     from ufmstar_torch.models.any_network import WrappedNetwork as WrappedNetwork

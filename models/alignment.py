@@ -114,31 +114,6 @@ class AlignmentFit:
     points: Tensor  # [B] usable measurements
     inliers: Tensor  # [B] those that the final fit used
     residual: Tensor  # [B] root mean square over the inliers of the difference in inverse depth [1/m] or depth [m]
-    sums: AlignmentSums  # to which those of further images can be added
-
-
-@dataclass(frozen=True, eq=False)
-class AlignmentSums:
-    """Weighted sums over measurements (x, y), which add up over a stream: ``total = total + fit.sums``."""
-
-    kind: str  # of the alignment
-    values: Tensor  # [..., 5] sums of w, w x, w y, w x^2, w x y
-
-    def __add__(self, other: AlignmentSums) -> AlignmentSums:
-        if self.kind != other.kind:
-            raise ValueError(f"cannot add sums for {other.kind!r} to sums for {self.kind!r}")
-        return AlignmentSums(self.kind, self.values + other.values)
-
-    def alignment(self, *, shift: float | None = None, max_depth: float | None = None) -> Alignment:
-        """The weighted least-squares alignment of everything summed; ``shift`` as :func:`fit_inverse_depth`. Raises
-        ValueError: the sums do not determine it, or the scale is not positive."""
-        scale, offset, determined = _line(self.values, shift)
-        flat = "has predictions that hardly differ, which determine no alignment; total weight:"
-        require_each(determined, self.values[..., 0], flat)
-        grows = "distance" if self.kind == "affine" else "nearness"
-        sentence = f"does not grow with {grows}, as kind {self.kind!r} declares; the fitted scale is"
-        require_each(scale > 0, scale, sentence)
-        return Alignment(self.kind, scale, offset, max_depth)
 
 
 class AlignedNetwork(DepthNetwork):
@@ -244,13 +219,15 @@ def _fit(
     require_each(count >= min_points, count, f"needs at least {min_points} measurements with a prediction, has")
     y = measured if kind == "affine" else 1 / measured
     inlier = _inliers(x, y, use, weight, shift) if robust else use
-    values = _sums(x, y, weight * inlier)
-    sums = AlignmentSums(kind, values[0] if pooled else values)
-    alignment = sums.alignment(shift=shift, max_depth=max_depth)
-    residual = y - alignment.scale.reshape(-1, 1) * x - alignment.shift.reshape(-1, 1)
+    scale, offset, determined = _line(x, y, weight * inlier, shift)
+    flat = "has predictions that hardly differ, which determine no alignment; measurements:"
+    require_each(determined, count, flat)
+    grows = "distance" if kind == "affine" else "nearness"
+    require_each(scale > 0, scale, f"does not grow with {grows}, as kind {kind!r} declares; the fitted scale is")
+    residual = y - scale[:, None] * x - offset[:, None]
     rms = ((residual.square() * inlier).sum(1) / inlier.sum(1)).sqrt()
-    points, inliers, rms = (v[0] if pooled else v for v in (count, inlier.sum(1), rms))
-    return AlignmentFit(alignment, points, inliers, rms, sums)
+    scale, offset, points, inliers, rms = (v[0] if pooled else v for v in (scale, offset, count, inlier.sum(1), rms))
+    return AlignmentFit(Alignment(kind, scale, offset, max_depth), points, inliers, rms)
 
 
 def _inliers(x: Tensor, y: Tensor, use: Tensor, weight: Tensor, shift: float | None) -> Tensor:
@@ -262,7 +239,7 @@ def _inliers(x: Tensor, y: Tensor, use: Tensor, weight: Tensor, shift: float | N
     root, inlier, weights = weight.sqrt(), use, weight * use
     floor = _ROUNDING * _median(y.abs() * root, use)
     for step in range(_REWEIGHTED + _TRIMMED):
-        scale, offset, determined = _line(_sums(x, y, weights), shift)
+        scale, offset, determined = _line(x, y, weights, shift)
         residual = (y - scale[:, None] * x - offset[:, None]).abs() * root
         deviation = torch.maximum(_MAD_TO_STD * _median(residual, use), floor)[:, None]
         if step < _REWEIGHTED:
@@ -276,15 +253,11 @@ def _inliers(x: Tensor, y: Tensor, use: Tensor, weight: Tensor, shift: float | N
     return inlier
 
 
-def _sums(x: Tensor, y: Tensor, w: Tensor) -> Tensor:
-    """[B, 5] as :class:`AlignmentSums` has them, of points [B, P]."""
-    return torch.stack([v.sum(1) for v in (w, w * x, w * y, w * x * x, w * x * y)], -1)
-
-
-def _line(sums: Tensor, shift: float | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Scale and shift [...] of the weighted least-squares line through sums [..., 5], and whether they are determined
+def _line(x: Tensor, y: Tensor, weight: Tensor, shift: float | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Scale and shift [B] of the weighted least-squares line through points [B, P], and whether they are determined
     (elsewhere the line through the origin of x)."""
-    w, wx, wy, wxx, wxy = sums.unbind(-1)
+    w, wx, wy = weight.sum(1), (weight * x).sum(1), (weight * y).sum(1)
+    wxx, wxy = (weight * x * x).sum(1), (weight * x * y).sum(1)
     if shift is None:
         spread, common = w * wxx - wx * wx, w * wxy - wx * wy
         determined = spread > _RANK * w * wxx

@@ -11,7 +11,7 @@ and its layers divide every batch among all members, so that one image cannot be
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.models.batch_layer import BatchLayer, Selection
-from ufmstar_torch.models.distribution import DepthDistribution, split_batch
+from ufmstar_torch.models.distribution import DepthDistribution
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.networks_in_turn import combine
@@ -62,20 +62,21 @@ def convert(
         raise ValueError(f"need members >= 2 and std >= 0, got {members} and {std}")
     if converted_layers(network):
         raise ValueError(f"{type(network).__name__} is converted already")
-    expected = 0
-    for name, module in network.named_modules():
-        if isinstance(module, _PLAIN):
-            _require_plain(name, module)
-            expected += 1
-    if not expected:
+    plain = [(name, module) for name, module in network.named_modules() if isinstance(module, _PLAIN)]
+    if not plain:
         raise ValueError(f"{type(network).__name__} has no Conv2d and no Linear: nothing to convert")
-    result, selection = copy.deepcopy(network), Selection()
-    plain = [module for module in result.modules() if isinstance(module, _PLAIN)]
-    result = _replace(result, {module: BatchLayer(module, members, selection) for module in plain})
+    # What deepcopy puts in place of an object, by its id: it replaces a layer wherever the network refers to it.
+    copies: dict[int, Any] = {}
+    selection = Selection()
+    for name, layer in plain:
+        _require_plain(name, layer)
+        copies[id(layer)] = BatchLayer(copy.deepcopy(layer, copies), members, selection)
+    result = copy.deepcopy(network, copies)
+    if left := [type(copied).__name__ for copied in copies.values() if isinstance(copied, _PLAIN)]:
+        raise ValueError(f"{type(network).__name__} keeps a {left[0]} that is not registered: use nn.ModuleList")
     layers = converted_layers(result)
-    left = sum(isinstance(module, _PLAIN) for module in result.modules()) - len(layers)  # each has one inside
-    if len(layers) != expected or left:
-        raise RuntimeError(f"{len(layers)} of {expected} layers were converted, {left} stayed as they were")
+    if len(layers) != len(plain):
+        raise RuntimeError(f"{len(layers)} of {len(plain)} layers were converted")
     for layer in layers:
         _draw(layer.r, std, generator)
         _draw(layer.s, std, generator)
@@ -133,8 +134,8 @@ class BatchEnsemble(DepthNetwork):
         between the members as E [m^2], from one pass with a batch of N B."""
         prediction = self.distribution(image).prediction()
         # In training mode a network with heads at several scales has as many blocks of members; the first predicts.
-        blocks = split_batch(prediction, max(self.members, len(prediction.depth) // max(len(image), 1)))
-        return combine(blocks[: self.members])
+        parts = [slice(n * len(image), (n + 1) * len(image)) for n in range(self.members)]
+        return combine([prediction.mapped(lambda value, part=part: value[part]) for part in parts])
 
     def member(self, n: int) -> BatchEnsembleMember:
         """Member n as a network, with the weights of this one: nothing is copied. Raises IndexError: no such member."""
@@ -148,8 +149,7 @@ class BatchEnsemble(DepthNetwork):
         """Member n as a plain network with its own weights W_n: the same function up to rounding, as fast as the
         network that was converted, and independent of this one. Raises IndexError: no such member."""
         self._checked(n)
-        network = copy.deepcopy(self.network)
-        return _replace(network, {layer: layer.plain(n) for layer in converted_layers(network)})
+        return copy.deepcopy(self.network, {id(layer): layer.plain(n) for layer in converted_layers(self.network)})
 
     def factors(self) -> list[nn.Parameter]:
         """r and s of every layer. Weight decay would pull them to 0, where a member ends, instead of to the
@@ -208,29 +208,3 @@ def _draw(factor: nn.Parameter, std: float, generator: torch.Generator | None) -
     values = 1 + std * torch.randn(factor.shape, generator=generator)
     with torch.no_grad():
         factor.copy_(values)
-
-
-def _replace(root: Network, new: Mapping[nn.Module, nn.Module]) -> Any:
-    """``root`` with modules replaced wherever its modules keep them, in place; or what replaces ``root``. Raises
-    ValueError: a layer that is no registered part of ``root`` is kept in a plain list or dict."""
-    modules = list(root.modules())
-    known = {id(module): new.get(module, module) for module in modules}
-    for module in modules:
-        for name, value in list(vars(module).items()):
-            vars(module)[name] = _replaced(value, known, f"{type(module).__name__}.{name}")
-    return known[id(root)]
-
-
-def _replaced(value: Any, known: Mapping[int, nn.Module], where: str) -> Any:
-    """``value`` with modules replaced, dicts and lists in place."""
-    if isinstance(value, nn.Module):
-        if id(value) not in known and any(isinstance(m, (*_PLAIN, BatchLayer)) for m in value.modules()):
-            raise ValueError(f"{where} keeps a {type(value).__name__} that is not registered: use nn.ModuleList")
-        return known.get(id(value), value)
-    if isinstance(value, dict):
-        value.update({key: _replaced(item, known, where) for key, item in value.items()})
-    elif isinstance(value, list):
-        value[:] = [_replaced(item, known, where) for item in value]
-    elif type(value) is tuple:
-        return tuple(_replaced(item, known, where) for item in value)
-    return value

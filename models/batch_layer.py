@@ -29,9 +29,8 @@ class BatchLayer(nn.Module):
     """W, and for every member two factors and a bias.
 
     Args:
-        layer: a Conv2d or Linear; becomes W (the parameter itself, so that tied weights stay tied) and every
-            member's first bias. It loses its parameters: code that still refers to it fails, instead of
-            continuing without the members.
+        layer: a Conv2d or Linear, which becomes a part of this one: W (the parameter itself, so that tied weights stay
+            tied), and every member's first bias.
         members: N.
         selection: the member of every image; the same object for all layers of a network.
     """
@@ -47,9 +46,8 @@ class BatchLayer(nn.Module):
         self.r = nn.Parameter(weight.new_ones(members, inputs))
         self.s = nn.Parameter(weight.new_ones(members, weight.shape[0]))
         self.register_parameter("bias", None if bias is None else nn.Parameter(bias.detach().repeat(members, 1)))
-        self.shared = copy.copy(layer)
-        self.shared._parameters = {**layer._parameters, "bias": None}
-        layer._parameters.clear()
+        self.shared = layer
+        self.shared.bias = None
         self.train(layer.training)
 
     @property

@@ -57,13 +57,3 @@ class EvidentialDepth:
 
 
 DepthDistribution = PointDepth | GaussianDepth | EvidentialDepth
-
-
-def split_batch(prediction: DepthPrediction, count: int) -> list[DepthPrediction]:
-    """The ``count`` predictions [B, H, W] that were computed as one batch [count B, H, W], in their order."""
-
-    def split(value: Tensor | None) -> tuple[Tensor, ...] | list[None]:
-        return [None] * count if value is None else value.chunk(count)
-
-    maps = (prediction.depth.chunk(count), split(prediction.aleatoric_variance), split(prediction.epistemic_variance))
-    return [DepthPrediction(depth, a, e) for depth, a, e in zip(*maps, strict=True)]

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth, split_batch
+from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -129,8 +129,7 @@ class UncertaintyNetwork(DepthNetwork):
     def forward(self, image: Tensor) -> DepthPrediction:
         """Depth [B, H, W] [m] and the head's variances [m^2] of ``image`` as ``preprocess`` returns it."""
         prediction = self.distribution(image).prediction()
-        scales = len(prediction.depth) // max(len(image), 1)
-        return prediction if scales <= 1 else split_batch(prediction, scales)[0]
+        return prediction.mapped(lambda value: value[: len(image)]) if self.training else prediction
 
 
 class DepthOnlyNetwork(UncertaintyNetwork):

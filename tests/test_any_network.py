@@ -35,7 +35,7 @@ from ufmstar_torch.models import (
     wrap_network,
 )
 from ufmstar_torch.models.any_network import load_exported, load_torchscript
-from ufmstar_torch.models.outputs import ProgramSpec
+from ufmstar_torch.models.outputs import SPREADS, ProgramSpec
 from ufmstar_torch.prediction import DepthPrediction, infer
 
 METRIC = ProgramSpec(OutputSpec("metric"))
@@ -84,21 +84,18 @@ def test_forms_of_depth(image: Tensor, returned: Any, output: str | int | None) 
     torch.testing.assert_close(network(image).depth, image.sum(1), check_dtype=False)
 
 
-def test_units_and_variances(image: Tensor) -> None:
-    """Millimetres with a standard deviation in millimetres and a log-variance in log mm^2."""
-    network = wrap_network(
-        lambda x: {"d": x.sum(1), "s": x[:, 0], "l": x[:, :1]},
-        "d",
-        scale=0.001,
-        aleatoric="s",
-        aleatoric_kind="std",
-        epistemic="l",
-        epistemic_kind="log_variance",
-    )
-    got = network(image)
+@pytest.mark.parametrize("kind", SPREADS)
+def test_units_and_variances(image: Tensor, kind: Any) -> None:
+    """Millimetres with a spread in the same unit, whatever form it has, become metres and m^2."""
+    raw = image[:, 0] - 1  # logarithms may be negative
+    maps = {"d": image.sum(1), "s": raw, "v": image[:, :1]}
+    declared = {"aleatoric": "s", "aleatoric_kind": kind, "epistemic": "v"}
+    got = wrap_network(lambda x: maps, "d", scale=0.001, **declared)(image)
     torch.testing.assert_close(got.depth, image.sum(1) * 1e-3)
-    torch.testing.assert_close(got.aleatoric_variance, image[:, 0] ** 2 * 1e-6)
-    torch.testing.assert_close(got.epistemic_variance, image[:, 0].exp() * 1e-6)
+    squared = {"variance": raw, "std": raw**2, "log_variance": raw.exp(), "log_std": raw.exp() ** 2}
+    squared["relative_std"] = (raw * image.sum(1)) ** 2
+    torch.testing.assert_close(got.aleatoric_variance, squared[kind] * 1e-6)
+    torch.testing.assert_close(got.epistemic_variance, image[:, 0] * 1e-6)
 
 
 def cameras(*focals: tuple[float, float]) -> Tensor:

@@ -198,6 +198,10 @@ def test_layers_that_compute_something_else_are_refused():
     ):
         with pytest.raises(TypeError, match=r"1.* cannot be converted"):
             convert(nn.Sequential(nn.Conv2d(3, 3, 1), layer), N)
+    network = nn.Sequential(nn.Linear(3, 3))
+    network.more = [nn.Sequential(nn.Linear(3, 3))]  # neither trained nor saved
+    with pytest.raises(ValueError, match="Sequential keeps a Linear that is not registered"):
+        convert(network, N)
 
 
 def test_fastdepth_and_monodepth2_are_converted_whole():

@@ -81,7 +81,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: loss_of(PointDepth(MAP), MAP[:1], MAP > 0), "target"),
     (lambda: loss_of(MAP, MAP, MAP > 0), "distribution"),
     (lambda: loss(evidence_weight=-1.0), "evidence_weight"),
-    (lambda: loss(beta_nll=2.0), "beta_nll"),
 ]
 
 

@@ -15,7 +15,7 @@ from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.train import SampleDataset, SampleError, SequenceFrames, tour_frames
 from ufmstar_torch.train.data_config import Part
 from ufmstar_torch.train.sequence_data import open_rgbd
-from ufmstar_torch.train.tour_data import TourFrames, tour_files
+from ufmstar_torch.train.tour_data import TourFrames, tour_file
 
 
 @pytest.mark.parametrize(
@@ -112,10 +112,9 @@ def test_tours_are_rendered_once_and_completed(tours, tmp_path):
     times = {path.name: path.stat().st_mtime_ns for path in inside.iterdir()}
     tour_frames([5, 6], TINY, tmp_path / "cache")
     assert times == {path.name: path.stat().st_mtime_ns for path in inside.iterdir()}
-    tour_files(inside, 6)[-1].unlink()  # as a kill between the writes leaves it
+    tour_file(inside, 6).unlink()
     again = tour_frames([5, 6], TINY, tmp_path / "cache")
-    for path in tour_files(inside, 5):
-        assert path.stat().st_mtime_ns == times[path.name]
+    assert tour_file(inside, 5).stat().st_mtime_ns == times["5.npy"]
     np.testing.assert_array_equal(again.load(4).image, frames.load(4).image)
     assert sorted(times) == sorted(path.name for path in inside.iterdir())  # nothing temporary is left
 
@@ -124,8 +123,8 @@ def test_a_truncated_cache_file_is_named(tours, tmp_path):
     folder, frames = tours
     shutil.copytree(folder, tmp_path / "cache")
     inside = tmp_path / "cache" / frames.folder.name
-    truncated(tour_files(inside, 5)[1], 0.5)
+    truncated(tour_file(inside, 5), 0.5)
     copy = TourFrames(inside, [5, 6], 3)
-    with pytest.raises(SampleError, match=r"5\.image\.npy\[1\]"):
+    with pytest.raises(SampleError, match=r"5\.npy\[1\]"):
         copy.load(1)
     np.testing.assert_array_equal(copy.load(3).depth, frames.load(3).depth)

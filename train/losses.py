@@ -35,7 +35,6 @@ def loss_of(
     valid: Tensor,
     *,
     evidence_weight: float = EVIDENCE_WEIGHT,
-    beta_nll: float = 0.0,
 ) -> Tensor:
     """The distribution's loss, averaged over the pixels that have ground truth.
 
@@ -48,7 +47,6 @@ def loss_of(
         valid: [B, H, W] bool, True = use; pixels whose target is not finite and positive are left out as
             well.
         evidence_weight: lambda of :func:`evidential_loss`.
-        beta_nll: exponent of :func:`gaussian_nll`'s weight; 0 = the likelihood itself.
 
     Returns:
         A scalar. Without any valid pixel it is 0 and its gradient is 0 everywhere (and not absent: a
@@ -57,7 +55,7 @@ def loss_of(
     Raises:
         ValueError: shapes differ, ``valid`` is not bool, a weight is out of range.
     """
-    total, count = loss_sums(distribution, target, valid, evidence_weight=evidence_weight, beta_nll=beta_nll)
+    total, count = loss_sums(distribution, target, valid, evidence_weight=evidence_weight)
     return total / count.clamp(min=1)
 
 
@@ -67,7 +65,6 @@ def loss_sums(
     valid: Tensor,
     *,
     evidence_weight: float = EVIDENCE_WEIGHT,
-    beta_nll: float = 0.0,
 ) -> tuple[Tensor, Tensor]:
     """The sum of the loss over valid pixels and their number (int64); arguments as :func:`loss_of`.
 
@@ -76,7 +73,7 @@ def loss_sums(
     gradients averaged over processes (as DistributedDataParallel does), ``sum * world / total`` as each process's
     loss gives the gradient of one process that sees the whole batch.
     """
-    _check(distribution, target, valid, evidence_weight, beta_nll)
+    _check(distribution, target, valid, evidence_weight)
     usable = valid & target.isfinite() & (target > 0)
 
     def at_valid(values: Tensor, elsewhere: float = 1.0) -> Tensor:
@@ -87,7 +84,7 @@ def loss_sums(
     goal = at_valid(target)
     depth = at_valid(distribution.depth)
     if isinstance(distribution, GaussianDepth):
-        loss = gaussian_nll(depth, at_valid(distribution.log_variance, 0.0), goal, beta=beta_nll)
+        loss = gaussian_nll(depth, at_valid(distribution.log_variance, 0.0), goal)
     elif isinstance(distribution, EvidentialDepth):
         nu, beta = at_valid(distribution.nu), at_valid(distribution.beta)
         loss = evidential_loss(depth, nu, at_valid(distribution.alpha, 2.0), beta, goal, evidence_weight)
@@ -101,20 +98,16 @@ def depth_l1(depth: Tensor, target: Tensor) -> Tensor:
     return (target - depth).abs()
 
 
-def gaussian_nll(depth: Tensor, log_variance: Tensor, target: Tensor, *, beta: float = 0.0) -> Tensor:
+def gaussian_nll(depth: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
     """-log N(target; depth, exp(s)) = ((target - depth)^2 exp(-s) + s + log 2 pi) / 2 per pixel [nat].
 
     Args:
         depth: [...] mean [m].
         log_variance: [...] s, of the variance in m^2. Beyond +-40 value and gradient are those at +-40.
         target: [...] [m].
-        beta: weighs each pixel with variance^beta, which gets no gradient (Seitzer et al. 2022, who
-            suggest 0.5): pixels with a large variance then no longer learn their depth more slowly. The result is
-            then no likelihood.
     """
     s = log_variance + (log_variance.clamp(-_LOG_VARIANCE_LIMIT, _LOG_VARIANCE_LIMIT) - log_variance).detach()
-    nll = 0.5 * ((target - depth).square() * (-s).exp() + s + math.log(2 * math.pi))
-    return nll * (beta * s.detach()).exp() if beta else nll
+    return 0.5 * ((target - depth).square() * (-s).exp() + s + math.log(2 * math.pi))
 
 
 def evidential_nll(depth: Tensor, nu: Tensor, alpha: Tensor, beta: Tensor, target: Tensor) -> Tensor:
@@ -158,7 +151,7 @@ def _log_gamma_half_step(a: Tensor) -> Tensor:
     return torch.where(large, series, torch.lgamma(small + 0.5) - torch.lgamma(small))
 
 
-def _check(distribution: DepthDistribution, target: Tensor, valid: Tensor, evidence: float, beta: float) -> None:
+def _check(distribution: DepthDistribution, target: Tensor, valid: Tensor, evidence_weight: float) -> None:
     if not isinstance(distribution, PointDepth | GaussianDepth | EvidentialDepth):
         raise ValueError(f"distribution must be a DepthDistribution, got {type(distribution).__name__}")
     if valid.dtype != torch.bool:
@@ -169,5 +162,5 @@ def _check(distribution: DepthDistribution, target: Tensor, valid: Tensor, evide
             f"target and valid must have the depth's shape {tuple(shape)}, got {tuple(target.shape)} and "
             f"{tuple(valid.shape)}"
         )
-    if not evidence >= 0 or not 0 <= beta <= 1:
-        raise ValueError(f"evidence_weight must be >= 0 and beta_nll in [0, 1], got {evidence} and {beta}")
+    if not evidence_weight >= 0:
+        raise ValueError(f"evidence_weight must be >= 0, got {evidence_weight}")

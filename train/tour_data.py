@@ -1,10 +1,9 @@
-"""Rendered tours as training frames, rendered once into memory-mapped files.
+"""Rendered tours as training frames, each rendered once into a memory-mapped file.
 
-A tour's files are ``<seed>.image.npy`` (uint8 [F, 3, H, W]), ``<seed>.depth.npy`` (uint16 [F, H, W] in
-millimetres, 0 = none), ``<seed>.pose.npy`` (float64 [F, 4, 4], camera-to-world) and ``<seed>.camera.npy`` (float64
-[3, 3]), written atomically and the camera last, so that its presence means that the tour is complete. The name of
-their folder is a digest of everything that decides their content, the renderer's source included, so that other
-settings and other versions have folders of their own.
+A tour's file is ``<seed>.npy``, an array [F] of records: ``image`` (uint8 [3, H, W]), ``depth`` (uint16 [H, W] in
+millimetres, 0 = none), ``pose`` (float64 [4, 4], camera-to-world) and ``camera`` (float64 [3, 3]). It is written
+atomically. The name of its folder is a digest of everything that decides the content, the renderer's source included,
+so that other settings and other versions have folders of their own.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.array_files import read_npy
-from ufmstar_torch.atomic import write_together
+from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.eval.tour.style import style_of
 from ufmstar_torch.train.samples import RawSample, SampleError
@@ -75,7 +74,7 @@ class TourFrames:
 
     def __init__(self, folder: Path, seeds: Iterable[int], frames: int) -> None:
         self.folder, self.seeds, self.frames = folder, tuple(seeds), frames
-        self._maps: dict[int, tuple[NDArray[Any], ...]] = {}
+        self._maps: dict[int, NDArray[Any]] = {}
 
     def __getstate__(self) -> dict[str, object]:
         # A worker process maps the files itself: a pickled map would be a copy of all of it.
@@ -86,28 +85,23 @@ class TourFrames:
 
     def name(self, index: int) -> str:
         """The tour's file and the frame."""
-        return f"{self.folder / str(self.seeds[index // self.frames])}.image.npy[{index % self.frames}]"
+        return f"{tour_file(self.folder, self.seeds[index // self.frames])}[{index % self.frames}]"
 
     def runs(self) -> list[range]:
         """The frames of every tour."""
         return [range(n, n + self.frames) for n in range(0, len(self), self.frames)]
 
     def load(self, index: int) -> RawSample:
-        """Reads a frame. Raises SampleError: the tour's files are missing or truncated."""
-        seed, frame = self.seeds[index // self.frames], index % self.frames
+        """Reads a frame. Raises SampleError: the tour's file is missing or truncated."""
+        seed, number = self.seeds[index // self.frames], index % self.frames
         try:
-            image, depth, pose, camera = self._mapped(seed)
-            metres = depth[frame].astype(np.float32) * np.float32(_UNIT)
-            return RawSample(image[frame].copy(), metres, camera, pose[frame])
+            if seed not in self._maps:
+                self._maps[seed] = read_npy(tour_file(self.folder, seed), mapped=True)
+            frame = self._maps[seed][number]
+            metres = frame["depth"].astype(np.float32) * np.float32(_UNIT)
+            return RawSample(frame["image"].copy(), metres, frame["camera"], frame["pose"])
         except (OSError, ValueError, IndexError) as error:
             raise SampleError(self.name(index), f"cannot be read: {error}") from error
-
-    def _mapped(self, seed: int) -> tuple[NDArray[Any], ...]:
-        if seed not in self._maps:
-            image, depth, *small = tour_files(self.folder, seed)
-            maps = (read_npy(file, mapped=True) for file in (image, depth))
-            self._maps[seed] = (*maps, *map(read_npy, small))
-        return self._maps[seed]
 
 
 def tour_frames(
@@ -138,7 +132,7 @@ def tour_frames(
     own = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ufmstar_torch" / "tours"
     folder = (own if cache is None else Path(cache)) / f"tours-{settings.digest()}"
     folder.mkdir(parents=True, exist_ok=True)
-    missing = [seed for seed in seeds if not tour_files(folder, seed)[-1].exists()]
+    missing = [seed for seed in seeds if not tour_file(folder, seed).exists()]
     random.Random(os.getpid()).shuffle(missing)
     if missing:
         _LOG.info("rendering %d tours of %d frames into %s", len(missing), settings.frames, folder)
@@ -146,17 +140,17 @@ def tour_frames(
     return TourFrames(folder, seeds, settings.frames)
 
 
-def tour_files(folder: Path, seed: int) -> tuple[Path, ...]:
-    """A tour's images, depth maps, poses and camera."""
-    return tuple(folder / f"{seed}.{part}.npy" for part in ("image", "depth", "pose", "camera"))
+def tour_file(folder: Path, seed: int) -> Path:
+    """A tour's frames."""
+    return folder / f"{seed}.npy"
 
 
 def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
-    """Renders one tour into its files, unless they exist."""
+    """Renders one tour into its file, unless it exists."""
     from ufmstar_torch.eval.tour import tour_sequence
 
-    files = tour_files(folder, seed)
-    if files[-1].exists():
+    file = tour_file(folder, seed)
+    if file.exists():
         return
     sequence = tour_sequence(
         seed,
@@ -166,18 +160,15 @@ def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
         fov=settings.fov,
         path_seed=0,  # the longest way, from anywhere on it
     )
-    image = np.empty((settings.frames, 3, *settings.size), np.uint8)
-    depth = np.empty((settings.frames, *settings.size), np.uint16)
-    pose = np.empty((settings.frames, 4, 4))
+    maps = [("image", np.uint8, (3, *settings.size)), ("depth", np.uint16, settings.size)]
+    frames = np.empty(settings.frames, [*maps, ("pose", np.float64, (4, 4)), ("camera", np.float64, (3, 3))])
     for i in range(settings.frames):
         frame = sequence[i * settings.stride]
-        if frame.image is None or frame.depth is None:
-            raise ValueError(f"tour {seed}: frame {frame.name} has no image or depth")
-        image[i] = frame.image.transpose(2, 0, 1)
-        depth[i] = np.rint(frame.depth / _UNIT).clip(0, _FARTHEST)
-        pose[i] = frame.T_world_cam
-    arrays: tuple[NDArray[Any], ...] = (image, depth, pose, sequence.intrinsics)
-    write_together({path: partial(np.save, arr=array) for path, array in zip(files, arrays, strict=True)})
+        assert frame.image is not None
+        assert frame.depth is not None
+        depth = np.rint(frame.depth / _UNIT).clip(0, _FARTHEST)
+        frames[i] = (frame.image.transpose(2, 0, 1), depth, frame.T_world_cam, frame.intrinsics)
+    write_atomic(file, partial(np.save, arr=frames))
 
 
 def _render(folder: Path, seeds: list[int], settings: TourSettings, workers: int) -> None:
