@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.models.hugging_face import from_hugging_face, of_transformers
 from ufmstar_torch.models.network import DeclaredNetwork, DepthNetwork
-from ufmstar_torch.models.outputs import METRIC, OutputSpec, ProgramSpec, Spread
+from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec, ProgramSpec, Spread
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction, infer
 from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
@@ -24,7 +24,6 @@ from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
 # Files of a torch.export archive: those of a word or a number, and tensors as raw bytes.
 _TEXTS = ("archive_format", "archive_version", "byteorder", "version", "serialization_id")
 _RAW = re.compile(r"[^/]+/data/(weights/weight|constants/tensor)_\d+")
-Spec = ProgramSpec | Mapping[str, Any] | str | Path
 
 
 class WrappedNetwork(DeclaredNetwork):
@@ -155,7 +154,7 @@ def _described(value: object) -> str:
     return type(value).__name__ + several
 
 
-def load_torchscript(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
+def load_torchscript(path: str | Path, spec: ProgramSpec | PlainSpec | None = None) -> WrappedNetwork:
     """A TorchScript file (``torch.jit.save``) as a network, on the CPU; ``spec``: a :class:`ProgramSpec`, its plain
     values or a JSON file. Such a file is a program: load only what you trust. Raises FileNotFoundError: there is no
     such file; ValueError: it is not a TorchScript file, or the spec is missing or impossible."""
@@ -167,7 +166,7 @@ def load_torchscript(path: str | Path, spec: Spec | None = None) -> WrappedNetwo
     return _wrapped(program.eval(), declared, path)
 
 
-def load_exported(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
+def load_exported(path: str | Path, spec: ProgramSpec | PlainSpec | None = None) -> WrappedNetwork:
     """A ``torch.export`` file (``torch.export.save``, .pt2) as a network; arguments, trust and errors as
     :func:`load_torchscript`. ``torch.export.load`` would unpickle any object in the archive, so one that holds more
     than tensors beside its graph is refused."""

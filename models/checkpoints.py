@@ -83,7 +83,7 @@ def fill(module: nn.Module, state: Mapping[str, Tensor], source: str) -> None:
         "missing": sorted(set(expected) - set(state)),
         "unexpected": sorted(set(state) - set(expected)),
         "of another shape": [
-            f"{key} is {own}, expected {other}" for key, (own, other) in shapes.items() if own != other
+            f"{key} is {actual}, expected {wanted}" for key, (actual, wanted) in shapes.items() if actual != wanted
         ],
         "with NaN or infinity": [key for key in sorted(state) if not torch.isfinite(state[key]).all()],
     }

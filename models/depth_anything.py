@@ -8,16 +8,22 @@ CC BY-NC 4.0: not for commercial use.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import torch
 
 from ufmstar_torch.models.checkpoints import CheckpointError
-from ufmstar_torch.models.hugging_face import Checkpoint, HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
+from ufmstar_torch.models.hugging_face import (
+    Checkpoint,
+    HuggingFaceDepth,
+    HuggingFaceSpec,
+    load_hugging_face,
+    read_checkpoint,
+)
 from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.outputs import PlainSpec
 
 SIZE = (518, 518)  # [px] of the input
 
@@ -68,8 +74,6 @@ class DepthAnything(HuggingFaceDepth):
         return cls(checkpoint, HuggingFaceSpec(size=size, keep_aspect=keep_aspect), dtype).to(device)
 
 
-def load_depth_anything(weights: Path, spec: Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
-    """The metric network in a directory, or of a hub name; arguments and errors as ``load_hugging_face``."""
-    declared = HuggingFaceSpec.read(spec or {})
-    metric: DepthNetwork = DepthAnything(read_checkpoint(weights), declared).aligned(declared.alignment)
-    return metric
+def load_depth_anything(weights: Path, spec: HuggingFaceSpec | PlainSpec | None = None) -> DepthNetwork:
+    """As ``load_hugging_face``, for this architecture."""
+    return load_hugging_face(weights, spec, DepthAnything)

@@ -28,9 +28,9 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_file
 from ufmstar_torch.models.dropout import DecoderDropout
 from ufmstar_torch.models.network import Backbone, DepthNetwork, require_image
-from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec, load_onnx, providers_for
+from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec, providers_for
 from ufmstar_torch.models.onnx_weights import read_convolutions
-from ufmstar_torch.models.outputs import METRIC, OutputSpec, ProgramSpec
+from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec, ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 
 MULTIPLE = 32  # [px] five halvings
@@ -226,7 +226,7 @@ class FastDepth(Backbone):
 
         The widths are read from the file, every weight in it must be used and every parameter filled, and on one
         random image the network must agree with ONNX Runtime; without that package, a warning states that this was not
-        tested. Batch norms stay batch norms (with their counters), so fine-tuning goes on as if from a checkpoint after
+        tested. Batch norms stay batch norms, so fine-tuning goes on as if from a checkpoint after
         ``.train()``; a file that has them folded gives a network without norm layers (``norm=False``).
 
         Args:
@@ -328,20 +328,17 @@ def _graph(network: FastDepth, weights: Path, runtime: str, threads: int, device
     if runtime == "auto" and device.type != "cpu" and len(providers) == 1:
         return None
     graph = OnnxNetwork(weights, OnnxSpec(OutputSpec(METRIC)), threads=threads, providers=providers)
-    if any(own not in (None, side) for own, side in zip(graph.size, network.size, strict=True)):
+    if any(fixed not in (None, side) for fixed, side in zip(graph.size, network.size, strict=True)):
         return None
     graph.preprocess = network.preprocess
     return graph
 
 
-def load_graph(
-    weights: Path, spec: OnnxSpec | Mapping[str, Any] | str | Path | None = None, **options: Any
-) -> OnnxNetwork:
-    """Any ONNX network, as ``load_onnx``; a FastDepth whose spec has no ``preprocess`` gets FastDepth's own crop,
-    instead of an image that is stretched."""
-    declared = OnnxSpec.required(spec)
-    network = load_onnx(weights, declared, **options)
-    if declared.preprocess is None and find_spec("onnx") is not None:
+def load_graph(weights: Path, spec: OnnxSpec | PlainSpec | None = None, **options: Any) -> OnnxNetwork:
+    """As :class:`OnnxNetwork`; a FastDepth whose spec has no ``preprocess`` gets FastDepth's own crop, instead of an
+    image that is stretched."""
+    network = OnnxNetwork(weights, spec, **options)
+    if network.spec.preprocess is None and find_spec("onnx") is not None:
         with suppress(ValueError):  # another network
             FastDepth.from_onnx(weights)
             network.preprocess = Preprocess.nyu(network.preprocess.size or (224, 224))

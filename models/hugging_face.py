@@ -8,7 +8,6 @@ numbers and goes on; here that is an error.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from pickle import UnpicklingError
@@ -22,7 +21,7 @@ from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.models.alignment import KINDS, AlignedNetwork, Alignment
 from ufmstar_torch.models.checkpoints import DAMAGE, CheckpointError, some
 from ufmstar_torch.models.network import DepthNetwork, require_image
-from ufmstar_torch.models.outputs import METRIC, as_map
+from ufmstar_torch.models.outputs import METRIC, PlainSpec, as_map
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.optional import optional
 from ufmstar_torch.prediction import DepthPrediction
@@ -272,12 +271,16 @@ def _in_memory(network: Any, processor: Any) -> tuple[nn.Module, Checkpoint]:
     return model, Checkpoint(name, model.config.to_dict(), described, {})
 
 
-def load_hugging_face(weights: Path, spec: Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
+def load_hugging_face(
+    weights: Path,
+    spec: HuggingFaceSpec | PlainSpec | None = None,
+    kind: type[HuggingFaceDepth] = HuggingFaceDepth,
+) -> DepthNetwork:
     """The metric network in a directory, or of a hub name; ``spec``: :class:`HuggingFaceSpec`, its plain values or a
     JSON file. Raises ValueError: an unknown option, or a relative network without an alignment; others as
     :func:`from_hugging_face`."""
     declared = HuggingFaceSpec.read(spec or {})
-    network: DepthNetwork = HuggingFaceDepth(read_checkpoint(weights), declared).aligned(declared.alignment)
+    network: DepthNetwork = kind(read_checkpoint(weights), declared).aligned(declared.alignment)
     return network
 
 
@@ -291,8 +294,7 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
 
     path = Path(name_or_dir).expanduser()
     # A directory is meant where one exists, and by what no "owner/name" looks like.
-    given = str(name_or_dir)
-    local = path.is_dir() or path.is_absolute() or given.startswith(".") or len(path.parts) != 2
+    local = path.is_dir() or path.is_absolute() or str(name_or_dir).startswith(".") or len(path.parts) != 2
     if local and not (path / "config.json").is_file():
         what = f"{path} has no config.json" if path.is_dir() else f"no such directory: {path}"
         raise FileNotFoundError(f"{what}; a checkpoint of transformers is a directory with config.json and weights")
@@ -368,9 +370,9 @@ def _preprocess(checkpoint: Checkpoint, size: tuple[int, int] | None, keep_aspec
             f"{name}: its image processor needs {unknown or f'resample {resample}'}, which is not supported: "
             f"declare another one {declare}"
         )
-    own = processor.get("size")
-    if size is None and isinstance(own, dict) and {"height", "width"} <= set(own):
-        size = (int(own["height"]), int(own["width"]))
+    stated = processor.get("size")
+    if size is None and isinstance(stated, dict) and {"height", "width"} <= set(stated):
+        size = (int(stated["height"]), int(stated["width"]))
     if size is None:
         raise ValueError(f"{name}: preprocessor_config.json states no size with height and width: declare it {declare}")
     keep = bool(processor.get("keep_aspect_ratio")) if keep_aspect is None else keep_aspect
@@ -413,16 +415,16 @@ def _kind(checkpoint: Checkpoint, spec: HuggingFaceSpec) -> str:
         raise ValueError(f"{name}: depth_estimation_type must be one of {list(_DECLARED)}, got {stated!r}")
     if stated == METRIC and "max_depth" not in config:
         raise ValueError(f"{name} states metric depth, but not the max_depth [m] that its output is a share of")
-    own = METRIC if _ALWAYS_METRIC[model_type] else _DECLARED.get(str(stated))
-    if own is None and kind is None:
+    stated_kind = METRIC if _ALWAYS_METRIC[model_type] else _DECLARED.get(str(stated))
+    if stated_kind is None and kind is None:
         raise ValueError(
             f"{name} ({model_type}) does not say whether its depth is metric: declare kind='metric', 'inverse' "
             "(inverse depth up to scale and shift) or 'affine' (depth up to scale and shift)"
         )
-    if own is not None and kind not in (None, own):
-        aligned = "" if own == METRIC else ": from_hugging_face(...).aligned(alignment) makes it metric"
+    if stated_kind is not None and kind not in (None, stated_kind):
+        aligned = "" if stated_kind == METRIC else ": from_hugging_face(...).aligned(alignment) makes it metric"
         source = f"depth_estimation_type {stated!r}" if stated else f"the architecture {model_type}"
-        raise ValueError(f"kind={kind!r}, but {name} states {source}, which is {own!r}{aligned}")
-    if (own or kind) != METRIC and spec.scale != 1:
+        raise ValueError(f"kind={kind!r}, but {name} states {source}, which is {stated_kind!r}{aligned}")
+    if (stated_kind or kind) != METRIC and spec.scale != 1:
         raise ValueError(f"scale goes with kind {METRIC!r} only; a relative network gets an Alignment")
-    return own or str(kind)
+    return stated_kind or str(kind)

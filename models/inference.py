@@ -93,11 +93,11 @@ class Inference(Checked):
 def runtime_of(network: nn.Module, precision: str) -> dict[str, Any]:
     """The runtime of a network, for the record: name, version, threads, provider (ONNX Runtime) and precision."""
     if isinstance(network, OnnxNetwork):
-        own = {"provider": network.session.get_providers()[0], "threads": network.threads or None}
-        return {"name": "onnxruntime", "version": version("onnxruntime"), **own, "precision": "as in the file"}
+        details = {"provider": network.session.get_providers()[0], "threads": network.threads or None}
+        return {"name": "onnxruntime", "version": version("onnxruntime"), **details, "precision": "as in the file"}
     if isinstance(network, LiteRTNetwork):
-        own = {"version": version("ai-edge-litert"), "threads": network.threads or None}
-        return {"name": "litert", **own, "precision": "as in the file"}
+        details = {"version": version("ai-edge-litert"), "threads": network.threads or None}
+        return {"name": "litert", **details, "precision": "as in the file"}
     return {"name": "torch", "version": torch.__version__, "threads": torch.get_num_threads(), "precision": precision}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.models.network import DeclaredNetwork, require_image
-from ufmstar_torch.models.outputs import ProgramSpec
+from ufmstar_torch.models.outputs import PlainSpec, ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.optional import optional
 from ufmstar_torch.prediction import DepthPrediction
@@ -25,7 +24,8 @@ class LiteRTNetwork(DeclaredNetwork):
 
     Args:
         path: the .tflite file, with one image [1, H, W, 3] or [1, 3, H, W] as input.
-        spec: declares what the file does not state. Without ``preprocess``, the image in [0, 1] is stretched to H x W.
+        spec: declares what the file does not state: a :class:`ProgramSpec`, its plain values or a JSON file. Without
+            ``preprocess``, the image in [0, 1] is stretched to H x W.
         threads: of the CPU; 0 leaves it to LiteRT.
 
     Raises:
@@ -34,13 +34,14 @@ class LiteRTNetwork(DeclaredNetwork):
         ValueError: the file is broken, or spec and file do not fit.
     """
 
-    def __init__(self, path: str | Path, spec: ProgramSpec, *, threads: int = 0) -> None:
+    def __init__(self, path: str | Path, spec: ProgramSpec | PlainSpec | None = None, *, threads: int = 0) -> None:
         super().__init__()
-        self.path, self.outputs, self.threads = str(path), spec.outputs, threads
-        if spec.takes_intrinsics:
+        declared = ProgramSpec.required(spec)
+        self.path, self.outputs, self.threads = str(path), declared.outputs, threads
+        if declared.takes_intrinsics:
             raise ValueError(f"{path}: takes_intrinsics is not supported for .tflite files")
         self._open()
-        preprocess = spec.preprocess or Preprocess()
+        preprocess = declared.preprocess or Preprocess()
         if preprocess.size not in (None, self.size):
             raise ValueError(f"{path}: the input has {self.size} px, the spec's preprocess.size {preprocess.size}")
         self.preprocess = replace(preprocess, size=self.size)
@@ -90,12 +91,12 @@ class LiteRTNetwork(DeclaredNetwork):
             image = (image / (scale or 1) + zero).round().clip(limits.min, limits.max)
         self.interpreter.set_tensor(self.input["index"], image[None].astype(dtype))
         self.interpreter.invoke()
-        found: dict[str, Tensor] = {}
-        for name, about in self.details.items():
-            value = torch.from_numpy(np.atleast_1d(self.interpreter.get_tensor(about["index"])).astype(np.float32))
-            scale, zero = about["quantization"]
-            found[name] = (value - zero) * scale if scale else value
-        return found
+        outputs: dict[str, Tensor] = {}
+        for name, details in self.details.items():
+            value = torch.from_numpy(np.atleast_1d(self.interpreter.get_tensor(details["index"])).astype(np.float32))
+            scale, zero = details["quantization"]
+            outputs[name] = (value - zero) * scale if scale else value
+        return outputs
 
     def __getstate__(self) -> dict[str, Any]:
         # An interpreter cannot be copied or pickled; the copy opens its own from the same file.
@@ -105,10 +106,3 @@ class LiteRTNetwork(DeclaredNetwork):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._open()
-
-
-def load_litert(
-    weights: Path, spec: ProgramSpec | Mapping[str, Any] | str | Path | None = None, threads: int = 0
-) -> LiteRTNetwork:
-    """A .tflite network from a spec, its plain values or a JSON file; errors as :class:`LiteRTNetwork`."""
-    return LiteRTNetwork(weights, ProgramSpec.required(spec), threads=threads)

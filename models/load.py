@@ -14,7 +14,7 @@ _LOADERS = {
     "exported": ("any_network", "load_exported"),
     "fastdepth": ("fastdepth", "load_fastdepth"),
     "huggingface": ("hugging_face", "load_hugging_face"),
-    "litert": ("litert_network", "load_litert"),
+    "litert": ("litert_network", "LiteRTNetwork"),
     "monodepth2": ("monodepth2_import", "load_monodepth_resnet"),
     "onnx": ("fastdepth", "load_graph"),
     "torchscript": ("any_network", "load_torchscript"),

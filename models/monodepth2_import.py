@@ -29,6 +29,7 @@ from ufmstar_torch.models.monodepth2 import (
     shape_of_state_dict,
 )
 from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.outputs import PlainSpec
 from ufmstar_torch.models.preprocess import Preprocess
 
 # Keys of encoder.pth that are no weights.
@@ -47,7 +48,9 @@ class Imported:
 
     loaded: tuple[str, ...]  # keys of the network that were filled
     skipped: Mapping[str, str]  # keys of the files that were not used, with the reason
-    kept: tuple[str, ...]  # keys of the network that stayed as they were; of a metric network its head
+    # keys of the network that stayed as they were, of a metric network its head; without the numbers of batches, which
+    # old files lack and nothing reads
+    kept: tuple[str, ...]
 
 
 def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_path: str | Path) -> Imported:
@@ -91,7 +94,8 @@ def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_pa
         skipped |= unused
     _to_imagenet_colours(loaded)
     network.load_state_dict(expected | loaded, strict=True)
-    return Imported(tuple(sorted(loaded)), skipped, tuple(sorted(set(expected) - set(loaded))))
+    kept = sorted(key for key in set(expected) - set(loaded) if not key.endswith("num_batches_tracked"))
+    return Imported(tuple(sorted(loaded)), skipped, tuple(kept))
 
 
 @dataclass(frozen=True)
@@ -125,7 +129,7 @@ class Units(nn.Module):
         return 1 / depth if self.inverse else depth
 
 
-def load_published(folder: Path, spec: PublishedSpec | Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
+def load_published(folder: Path, spec: PublishedSpec | PlainSpec | None = None) -> DepthNetwork:
     """Metric depth by the weights in a folder with Monodepth2's encoder.pth and depth.pth; ``spec``: declarations,
     plain values or a JSON file. Raises FileNotFoundError, CheckpointError: as :func:`load_monodepth2`; ValueError:
     weights of single images without a scale, or an impossible value."""
@@ -133,8 +137,8 @@ def load_published(folder: Path, spec: PublishedSpec | Mapping[str, Any] | str |
     if missing := [path for path in files if not path.is_file()]:
         raise FileNotFoundError(f"no {missing[0]}; expected a folder with Monodepth2's encoder.pth and depth.pth")
     with files[0].open("rb") as opened:
-        about: Any = read_tensors(opened, files[0])
-    if s.alignment is None and s.scale is None and not about.get("use_stereo"):
+        encoder: Any = read_tensors(opened, files[0])
+    if s.alignment is None and s.scale is None and not encoder.get("use_stereo"):
         raise ValueError(
             f'{folder}: trained on single images, Monodepth2\'s depth has no scale: declare "scale" [m] or "alignment" '
             "(fit_affine_depth, fit_inverse_depth) in a spec"
@@ -142,11 +146,11 @@ def load_published(folder: Path, spec: PublishedSpec | Mapping[str, Any] | str |
     keys = [f"decoder.{2 * n + 1}.conv.conv.weight" for n in range(LEVELS)]
     widths = channels_of(load_state_dict_file(files[1]), keys, "Monodepth2 decoder", files[1])
     scale = (s.scale or STEREO_SCALE) if s.alignment is None else 1.0
-    network = MonodepthResNet(layers_of(about), decoder=widths[::-1], disparity=(s.least, s.largest), scale=scale)
+    network = MonodepthResNet(layers_of(encoder), decoder=widths[::-1], disparity=(s.least, s.largest), scale=scale)
     report = load_monodepth2(network, *files)
-    if kept := [key for key in report.kept if not key.endswith("num_batches_tracked")]:
-        raise CheckpointError(f"{folder} lacks {kept[0]} ({len(kept)} such tensors)")
-    size = s.size or (int(about.get("height", 192)), int(about.get("width", 640)))
+    if report.kept:
+        raise CheckpointError(f"{folder} lacks {report.kept[0]} ({len(report.kept)} such tensors)")
+    size = s.size or (int(encoder.get("height", 192)), int(encoder.get("width", 640)))
     network.preprocess = Preprocess(size=size, mean=IMAGENET_MEAN, std=IMAGENET_STD)
     if s.alignment is None:
         return network.eval()

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ufmstar_torch.checked import choice
 from ufmstar_torch.models.network import DeclaredNetwork, require_image
-from ufmstar_torch.models.outputs import ProgramSpec
+from ufmstar_torch.models.outputs import PlainSpec, ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.optional import optional
 from ufmstar_torch.prediction import DepthPrediction
@@ -67,7 +67,7 @@ class OnnxNetwork(DeclaredNetwork):
 
     Args:
         path: the .onnx file.
-        spec: what the file does not state.
+        spec: what the file does not state: an :class:`OnnxSpec`, its plain values or a JSON file.
         threads: CPU threads of one run; 0 leaves it to ONNX Runtime. They do not spin between two runs.
         providers: ONNX Runtime's execution providers in order of preference.
 
@@ -80,16 +80,17 @@ class OnnxNetwork(DeclaredNetwork):
     def __init__(
         self,
         path: str | Path,
-        spec: OnnxSpec,
+        spec: OnnxSpec | PlainSpec | None = None,
         *,
         threads: int = 0,
         providers: Sequence[str] = ("CPUExecutionProvider",),
     ) -> None:
         super().__init__()
-        self.path, self.spec, self.outputs = str(path), spec, spec.outputs
+        self.path, self.spec = str(path), OnnxSpec.required(spec)
+        self.outputs = self.spec.outputs
         self.threads, self.providers = threads, tuple(providers)
         self._open()
-        self.preprocess = self._fitted_preprocess(spec.preprocess or Preprocess())
+        self.preprocess = self._fitted_preprocess(self.spec.preprocess or Preprocess())
 
     def _open(self) -> None:
         """Start a session and check the spec's names against the graph."""
@@ -261,10 +262,3 @@ def _numbers(value: object) -> bool:
 def _fixed(node: NodeArg) -> list[int | None]:
     """The sides of an input's shape, None where the graph leaves one open."""
     return [side if isinstance(side, int) and side > 0 else None for side in node.shape]
-
-
-def load_onnx(
-    weights: Path, spec: OnnxSpec | Mapping[str, Any] | str | Path | None = None, **options: Any
-) -> OnnxNetwork:
-    """An ONNX network from a spec, its plain values or a JSON file; options and errors as :class:`OnnxNetwork`."""
-    return OnnxNetwork(weights, OnnxSpec.required(spec), **options)

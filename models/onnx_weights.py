@@ -27,8 +27,7 @@ class ConvWeights:
 
     weight: Tensor  # [C_out, C_in / groups, k, k]
     bias: Tensor | None  # [C_out], or None
-    # the following batch norm's weight, bias, running_mean, running_var [C_out] and, where the file holds it,
-    # num_batches_tracked []; empty without batch norm
+    # the following batch norm's weight, bias, running_mean, running_var [C_out]; empty without batch norm
     norm: dict[str, Tensor] = field(default_factory=dict)
     norm_eps: float = 0.0  # what batch norm adds to the variance
 
@@ -38,7 +37,7 @@ class ConvWeights:
         bias = torch.zeros(len(self.weight)) if self.bias is None else self.bias
         if not self.norm:
             return state | {"conv.bias": bias}
-        norm = {"num_batches_tracked": torch.zeros((), dtype=torch.int64)} | self.norm
+        norm = {**self.norm, "num_batches_tracked": torch.zeros((), dtype=torch.int64)}
         norm["running_mean"] = norm["running_mean"] - bias  # a bias before batch norm only shifts the mean
         return state | {f"norm.{key}": value for key, value in norm.items()}
 
@@ -70,7 +69,6 @@ def read_convolutions(path: str | Path) -> list[ConvWeights]:
     tensors = {t.name: torch.tensor(numpy_helper.to_array(t)) for t in graph.initializer}
     names = {name: name for name in tensors}  # tensor in the graph -> initialiser
     produced: dict[str, ConvWeights] = {}
-    owner: dict[str, ConvWeights] = {}  # initialiser -> its convolution
     layers: list[ConvWeights] = []
     for node in graph.node:
         if node.op_type == "Identity" and node.input[0] in names:  # two names for equal weights
@@ -79,27 +77,20 @@ def read_convolutions(path: str | Path) -> list[ConvWeights]:
             continue
         if missing := [name for name in node.input[1:] if name not in names]:
             raise ValueError(f"{path}: {node.op_type} {node.output[0]!r} needs {missing} as weights in the file")
-        own = [names[name] for name in node.input[1:]]
+        weight_names = [names[name] for name in node.input[1:]]
         if node.op_type == "Conv":
-            layer = ConvWeights(tensors[own[0]], tensors[own[1]] if len(own) > 1 else None)
+            layer = ConvWeights(tensors[weight_names[0]], tensors[weight_names[1]] if len(weight_names) > 1 else None)
             produced[node.output[0]] = layer
             layers.append(layer)
         elif node.input[0] not in produced:
             raise ValueError(f"{path}: batch norm {node.output[0]!r} does not follow a convolution")
         else:
             layer = produced.pop(node.input[0])
-            layer.norm = {key: tensors[name] for key, name in zip(_NORM, own, strict=True)}
+            layer.norm = {key: tensors[name] for key, name in zip(_NORM, weight_names, strict=True)}
             layer.norm_eps = {a.name: helper.get_attribute_value(a) for a in node.attribute}.get("epsilon", 1e-5)
-        owner |= dict.fromkeys(own, layer)
     used = {names.get(name, name) for node in graph.node for name in node.input}
-    last: ConvWeights | None = None
     for name, value in tensors.items():
-        last = owner.get(name, last)
-        if name in used:
-            continue
-        # Batch norm's counter is used by no node; it stands behind the layer's other weights.
-        counter = value.dim() == 0 and value.dtype == torch.int64
-        if not counter or last is None or not last.norm or "num_batches_tracked" in last.norm:
+        counter = value.dim() == 0 and value.dtype == torch.int64  # batch norm's number of batches, which nothing reads
+        if name not in used and not counter:
             raise ValueError(f"{path}: initialiser {name!r} {tuple(value.shape)} is used by no layer")
-        last.norm["num_batches_tracked"] = value
     return layers

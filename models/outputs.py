@@ -24,6 +24,7 @@ from ufmstar_torch.prediction import DepthPrediction
 METRIC = "metric"
 Spread = Literal["variance", "std", "log_variance", "log_std", "relative_std"]
 SPREADS = get_args(Spread)
+PlainSpec = Mapping[str, Any] | str | Path  # the values of a spec, or a JSON file of them
 NOT_METRIC = ("inverse", "disparity", "relative", "affine")
 
 
@@ -221,7 +222,7 @@ class ProgramSpec(Checked):
                 raise ValueError(f"{type(self).__name__}.{name} must be settings, got {type(value).__name__}")
 
     @classmethod
-    def required(cls, spec: Self | Mapping[str, Any] | str | Path | None) -> Self:
+    def required(cls, spec: Self | PlainSpec | None) -> Self:
         """As :meth:`read`, with an explanation where ``spec`` is None."""
         if spec is None:
             raise ValueError(

@@ -79,10 +79,10 @@ def save_trained(
     expected = {key: value.shape for key, value in reference.state_dict().items()}
     state: dict[str, Tensor] = {}
     for n, member in enumerate(members):
-        own = _unwrapped(member).state_dict()
-        if {key: value.shape for key, value in own.items()} != expected:
+        weights = _unwrapped(member).state_dict()
+        if {key: value.shape for key, value in weights.items()} != expected:
             raise ValueError(f"network {n} ({type(member).__name__}) is not what its spec describes: {spec}")
-        state |= {f"member.{n}.{key}": value for key, value in own.items()}
+        state |= {f"member.{n}.{key}": value for key, value in weights.items()}
     if broken := [key for key, value in state.items() if not torch.isfinite(value).all()]:
         raise ValueError(f"{broken[0]} has NaN or infinity ({len(broken)} such tensors): training diverged")
     if half:

@@ -12,11 +12,9 @@ import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
 from onnx_files import save
-from shared_data import require_shared
 from torch import Tensor
 
-from ufmstar_torch.models import FastDepth, OnnxNetwork, OnnxSpec, OutputSpec, Preprocess
-from ufmstar_torch.models.onnx_network import load_onnx
+from ufmstar_torch.models import OnnxNetwork, OnnxSpec, OutputSpec, Preprocess
 
 METRIC, NAMED = OutputSpec("metric"), OutputSpec("metric", "depth")
 COEFFICIENTS = (0.5, 0.25, 2.0)  # depth = .5 R + .25 G + 2 B
@@ -86,7 +84,7 @@ def test_a_second_input_for_the_intrinsics(tmp_path: Path, image: Tensor, batch:
     path = write_with_camera(tmp_path / "n.onnx", [batch, 3, "h", "w"], [batch, 3, 3], ("image", "K"))
     spec = {"outputs": {"kind": "metric", "focal": 300.0}, "takes_intrinsics": True, "input": "image"}
     K = torch.diag_embed(torch.tensor([[300.0, 300, 1], [600, 600, 1], [200, 100, 1]], dtype=torch.float64))
-    network = load_onnx(path, spec)
+    network = OnnxNetwork(path, spec)
     for twin in (network, copy.deepcopy(network)):
         assert twin.takes_intrinsics
         unit = torch.tensor([300.0, 1200, 100])[:, None, None]  # fx (fx + fy) / 2 / 300
@@ -110,10 +108,10 @@ def test_a_second_input_for_the_intrinsics(tmp_path: Path, image: Tensor, batch:
 def test_refusals_of_a_second_input(tmp_path: Path, camera: list[int | str], spec: Any, message: str) -> None:
     path = write_with_camera(tmp_path / "n.onnx", [1, 3, "h", "w"], camera, ("image", "K"))
     with pytest.raises(ValueError, match=message):
-        load_onnx(path, {"outputs": {"kind": "metric"}, **spec})
+        OnnxNetwork(path, {"outputs": {"kind": "metric"}, **spec})
     alone = write(tmp_path / "alone.onnx")
     with pytest.raises(ValueError, match="takes_intrinsics needs two inputs"):
-        load_onnx(alone, {"outputs": {"kind": "metric"}, "takes_intrinsics": True})
+        OnnxNetwork(alone, {"outputs": {"kind": "metric"}, "takes_intrinsics": True})
 
 
 @pytest.fixture
@@ -168,17 +166,6 @@ def test_a_fixed_size_becomes_the_preprocessing(tmp_path: Path) -> None:
     assert network(x).depth.shape == (1, 6, 8)
     with pytest.raises(ValueError, match=r"input 'image' has a fixed size of 6 x 8 px, but .* is \(8, 8\)"):
         OnnxNetwork(path, OnnxSpec(METRIC, Preprocess(size=(8, 8))))
-
-
-def test_fastdepth_through_the_adapter() -> None:
-    path = require_shared("weights/fastdepth_nyu.onnx")
-    values = {"preprocess": {"resize_height": 250, "crop": [228, 304]}, "outputs": {"kind": "metric"}}
-    adapter, network = OnnxNetwork(path, OnnxSpec.from_dict(values), threads=1), FastDepth.from_onnx(path)
-    assert adapter.preprocess == network.preprocess
-    image = torch.randint(0, 256, (2, 3, 360, 540), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-    x = network.preprocess.apply_image(image)
-    with torch.inference_mode():
-        torch.testing.assert_close(adapter(x).depth, network(x).depth, rtol=0, atol=2e-5)
 
 
 def test_copies_and_pickles(tmp_path: Path, image: Tensor) -> None:

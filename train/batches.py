@@ -73,8 +73,8 @@ class EpochBatches(Sampler[list[SampleKey]]):
         counts = self.shuffle or self.rank < self.length  # whether this process has frames of its own
         for batch in range(len(self)):
             step = self.batch_size * (self.world if self.shuffle else 1)
-            mine = slice(self.rank, None, self.world) if self.shuffle else slice(None)
-            chosen = order[batch * step : (batch + 1) * step][mine].tolist()
+            share = slice(self.rank, None, self.world) if self.shuffle else slice(None)
+            chosen = order[batch * step : (batch + 1) * step][share].tolist()
             frames = chosen if self.clips is None else [frame for clip in chosen for frame in self.clips[clip]]
             yield [SampleKey(epoch, frame, counts) for frame in frames]
 

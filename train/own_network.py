@@ -16,6 +16,7 @@ from ufmstar_torch.models.heads import UncertaintyHead
 from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec, read_checkpoint
 from ufmstar_torch.models.module_backbone import ModuleSpec
 from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.outputs import PlainSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.models.spec import NetworkSpec
 from ufmstar_torch.models.trained import load_ensemble
@@ -70,7 +71,7 @@ def own_job(
     fine_tune: bool = False,
     preprocess: Preprocess | None = None,
     features: str | None = None,
-    spec: HuggingFaceSpec | Mapping[str, Any] | str | Path | None = None,
+    spec: HuggingFaceSpec | PlainSpec | None = None,
     members: int | None = None,
     network: Mapping[str, Any] | None = None,
     **recipe: Any,
@@ -103,12 +104,13 @@ def own_job(
         raise ValueError(f"train_module has no {unknown}; a recipe has {[f.name for f in fields(Recipe)]}")
     of_row, several = METHOD_ROWS[row]
     if isinstance(backbone, nn.Module):
-        module, own = backbone, preprocess or getattr(backbone, "preprocess", None) or Preprocess()
-        about = ModuleSpec.of(module, own, features)
+        module, network_input = backbone, preprocess or getattr(backbone, "preprocess", None) or Preprocess()
+        module_spec = ModuleSpec.of(module, network_input, features)
     else:
-        module, about = None, _of_checkpoint(backbone, data, preprocess, features, spec)
+        module, module_spec = None, _of_checkpoint(backbone, data, preprocess, features, spec)
     dropout = {"dropout": DROPOUT} if row == "mc-dropout" else {}
-    shape = {"architecture": "module", "module": about, **({"size": s} if (s := about.preprocess.size) else {})}
+    shape: dict[str, Any] = {} if module_spec.preprocess.size is None else {"size": module_spec.preprocess.size}
+    shape |= {"architecture": "module", "module": module_spec}
     described = NetworkSpec(**{**shape, **of_row, **dropout, **(network or {})})
     changed = Recipe(described, **{**(OF_MODULE if fine_tune else OF_HEAD), "members": several, **recipe})
     if not fine_tune and not settings.trainable:
@@ -129,8 +131,8 @@ def _of_checkpoint(
     if not network.is_metric and declared.alignment is None:
         declared = replace(declared, alignment=_aligned(network, data))
     content = {"config": read.config, "processor": read.processor}
-    about = {"source": read.name, "checkpoint": content, "declared": declared}
-    return ModuleSpec.of(network.aligned(declared.alignment), network.preprocess, part, **about)
+    details = {"source": read.name, "checkpoint": content, "declared": declared}
+    return ModuleSpec.of(network.aligned(declared.alignment), network.preprocess, part, **details)
 
 
 def _aligned(network: HuggingFaceDepth, data: DataConfig) -> Alignment:

@@ -173,7 +173,7 @@ def make_sample(
 def clips(source: FrameSource, length: int) -> list[range]:
     """The frames of a source in clips that do not overlap; what is left at the end of a path is in none. Raises
     ValueError: there is none."""
-    found = [run[i : i + length] for run in source.runs() for i in range(0, len(run) - length + 1, length)]
-    if not found:
+    whole = [run[i : i + length] for run in source.runs() for i in range(0, len(run) - length + 1, length)]
+    if not whole:
         raise ValueError(f"clip_frames: the training part has no {length} frames with known poses one after the other")
-    return found
+    return whole

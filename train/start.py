@@ -44,8 +44,8 @@ def starting_network(
         ValueError: the file contains another architecture than the spec's; the message names the options that fit.
     """
     if init is None and spec.module is not None:
-        own = spec.module.build(weights=True) if module is None else copy.deepcopy(module)
-        return build_network(spec, build_backbone(spec, own), std=PRETRAINED_STD)
+        network = spec.module.build(weights=True) if module is None else copy.deepcopy(module)
+        return build_network(spec, build_backbone(spec, network), std=PRETRAINED_STD)
     if init is None:
         return build_network(spec)
     if init.suffix == ".safetensors" and _is_trained(init):
@@ -106,8 +106,8 @@ def _from_trained(spec: NetworkSpec, path: Path, member: int, module: nn.Module 
     if info.spec.method == "batch_ensemble":
         raise ValueError(f"init: {path} holds a batch_ensemble, whose backbone is not one network's")
     backbone = build_backbone(spec, copy.deepcopy(module))
-    held: Any = source.backbone
-    fill(backbone, held.state_dict(), str(path))
+    trained_backbone: Any = source.backbone
+    fill(backbone, trained_backbone.state_dict(), str(path))
     return build_network(spec, backbone, std=PRETRAINED_STD)
 
 
@@ -134,8 +134,8 @@ def _from_resnet(spec: NetworkSpec, path: Path) -> Backbone:
     if path.is_dir():
         report = load_monodepth2(backbone, path / "encoder.pth", path / "depth.pth")
         # Some tensors of another ResNet fit by chance; most weights would then stay random.
-        wrong = [key for key in report.kept if key.startswith("encoder.") and not key.endswith("num_batches_tracked")]
-        wrong += [key for key in report.skipped if key.startswith("encoder.") and not key.startswith("encoder.fc.")]
+        unfilled = [key for key in (*report.kept, *report.skipped) if not key.startswith("encoder.fc.")]
+        wrong = [key for key in unfilled if key.startswith("encoder.")]
         if wrong:
             raise ValueError(
                 f"init: {path} does not hold a ResNet{spec.layers}: {len(wrong)} tensors of one do not fit the other, "

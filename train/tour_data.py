@@ -129,8 +129,8 @@ def tour_frames(
     seeds = tuple(seeds)
     if not seeds or workers < 1:
         raise ValueError(f"seeds must hold at least one and workers be at least 1, got {len(seeds)} and {workers}")
-    own = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ufmstar_torch" / "tours"
-    folder = (own if cache is None else Path(cache)) / f"tours-{settings.digest()}"
+    user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ufmstar_torch" / "tours"
+    folder = (user_cache if cache is None else Path(cache)) / f"tours-{settings.digest()}"
     folder.mkdir(parents=True, exist_ok=True)
     missing = [seed for seed in seeds if not tour_file(folder, seed).exists()]
     random.Random(os.getpid()).shuffle(missing)
