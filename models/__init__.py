@@ -35,10 +35,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.fastdepth import FastDepth as FastDepth
     from ufmstar_torch.models.fastdepth import FastDepthWidths as FastDepthWidths
     from ufmstar_torch.models.heads import AleatoricHead as AleatoricHead
-    from ufmstar_torch.models.heads import AleatoricNetwork as AleatoricNetwork
-    from ufmstar_torch.models.heads import DepthOnlyNetwork as DepthOnlyNetwork
     from ufmstar_torch.models.heads import EvidentialHead as EvidentialHead
-    from ufmstar_torch.models.heads import EvidentialNetwork as EvidentialNetwork
     from ufmstar_torch.models.heads import UncertaintyNetwork as UncertaintyNetwork
     from ufmstar_torch.models.heads import with_head as with_head
     from ufmstar_torch.models.hugging_face import HuggingFaceDepth as HuggingFaceDepth

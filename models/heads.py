@@ -70,7 +70,7 @@ class AleatoricHead(UncertaintyHead):
 
 
 class EvidentialHead(UncertaintyHead):
-    """Learned data and model variance (Amini et al. 2020)."""
+    """Learned data and model variance from one inference (Amini et al. 2020)."""
 
     method, outputs = "evidential", 3
 
@@ -81,11 +81,19 @@ class EvidentialHead(UncertaintyHead):
         return EvidentialDepth(depth, nu + EVIDENCE_FLOOR, alpha + (1 + EVIDENCE_FLOOR), beta + BETA_FLOOR)
 
 
+HEADS: dict[str, type[UncertaintyHead] | None] = {
+    "depth": None,
+    "aleatoric": AleatoricHead,
+    "evidential": EvidentialHead,
+}
+
+
 class UncertaintyNetwork(DepthNetwork):
-    """A backbone with a head.
+    """A backbone with a head; made by :func:`with_head`.
 
     Args:
         backbone: whose features and depth are used; its ``preprocess`` is this network's.
+        kind: of the head; None: depth without a variance.
         scales: heads, at full resolution, 1/2, 1/4, ...: as many as 4 in Poggi et al. (2020). Only the first predicts;
             the coarser ones are there in training mode, where they teach the decoder's inner layers.
 
@@ -93,20 +101,18 @@ class UncertaintyNetwork(DepthNetwork):
         ValueError: more scales than the backbone has.
     """
 
-    kind: type[UncertaintyHead] | None = None  # of head
-
-    def __init__(self, backbone: Backbone, scales: int = 1) -> None:
+    def __init__(self, backbone: Backbone, kind: type[UncertaintyHead] | None, scales: int = 1) -> None:
         super().__init__()
         channels = backbone.pyramid_channels
         if not 1 <= scales <= len(channels):
             raise ValueError(f"scales must be from 1 to {len(channels)} of this backbone, got {scales}")
-        self.backbone = backbone
+        self.backbone, self.kind = backbone, kind
         self.preprocess = backbone.preprocess
-        if self.kind is not None:
+        if kind is not None:
             # The convolutions alone, under the names that stored weights have.
-            self.head = _convolution(channels[0], self.kind.outputs)
+            self.head = _convolution(channels[0], kind.outputs)
             if scales > 1:
-                coarse = (_convolution(channels[s], self.kind.outputs) for s in range(1, scales))
+                coarse = (_convolution(channels[s], kind.outputs) for s in range(1, scales))
                 self.coarse = nn.ModuleList(coarse)
 
     @property
@@ -132,35 +138,12 @@ class UncertaintyNetwork(DepthNetwork):
         return prediction.mapped(lambda value: value[: len(image)]) if self.training else prediction
 
 
-class DepthOnlyNetwork(UncertaintyNetwork):
-    """No head: depth without a variance ("DepthOnly")."""
-
-
-class AleatoricNetwork(UncertaintyNetwork):
-    """Depth and a learned data variance ("Aleatoric")."""
-
-    kind = AleatoricHead
-
-
-class EvidentialNetwork(UncertaintyNetwork):
-    """Depth with learned data and model variance from one inference ("Evidential")."""
-
-    kind = EvidentialHead
-
-
-HEADS: dict[str, type[UncertaintyNetwork]] = {
-    "depth": DepthOnlyNetwork,
-    "aleatoric": AleatoricNetwork,
-    "evidential": EvidentialNetwork,
-}
-
-
 def with_head(backbone: Backbone, method: str, scales: int = 1) -> UncertaintyNetwork:
     """A backbone with the head of a method: "depth" (none), "aleatoric" or "evidential"; ``scales`` as in
     :class:`UncertaintyNetwork`. Raises ValueError: another method, or more scales than the backbone has."""
     if method not in HEADS:
         raise ValueError(f"method must be one of {list(HEADS)}, got {method!r}")
-    return HEADS[method](backbone, scales)
+    return UncertaintyNetwork(backbone, HEADS[method], scales)
 
 
 def soft_range(x: Tensor, low: float, high: float) -> Tensor:

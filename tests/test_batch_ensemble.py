@@ -17,15 +17,14 @@ from torch import nn
 
 from ufmstar_torch import UncertainDepth
 from ufmstar_torch.models import (
-    AleatoricNetwork,
     Backbone,
     BatchEnsemble,
-    EvidentialNetwork,
     FastDepth,
     FastDepthWidths,
     MonodepthResNet,
     Preprocess,
     convert,
+    with_head,
 )
 from ufmstar_torch.models.batch_ensemble import converted_layers
 from ufmstar_torch.models.batch_layer import BatchLayer, Selection
@@ -60,7 +59,7 @@ def seeded(seed=0):
 def tiny(seed=0, **options):
     """A network in eval mode whose statistics are not the initial ones, and its ensemble with biases that differ."""
     torch.manual_seed(seed)
-    network = AleatoricNetwork(Tiny()).double()
+    network = with_head(Tiny(), "aleatoric").double()
     network(torch.rand(8, 3, 6, 8, dtype=torch.float64))
     ensemble = BatchEnsemble(network, N, **{"std": 0.4, "generator": seeded(seed), **options})
     with torch.no_grad():
@@ -209,7 +208,7 @@ def test_fastdepth_and_monodepth2_are_converted_whole():
     monodepth = MonodepthResNet(18, size=(64, 64))
     for network in (fastdepth, monodepth):
         expected = sum(isinstance(m, (nn.Conv2d, nn.Linear)) for m in network.modules())
-        ensemble = BatchEnsemble(AleatoricNetwork(network), N, std=0.2).eval()
+        ensemble = BatchEnsemble(with_head(network, "aleatoric"), N, std=0.2).eval()
         assert len(converted_layers(ensemble)) == expected + 1  # the head's
         x = torch.rand(1, 3, 64, 64)
         with torch.no_grad():
@@ -240,9 +239,10 @@ def test_a_member_is_its_part_of_the_batched_pass_and_its_folded_network():
         assert torch.equal(ensemble.distribution(x, n).depth, own.depth)
 
 
-@pytest.mark.parametrize("head", [AleatoricNetwork, EvidentialNetwork])
-def test_the_batched_pass_combines_its_members(head):
-    ensemble = tiny()[1] if head is AleatoricNetwork else BatchEnsemble(head(Tiny()).double(), N, std=0.3).eval()
+@pytest.mark.parametrize("method", ["aleatoric", "evidential"])
+def test_the_batched_pass_combines_its_members(method):
+    aleatoric = method == "aleatoric"
+    ensemble = tiny()[1] if aleatoric else BatchEnsemble(with_head(Tiny(), method).double(), N, std=0.3).eval()
     x = images()
     expected = combine([member(x) for member in ensemble.all_members()])
     combined = ensemble(x)

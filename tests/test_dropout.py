@@ -10,14 +10,12 @@ from tiny_networks import Linear
 from torch import Tensor, nn
 
 from ufmstar_torch.models import (
-    AleatoricNetwork,
     Backbone,
     DecoderDropout,
-    DepthOnlyNetwork,
-    EvidentialNetwork,
     FastDepth,
     MonteCarloDropout,
     set_sampling,
+    with_head,
 )
 from ufmstar_torch.models.dropout import SAMPLES
 
@@ -61,7 +59,7 @@ def test_moments_of_a_linear_decoder() -> None:
     backbone, count = Linear(dropout=P), 4000
     image = 1 + torch.rand(2, 3, 4, 6, generator=seeded(1))
     mean, variance = closed_form(backbone, image)
-    network = MonteCarloDropout(DepthOnlyNetwork(backbone), count, generator=seeded(2)).eval()
+    network = MonteCarloDropout(with_head(backbone, "depth"), count, generator=seeded(2)).eval()
     with torch.no_grad():
         prediction = network(image)
     assert prediction.aleatoric_variance is None
@@ -74,7 +72,7 @@ def test_one_batch_draws_independently() -> None:
     """Passes that run as one batch share no mask: neither with each other nor between images. Within an image a channel
     has one: no pixel differs from its neighbour by a draw of its own."""
     backbone, count = Linear(dropout=P), 4000
-    network = MonteCarloDropout(DepthOnlyNetwork(backbone), generator=seeded(3)).eval()
+    network = MonteCarloDropout(with_head(backbone, "depth"), generator=seeded(3)).eval()
     with torch.no_grad():
         depth = network(torch.ones(2 * count, 3, 4, 6)).depth.reshape(2, count, -1)
     a, b = depth[0, :, 0], depth[1, :, 0]
@@ -88,8 +86,8 @@ def test_one_batch_draws_independently() -> None:
 def test_aleatoric_variance_is_averaged_and_evidence_added() -> None:
     """combine(): A = mean A_n; E = variance between + mean E_n."""
     image = 1 + torch.rand(1, 3, 4, 6, generator=seeded(4))
-    for kind in (AleatoricNetwork, EvidentialNetwork):
-        network = kind(Linear(dropout=P))
+    for method in ("aleatoric", "evidential"):
+        network = with_head(Linear(dropout=P), method)
         passes = MonteCarloDropout(network, generator=seeded(5)).eval()
         with torch.no_grad():
             single = [passes(image) for _ in range(SAMPLES)]
@@ -120,7 +118,7 @@ def test_the_encoder_does_not_sample() -> None:
         last = [m for m in backbone.encoder.modules() if isinstance(m, nn.BatchNorm2d)][-1]
         last.register_forward_hook(lambda *args, seen=seen: seen.append(args[2].clone()))
         before = copy.deepcopy(backbone.state_dict())
-        network = MonteCarloDropout(AleatoricNetwork(backbone)).eval()
+        network = MonteCarloDropout(with_head(backbone, "aleatoric")).eval()
         image = torch.rand(1, 3, 64, 64, generator=seeded(6))
         with torch.no_grad():
             depth = [network(image).depth for _ in range(2)]

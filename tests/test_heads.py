@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from ufmstar_torch.models import (
     EvidentialDepth,
-    EvidentialNetwork,
     MonodepthResNet,
     with_head,
 )
@@ -85,7 +84,7 @@ def test_extremes_stay_finite(method: str, raw: float, dtype: torch.dtype) -> No
 
 def test_evidence_against_its_closed_form() -> None:
     """softplus(ln(e^y - 1)) = y: raw outputs chosen for nu = 2, alpha = 1 + 3, beta = .5 (all + the floors)."""
-    network = EvidentialNetwork(Linear())
+    network = with_head(Linear(), "evidential")
     constant_head(network.head, tuple(math.log(math.expm1(y)) for y in (2.0, 3.0, 0.5)))
     image = torch.rand(1, 3, 4, 6)
     d, prediction = network.distribution(image), network(image)

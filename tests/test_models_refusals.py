@@ -15,7 +15,6 @@ from torch import nn
 
 from ufmstar_torch import UncertainDepth
 from ufmstar_torch.models import (
-    AleatoricNetwork,
     AlignedNetwork,
     Alignment,
     BatchEnsemble,
@@ -55,7 +54,7 @@ def members(*sizes: int) -> list[DepthNetwork]:
 
 
 def batch_ensemble() -> BatchEnsemble:
-    return BatchEnsemble(AleatoricNetwork(Linear()), 3).eval()
+    return BatchEnsemble(with_head(Linear(), "aleatoric"), 3).eval()
 
 
 REFUSALS: list[tuple[Callable[[], object], str]] = [
@@ -140,7 +139,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: resnet(dropout=1.0), "dropout"),
     (lambda: DecoderDropout(NAN), "dropout"),
     (lambda: set_sampling(nn.Dropout(0.2), True), "no decoder dropout"),
-    (lambda: MonteCarloDropout(AleatoricNetwork(Linear())), "no decoder dropout"),
+    (lambda: MonteCarloDropout(with_head(Linear(), "aleatoric")), "no decoder dropout"),
     (lambda: with_head(Linear(), "mc"), "method"),
     (lambda: with_head(Linear(), "aleatoric", 4), "scales"),
     (lambda: Ensemble(members(8)), "members must be at least two"),

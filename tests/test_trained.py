@@ -162,7 +162,7 @@ def test_networks_that_do_not_fit_their_spec(tmp_path):
     networks = make_networks(spec_of())
     file = tmp_path / "n.safetensors"
     for wrong in (replace(spec_of(), method="evidential"), replace(spec_of(), widths=0.2)):
-        with pytest.raises(ValueError, match=r"network 0 \(AleatoricNetwork\) is not what its spec describes"):
+        with pytest.raises(ValueError, match=r"network 0 \(UncertaintyNetwork\) is not what its spec describes"):
             save_trained(file, networks, wrong)
     with pytest.raises(ValueError, match="at least one network, got n"):
         save_trained(file, [], spec_of())

@@ -18,7 +18,7 @@ from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDropout
 from ufmstar_torch.models.ensemble import LazyMember
-from ufmstar_torch.models.heads import DepthOnlyNetwork, UncertaintyNetwork
+from ufmstar_torch.models.heads import UncertaintyNetwork, with_head
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.models.onnx_network import OnnxNetwork
 from ufmstar_torch.networks_in_turn import NetworksInTurn
@@ -113,4 +113,4 @@ def depth_alone(network: DepthNetwork) -> DepthNetwork | None:
     for module in backbone.modules():
         if isinstance(module, DecoderDropout):
             module.sampling = False
-    return DepthOnlyNetwork(backbone).eval()
+    return with_head(backbone, "depth").eval()
