@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from torch import Tensor, nn
 
 from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.models.alignment import AlignedNetwork, Alignment
-from ufmstar_torch.models.checkpoints import CheckpointError, channels_of, fill, load_state_dict_file, read_tensors
+from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_file, read_tensors
 from ufmstar_torch.models.monodepth2 import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -48,13 +47,11 @@ class Imported:
 
     loaded: tuple[str, ...]  # keys of the network that were filled
     skipped: Mapping[str, str]  # keys of the files that were not used, with the reason
-    # keys of the network that stayed as they were, of a metric network its head; without the numbers of batches, which
-    # old files lack and nothing reads
-    kept: tuple[str, ...]
+    kept: tuple[str, ...]  # keys of the network that stayed as they were: of a metric network its head
 
 
 def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_path: str | Path) -> Imported:
-    """Fill a network's encoder and decoder with published Monodepth2 weights, in place, where shapes allow.
+    """Fill a network's encoder and decoder with published Monodepth2 weights, in place.
 
     A network with ``disparity`` gets the finest disparity convolution too. Another one does not predict depth yet: its
     head stays untrained. The first convolution is rescaled from
@@ -62,40 +59,33 @@ def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_pa
     ImageNet's mean instead of its grey.
 
     Args:
-        network: with ``strides="v1.5"`` and the number of layers that the files have.
+        network: with ``strides="v1.5"`` and the layers and channels of the files.
         encoder_path, depth_path: encoder.pth and depth.pth.
 
     Raises:
         ValueError: the network's strides are not "v1.5".
         FileNotFoundError: a file is missing.
-        CheckpointError: a file is damaged, or nothing in it fits the network, which is unchanged then.
+        CheckpointError: a file is damaged, or a tensor does not fit the network, which is unchanged then.
     """
     if network.strides != "v1.5":
         raise ValueError(f"Monodepth2's encoders have strides 'v1.5', got a network with {network.strides!r}")
-    expected = network.state_dict()
-    skipped: dict[str, str] = {}
-    loaded: dict[str, Tensor] = {}
-    decoder = partial(_decoder_place, disparity=network.disparity is not None)
-    for path, place in ((encoder_path, _encoder_place), (depth_path, decoder)):
-        state = load_state_dict_file(path, ignore=_NO_WEIGHTS)
-        fitting, unused = {}, {}
-        for key, value in state.items():
-            try:
-                target = place(key)
-                _require_fit(value, expected.get(target))
-            except ValueError as reason:
-                unused[key] = str(reason)
-            else:
-                fitting[target] = value
-        if not fitting:
-            why = ": ".join(next(iter(unused.items()), ("it is empty",)))
-            raise CheckpointError(f"nothing in {path} fits the network; {why}")
-        loaded |= fitting
-        skipped |= unused
-    _to_imagenet_colours(loaded)
-    network.load_state_dict(expected | loaded, strict=True)
-    kept = sorted(key for key in set(expected) - set(loaded) if not key.endswith("num_batches_tracked"))
-    return Imported(tuple(sorted(loaded)), skipped, tuple(kept))
+    disparity = network.disparity is not None
+    expected, loaded, skipped = network.state_dict(), dict[str, Tensor](), dict[str, str]()
+    files = [load_state_dict_file(path, ignore=_NO_WEIGHTS) for path in (encoder_path, depth_path)]
+    for key, value in (files[0] | files[1]).items():
+        target = _network_key(key)
+        if key.startswith("encoder.fc."):
+            skipped[key] = "the classifier is not used"
+        elif target is None or (target.startswith("head.") and not disparity):
+            skipped[key] = "coarser disparities are not used" if disparity else "disparity is not metric depth"
+        else:
+            loaded[target] = value
+    kept = tuple(key for key in expected if key.startswith("head.") and not disparity)
+    uncounted = [key for key in expected if key.endswith("num_batches_tracked")]  # old files lack it, nothing reads it
+    unchanged = {key: expected[key] for key in (*kept, *uncounted)}
+    fill(network, unchanged | loaded, f"{encoder_path} with {depth_path}")
+    _to_imagenet_colours(network)
+    return Imported(tuple(sorted(loaded)), skipped, tuple(sorted(kept)))
 
 
 @dataclass(frozen=True)
@@ -147,9 +137,7 @@ def load_published(folder: Path, spec: PublishedSpec | PlainSpec | None = None) 
     widths = channels_of(load_state_dict_file(files[1]), keys, "Monodepth2 decoder", files[1])
     scale = (s.scale or STEREO_SCALE) if s.alignment is None else 1.0
     network = MonodepthResNet(layers_of(encoder), decoder=widths[::-1], disparity=(s.least, s.largest), scale=scale)
-    report = load_monodepth2(network, *files)
-    if report.kept:
-        raise CheckpointError(f"{folder} lacks {report.kept[0]} ({len(report.kept)} such tensors)")
+    load_monodepth2(network, *files)
     size = s.size or (int(encoder.get("height", 192)), int(encoder.get("width", 640)))
     network.preprocess = Preprocess(size=size, mean=IMAGENET_MEAN, std=IMAGENET_STD)
     if s.alignment is None:
@@ -171,46 +159,27 @@ def load_monodepth_resnet(
     return network
 
 
-def _encoder_place(key: str) -> str:
-    """The network's key for one of encoder.pth. Raises ValueError: there is none."""
-    if key.startswith("encoder.fc."):
-        raise ValueError("the classifier is not used")
-    return key
-
-
-def _decoder_place(key: str, disparity: bool = False) -> str:
-    """The network's key for one of depth.pth. Raises ValueError: there is none."""
+def _network_key(key: str) -> str | None:
+    """The network's key for one of the files, "head." of the finest disparity; None of a coarser one; an unknown key as
+    it is."""
     match = _CONVOLUTION.fullmatch(key)
     if match is None:
-        raise ValueError("not a key of Monodepth2's decoder")
+        return key
     number, kind = int(match[1]), match[2]
-    if disparity and number == 2 * LEVELS:
-        return f"head.{kind}"
     if number >= 2 * LEVELS:
-        raise ValueError("coarser disparities are not used" if disparity else "disparity is not metric depth")
+        return f"head.{kind}" if number == 2 * LEVELS else None
     return f"levels.{LEVELS - 1 - number // 2}.{'after' if number % 2 else 'before'}.{kind}"
 
 
-def _require_fit(value: Tensor, expected: Tensor | None) -> None:
-    """Raises ValueError unless a tensor can fill the network's."""
-    if expected is None:
-        raise ValueError("the network has no such tensor")
-    if value.shape != expected.shape:
-        raise ValueError(f"is {tuple(value.shape)}, expected {tuple(expected.shape)}")
-    if not torch.isfinite(value).all():
-        raise ValueError("has NaN or infinity")
-
-
-def _to_imagenet_colours(loaded: dict[str, Tensor]) -> None:
+@torch.no_grad()
+def _to_imagenet_colours(network: MonodepthResNet) -> None:
     """Rescale the first convolution, in place.
 
     With ImageNet's x = (c - m) / s for a colour c, Monodepth2's input is (x s + m - .45) / .225: a factor per
     channel, and an offset, constant over the image, that batch norm subtracts again with its mean.
     """
-    weight, mean = loaded.get("encoder.conv1.weight"), loaded.get("encoder.bn1.running_mean")
-    if weight is None or mean is None:
-        return
+    weight, mean = network.encoder.conv1.weight, network.encoder.bn1.running_mean
     s, m = torch.tensor(IMAGENET_STD), torch.tensor(IMAGENET_MEAN)
     offset = (weight * ((m - _MEAN) / _STD)[:, None, None]).sum((1, 2, 3))
-    loaded["encoder.conv1.weight"] = weight * (s / _STD)[:, None, None]
-    loaded["encoder.bn1.running_mean"] = mean - offset
+    weight.mul_((s / _STD)[:, None, None])
+    mean.sub_(offset)

@@ -132,15 +132,10 @@ def _from_resnet(spec: NetworkSpec, path: Path) -> Backbone:
     if not isinstance(backbone, MonodepthResNet):
         raise ValueError(f"init: {path} is no start for {spec.architecture}; expected {WAYS}")
     if path.is_dir():
-        report = load_monodepth2(backbone, path / "encoder.pth", path / "depth.pth")
-        # Some tensors of another ResNet fit by chance; most weights would then stay random.
-        unfilled = [key for key in (*report.kept, *report.skipped) if not key.startswith("encoder.fc.")]
-        wrong = [key for key in unfilled if key.startswith("encoder.")]
-        if wrong:
-            raise ValueError(
-                f"init: {path} does not hold a ResNet{spec.layers}: {len(wrong)} tensors of one do not fit the other, "
-                f"first {wrong[0]!r}; another --network.layers may"
-            )
+        try:
+            load_monodepth2(backbone, path / "encoder.pth", path / "depth.pth")
+        except CheckpointError as error:
+            raise CheckpointError(f"init: {error}; another --network.layers may fit") from error
         return backbone
     weights = None if str(path) == IMAGENET else path
     source = MonodepthResNet.imagenet(weights, spec.layers, strides=spec.strides)
