@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from depth_anything_files import write_depth_anything
+from depth_anything_files import write_depth_anything, write_other
 from onnx_files import small_network, write_fastdepth
 from test_monodepth2 import classifier_weights, published_decoder, write_published
 from torch import nn
@@ -25,18 +24,6 @@ def blocks() -> list[str]:
     return re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
 
 
-def write_glpn(folder: Path) -> None:
-    """A tiny GLPN with random weights, as ``save_pretrained`` leaves it."""
-    import transformers
-
-    config = transformers.GLPNConfig(
-        depths=[1, 1, 1, 1], hidden_sizes=[8, 8, 16, 16], num_attention_heads=[1, 1, 2, 2], decoder_hidden_size=8
-    )
-    transformers.GLPNForDepthEstimation(config).save_pretrained(folder)
-    processor = {"do_rescale": True, "do_resize": True, "do_normalize": False, "size": {"height": 64, "width": 64}}
-    (folder / "preprocessor_config.json").write_text(json.dumps({"image_processor_type": "X", **processor}))
-
-
 def write_files(folder: Path) -> None:
     """Small networks under the names that the page uses."""
     torch.manual_seed(0)
@@ -49,7 +36,7 @@ def write_files(folder: Path) -> None:
     torch.jit.save(torch.jit.trace(network, image), str(folder / "network.ts"))
     torch.export.save(torch.export.export(network, (image,)), folder / "network.pt2")
     write_fastdepth(folder / "network.onnx", small_network())
-    write_glpn(folder / "glpn-nyu")
+    write_other(folder / "glpn-nyu", "glpn")
     write_depth_anything(folder / "Depth-Anything-V2-Metric-Indoor-Small-hf", "metric")
     write_depth_anything(folder / "Depth-Anything-V2-Small-hf", "relative")
 
