@@ -13,6 +13,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
+from operator import itemgetter
 from typing import Any, TypeVar
 
 import torch
@@ -68,9 +69,9 @@ def convert(
     # What deepcopy puts in place of an object, by its id: it replaces a layer wherever the network refers to it.
     copies: dict[int, Any] = {}
     selection = Selection()
-    for name, layer in plain:
-        _require_plain(name, layer)
-        copies[id(layer)] = BatchLayer(copy.deepcopy(layer, copies), members, selection)
+    for name, module in plain:
+        _require_plain(name, module)
+        copies[id(module)] = BatchLayer(copy.deepcopy(module, copies), members, selection)
     result = copy.deepcopy(network, copies)
     if left := [type(copied).__name__ for copied in copies.values() if isinstance(copied, _PLAIN)]:
         raise ValueError(f"{type(network).__name__} keeps a {left[0]} that is not registered: use nn.ModuleList")
@@ -134,8 +135,8 @@ class BatchEnsemble(DepthNetwork):
         between the members as E [m^2], from one pass with a batch of N B."""
         prediction = self.distribution(image).prediction()
         # In training mode a network with heads at several scales has as many blocks of members; the first predicts.
-        parts = [slice(n * len(image), (n + 1) * len(image)) for n in range(self.members)]
-        return combine([prediction.mapped(lambda value, part=part: value[part]) for part in parts])
+        starts = [n * len(image) for n in range(self.members)]
+        return combine([prediction.mapped(itemgetter(slice(start, start + len(image)))) for start in starts])
 
     def member(self, n: int) -> BatchEnsembleMember:
         """Member n as a network, with the weights of this one: nothing is copied. Raises IndexError: no such member."""

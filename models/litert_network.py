@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from torch import Tensor
 
 from ufmstar_torch.models.network import DeclaredNetwork, require_image
 from ufmstar_torch.models.outputs import PlainSpec, ProgramSpec
-from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.optional import optional
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -41,10 +39,7 @@ class LiteRTNetwork(DeclaredNetwork):
         if declared.takes_intrinsics:
             raise ValueError(f"{path}: takes_intrinsics is not supported for .tflite files")
         self._open()
-        preprocess = declared.preprocess or Preprocess()
-        if preprocess.size not in (None, self.size):
-            raise ValueError(f"{path}: the input has {self.size} px, the spec's preprocess.size {preprocess.size}")
-        self.preprocess = replace(preprocess, size=self.size)
+        self.preprocess = self.sized(declared.preprocess, self.size)
 
     def _open(self) -> None:
         """Start an interpreter, and find the input and the declared outputs."""

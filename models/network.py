@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -114,6 +115,15 @@ class DeclaredNetwork(DepthNetwork):
     def max_depth(self) -> float | None:
         """[m] As declared, or stated by a network that returns a ``DepthPrediction``."""
         return self.outputs.max_depth or super().max_depth
+
+    def sized(self, preprocess: Preprocess | None, size: tuple[int, int]) -> Preprocess:
+        """The declared preprocessing with the (height, width) [px] of the file's input. Raises ValueError: another size
+        is declared."""
+        preprocess = preprocess or Preprocess()
+        if preprocess.size not in (None, size):
+            fixed = f"{self.path}: the input has a fixed size of {size[0]} x {size[1]} px"
+            raise ValueError(f"{fixed}, but the spec's preprocess.size is {preprocess.size}")
+        return replace(preprocess, size=size)
 
     def declared(self, result: Any, image: Tensor, intrinsics: Tensor | None) -> DepthPrediction:
         """The prediction in what the network returned; arguments and errors as :meth:`OutputSpec.prediction`, with the

@@ -7,7 +7,7 @@ the unit of the output, which no graph states.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,7 +90,11 @@ class OnnxNetwork(DeclaredNetwork):
         self.outputs = self.spec.outputs
         self.threads, self.providers = threads, tuple(providers)
         self._open()
-        self.preprocess = self._fitted_preprocess(self.spec.preprocess or Preprocess())
+        height, width = self.size
+        if height is None or width is None:
+            self.preprocess = self.spec.preprocess or Preprocess()
+        else:
+            self.preprocess = self.sized(self.spec.preprocess, (height, width))
 
     def _open(self) -> None:
         """Start a session and check the spec's names against the graph."""
@@ -146,17 +150,6 @@ class OnnxNetwork(DeclaredNetwork):
     def takes_intrinsics(self) -> bool:
         """True if the graph takes intrinsics, or the unit of its depth depends on the focal length."""
         return self.K_input is not None or super().takes_intrinsics
-
-    def _fitted_preprocess(self, preprocess: Preprocess) -> Preprocess:
-        height, width = self.size
-        if height is None or width is None:
-            return preprocess
-        if preprocess.size not in (None, (height, width)):
-            raise ValueError(
-                f"{self.path}: input {self.input!r} has a fixed size of {height} x {width} px, but the spec's "
-                f"preprocess.size is {preprocess.size}"
-            )
-        return replace(preprocess, size=(height, width))
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth [B, H, W] [m], on the image's device, of ``image`` [B, 3, H, W] as ``preprocess`` returns it, with

@@ -7,7 +7,7 @@ depth, disparity or depth up to scale (and shift) are refused here, where their 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ufmstar_torch.arguments import as_tensor
-from ufmstar_torch.checked import Checked, choice, number
+from ufmstar_torch.checked import Checked, choice, number, section
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -210,16 +210,9 @@ class ProgramSpec(Checked):
         ValueError: a field is out of range.
     """
 
-    outputs: OutputSpec
-    preprocess: Preprocess | None = None
+    outputs: OutputSpec = field(metadata={"section": OutputSpec, "optional": False})
+    preprocess: Preprocess | None = section(Preprocess, optional=True)
     takes_intrinsics: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, kind in (("outputs", OutputSpec), ("preprocess", Preprocess | None)):
-            value = getattr(self, name)
-            if not isinstance(value, kind):
-                raise ValueError(f"{type(self).__name__}.{name} must be settings, got {type(value).__name__}")
 
     @classmethod
     def required(cls, spec: Self | PlainSpec | None) -> Self:

@@ -164,7 +164,7 @@ def test_a_fixed_size_becomes_the_preprocessing(tmp_path: Path) -> None:
     assert network.preprocess == Preprocess(resize_height=20, crop=(12, 16), size=(6, 8))
     x, _ = network.preprocess(torch.rand(1, 3, 48, 64), torch.eye(3)[None])
     assert network(x).depth.shape == (1, 6, 8)
-    with pytest.raises(ValueError, match=r"input 'image' has a fixed size of 6 x 8 px, but .* is \(8, 8\)"):
+    with pytest.raises(ValueError, match=r"input has a fixed size of 6 x 8 px, but .* is \(8, 8\)"):
         OnnxNetwork(path, OnnxSpec(METRIC, Preprocess(size=(8, 8))))
 
 
