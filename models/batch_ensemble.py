@@ -34,13 +34,7 @@ _PLAIN = (nn.Conv2d, nn.Linear)
 Network = TypeVar("Network", bound=nn.Module)
 
 
-def convert(
-    network: Network,
-    members: int,
-    *,
-    std: float = INIT_STD,
-    generator: torch.Generator | None = None,
-) -> Network:
+def convert(network: Network, members: int, *, std: float = INIT_STD) -> Network:
     """A copy of a network in which every ``Conv2d`` and ``Linear`` is a :class:`BatchLayer`.
 
     Weights are copied and every member starts with the layer's bias. Layers are found wherever the network
@@ -49,8 +43,7 @@ def convert(
     Args:
         network: not changed.
         members: N.
-        std: [1] of the factors, which begin at 1 +- ``std``; 0 starts all members equal.
-        generator: of the random numbers, on the CPU; None = torch's.
+        std: [1] of the factors, which begin at 1 +- ``std``, drawn from torch's generator; 0 starts all members equal.
 
     Raises:
         ValueError: nothing to convert, an option out of range, a network that is converted already, or a
@@ -79,8 +72,8 @@ def convert(
     if len(layers) != len(plain):
         raise RuntimeError(f"{len(layers)} of {len(plain)} layers were converted")
     for layer in layers:
-        _draw(layer.r, std, generator)
-        _draw(layer.s, std, generator)
+        _draw(layer.r, std)
+        _draw(layer.s, std)
     return result
 
 
@@ -99,16 +92,9 @@ class BatchEnsemble(DepthNetwork):
         network: converted into a copy; see :func:`convert` for it and the other arguments, and for errors.
     """
 
-    def __init__(
-        self,
-        network: UncertaintyNetwork,
-        members: int,
-        *,
-        std: float = INIT_STD,
-        generator: torch.Generator | None = None,
-    ) -> None:
+    def __init__(self, network: UncertaintyNetwork, members: int, *, std: float = INIT_STD) -> None:
         super().__init__()
-        self.network = convert(network, members, std=std, generator=generator)
+        self.network = convert(network, members, std=std)
         self.preprocess = network.preprocess
         self.members = members
 
@@ -204,8 +190,7 @@ def _require_plain(name: str, module: nn.Module) -> None:
         raise TypeError(f"{name or 'the network'} cannot be converted: it is a {type(module).__name__} of {held}")
 
 
-def _draw(factor: nn.Parameter, std: float, generator: torch.Generator | None) -> None:
+def _draw(factor: nn.Parameter, std: float) -> None:
     """Random values into a parameter; drawn on the CPU in float32, so that they depend on the seed alone."""
-    values = 1 + std * torch.randn(factor.shape, generator=generator)
     with torch.no_grad():
-        factor.copy_(values)
+        factor.copy_(1 + std * torch.randn(factor.shape))

@@ -52,16 +52,12 @@ class Tiny(Backbone):
         return F.softplus(self.out(features.movedim(1, -1)))[..., 0]
 
 
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def tiny(seed=0, **options):
+def tiny():
     """A network in eval mode whose statistics are not the initial ones, and its ensemble with biases that differ."""
-    torch.manual_seed(seed)
+    torch.manual_seed(0)
     network = with_head(Tiny(), "aleatoric").double()
     network(torch.rand(8, 3, 6, 8, dtype=torch.float64))
-    ensemble = BatchEnsemble(network, N, **{"std": 0.4, "generator": seeded(seed), **options})
+    ensemble = BatchEnsemble(network, N, std=0.4)
     with torch.no_grad():
         for layer in converted_layers(ensemble):
             if layer.bias is not None:
@@ -69,8 +65,8 @@ def tiny(seed=0, **options):
     return network.eval(), ensemble.eval()
 
 
-def images(batch=2, seed=1):
-    return torch.rand(batch, 3, 6, 8, dtype=torch.float64, generator=seeded(seed))
+def images(batch=2):
+    return torch.rand(batch, 3, 6, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
 
 def alone(layer, n):
@@ -102,7 +98,7 @@ def test_a_convolution_is_the_formula(groups, kernel, padding, stride, dilation,
     options = {"padding": amount, "padding_mode": mode, "stride": stride, "dilation": dilation, "groups": count}
     torch.manual_seed(0)
     plain = nn.Conv2d(inputs, outputs, kernel, bias=bias, **options).double()
-    layer = convert(plain, N, std=0.5, generator=seeded())
+    layer = convert(plain, N, std=0.5)
     x = torch.randn(2, inputs, 7, 9, dtype=torch.float64)
     for n in range(N):
         # W_n[o, i] = W[o, i] s_n[o] r_n[j], j the channel that weight i of o's group multiplies.
@@ -122,7 +118,7 @@ def test_a_convolution_is_the_formula(groups, kernel, padding, stride, dilation,
 @pytest.mark.parametrize("bias", [True, False])
 def test_a_linear_layer_is_the_formula(shape, bias):
     plain = nn.Linear(5, 6, bias=bias).double()
-    layer = convert(plain, N, std=0.5, generator=seeded())
+    layer = convert(plain, N, std=0.5)
     if bias:
         with torch.no_grad():
             layer.bias += torch.randn(N, 6)
