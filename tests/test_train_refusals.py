@@ -17,10 +17,8 @@ from ufmstar_torch.train import (
     EpochBatches,
     FitSettings,
     Recipe,
-    TourSettings,
     loss_of,
     preset,
-    tour_frames,
 )
 from ufmstar_torch.train.data_config import Part
 
@@ -64,11 +62,10 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: AugmentationConfig(brightness=1.1), "brightness"),
     (lambda: AugmentationConfig(crop="corner"), "crop"),
     (lambda: AugmentationConfig(zoom="both"), "zoom"),
-    (lambda: TourSettings(frames=0), "frames"),
-    (lambda: TourSettings(size=(4, 32)), "size"),
-    (lambda: TourSettings(fov=170.0), "fov"),
-    (lambda: TourSettings(style="castle"), "style"),
-    (lambda: tour_frames([], TourSettings()), "seeds"),
+    (lambda: DataConfig(tour_frames=0), "tour_frames"),
+    (lambda: DataConfig(tour_size=(4, 32)), "tour_size"),
+    (lambda: DataConfig(tour_fov=170.0), "tour_fov"),
+    (lambda: DataConfig(tour_style="castle"), "style"),
     (lambda: EpochBatches(0, 3), "length"),
     (lambda: EpochBatches(9, 0), "batch_size"),
     (lambda: batches(seed=-1), "seed"),

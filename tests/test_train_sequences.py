@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,7 +90,7 @@ def test_images_and_depth_without_poses(tmp_path):
 @pytest.fixture(scope="module")
 def tours(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cache")
-    return folder, tour_frames([5, 6], TINY, folder)
+    return folder, tour_frames([5, 6], replace(TINY, cache=str(folder)))
 
 
 def test_stored_tours_are_the_rendered_ones(tours):
@@ -110,10 +111,10 @@ def test_tours_are_rendered_once_and_completed(tours, tmp_path):
     shutil.copytree(folder, tmp_path / "cache")
     inside = tmp_path / "cache" / frames.folder.name
     times = {path.name: path.stat().st_mtime_ns for path in inside.iterdir()}
-    tour_frames([5, 6], TINY, tmp_path / "cache")
+    tour_frames([5, 6], replace(TINY, cache=str(tmp_path / "cache")))
     assert times == {path.name: path.stat().st_mtime_ns for path in inside.iterdir()}
     tour_file(inside, 6).unlink()
-    again = tour_frames([5, 6], TINY, tmp_path / "cache")
+    again = tour_frames([5, 6], replace(TINY, cache=str(tmp_path / "cache")))
     assert tour_file(inside, 5).stat().st_mtime_ns == times["5.npy"]
     np.testing.assert_array_equal(again.load(4).image, frames.load(4).image)
     assert sorted(times) == sorted(path.name for path in inside.iterdir())  # nothing temporary is left

@@ -9,17 +9,17 @@ from ufmstar_torch.models import Preprocess
 from ufmstar_torch.train import (
     Augmentation,
     AugmentationConfig,
+    DataConfig,
     EpochBatches,
     SampleDataset,
     SampleError,
-    TourSettings,
 )
 from ufmstar_torch.train.data import sample_loader
 from ufmstar_torch.train.samples import RawSample
 
 SMALL = (48, 64)  # NYU's aspect ratio
 PLAIN = Preprocess()
-TINY = TourSettings(frames=3, stride=4, size=(24, 32))
+TINY = DataConfig(tour_frames=3, tour_stride=4, tour_size=(24, 32))
 
 
 def nyu_frame(number: int, size=SMALL) -> tuple[np.ndarray, np.ndarray]:

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.train.settings import FitSettings as FitSettings
     from ufmstar_torch.train.settings import Job as Job
     from ufmstar_torch.train.start import starting_network as starting_network
-    from ufmstar_torch.train.tour_data import TourSettings as TourSettings
     from ufmstar_torch.train.tour_data import tour_frames as tour_frames
     from ufmstar_torch.train.uncertainty import UncertaintyCallback as UncertaintyCallback
     from ufmstar_torch.train.uncertainty import judge_network as judge_network

@@ -17,7 +17,7 @@ from ufmstar_torch.train.data_config import DataConfig, Part
 from ufmstar_torch.train.nyu import NyuFrames
 from ufmstar_torch.train.samples import FrameSource, Sample, SampleDataset, clips
 from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
-from ufmstar_torch.train.tour_data import TourFrames, TourSettings, tour_frames
+from ufmstar_torch.train.tour_data import TourFrames, tour_frames
 
 
 class DepthDataModule(LightningDataModule):
@@ -117,9 +117,8 @@ def sources(config: DataConfig) -> tuple[FrameSource, FrameSource]:
     if c.kind == "nyu":
         return NyuFrames(c.paths[0], "train"), NyuFrames(c.paths[0], "val")
     if c.kind == "tour":
-        settings = TourSettings(c.tour_frames, c.tour_stride, c.tour_size, c.tour_style, c.tour_fov)
         seeds = range(c.first_tour, c.first_tour + c.tours + c.validation_tours)
-        folder = tour_frames(seeds, settings, c.cache or None, workers=c.render_workers).folder
+        folder = tour_frames(seeds, c).folder
         parts = seeds[: c.tours], seeds[c.tours :]
         return TourFrames(folder, parts[0], c.tour_frames), TourFrames(folder, parts[1], c.tour_frames)
     return _sequences(c)

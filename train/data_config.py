@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass, field
 
 from ufmstar_torch.checked import Checked, choice, number
+from ufmstar_torch.eval.tour.style import style_of
 from ufmstar_torch.train.augment import AugmentationConfig
 
 KINDS = ("nyu", "sequences", "tour")
@@ -103,7 +104,7 @@ class DataConfig(Checked):
     tour_stride: int = number(6, "N", "steps", 1)
     tour_style: str = "home"
     tour_size: tuple[int, int] = (160, 224)
-    tour_fov: float = 70.0
+    tour_fov: float = number(70.0, "fov", "degrees", 20, 120)
     cache: str = ""
     render_workers: int = number(1, "N", "processes", 1)
     batch_size: int = number(8, "B", "frames", 1)
@@ -121,6 +122,11 @@ class DataConfig(Checked):
             raise ValueError(f"DataConfig.paths must name {expected} where kind is {self.kind!r}, got {self.paths}")
         if self.validation_paths and self.kind != "sequences":
             raise ValueError(f"DataConfig.validation_paths is for kind 'sequences', got kind {self.kind!r}")
+        if len(self.tour_size) != 2 or min(self.tour_size) < 8:
+            raise ValueError(
+                f"DataConfig.tour_size must be (height, width) of at least 8 px each, got {self.tour_size}"
+            )
+        style_of(self.tour_style)
         for name in ("part", "validation_part"):
             try:
                 Part.parse(getattr(self, name))

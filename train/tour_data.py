@@ -16,7 +16,7 @@ import os
 import random
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,46 +27,14 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.array_files import read_npy
 from ufmstar_torch.atomic import write_atomic
-from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.eval.tour.style import style_of
+from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.samples import RawSample, SampleError
 
 _LOG = logging.getLogger(__name__)
 # [m] Twice the largest error of a stored depth; the largest depth is 65 m.
 _UNIT = 1e-3
 _FARTHEST = np.iinfo(np.uint16).max
-
-
-@dataclass(frozen=True)
-class TourSettings(Checked):
-    """Settings of the stored frames of a tour, apart from its seed.
-
-    Raises:
-        ValueError: a number out of range, or no such style.
-    """
-
-    frames: int = number(40, "N", "frames", 1)  # of each tour
-    stride: int = number(6, "N", "steps", 1)  # of the walk between two frames
-    size: tuple[int, int] = (160, 224)  # (height, width) [px]
-    style: str = "home"  # of the rooms
-    fov: float = number(70.0, "fov", "degrees", 20, 120)  # horizontal field of view
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if len(self.size) != 2 or min(self.size) < 8:
-            raise ValueError(f"TourSettings.size must be (height, width) of at least 8 px each, got {self.size}")
-        style_of(self.style)
-
-    def digest(self) -> str:
-        """16 hexadecimal digits that change with every setting and with the renderer's source."""
-        import ufmstar_torch.eval.tour as package
-
-        settings = {**asdict(self), "style": asdict(style_of(self.style))}
-        sources = sorted(Path(str(package.__file__)).parent.glob("*.py"))
-        digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
-        for source in (*sources, Path(__file__)):
-            digest.update(source.read_bytes())
-        return digest.hexdigest()[:16]
 
 
 class TourFrames:
@@ -106,10 +74,7 @@ class TourFrames:
 
 def tour_frames(
     seeds: Iterable[int],
-    settings: TourSettings,
-    cache: str | Path | None = None,
-    *,
-    workers: int = 1,
+    config: DataConfig,
 ) -> TourFrames:
     """The frames of tours, which are rendered if the cache does not have them.
 
@@ -118,26 +83,34 @@ def tour_frames(
 
     Args:
         seeds: of the tours.
-        settings: what is rendered.
-        cache: folder; None = ``ufmstar_torch/tours`` in the user's cache folder.
-        workers: processes that render; 1 = this one.
+        config: what is rendered, by how many processes, and the folder of the cache.
 
     Raises:
-        ValueError: no seed, or a number out of range.
         OSError: the cache cannot be written.
     """
     seeds = tuple(seeds)
-    if not seeds or workers < 1:
-        raise ValueError(f"seeds must hold at least one and workers be at least 1, got {len(seeds)} and {workers}")
     user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ufmstar_torch" / "tours"
-    folder = (user_cache if cache is None else Path(cache)) / f"tours-{settings.digest()}"
+    folder = (Path(config.cache) if config.cache else user_cache) / f"tours-{digest(config)}"
     folder.mkdir(parents=True, exist_ok=True)
     missing = [seed for seed in seeds if not tour_file(folder, seed).exists()]
     random.Random(os.getpid()).shuffle(missing)
     if missing:
-        _LOG.info("rendering %d tours of %d frames into %s", len(missing), settings.frames, folder)
-        _render(folder, missing, settings, min(workers, len(missing)))
-    return TourFrames(folder, seeds, settings.frames)
+        _LOG.info("rendering %d tours of %d frames into %s", len(missing), config.tour_frames, folder)
+        _render(folder, missing, config)
+    return TourFrames(folder, seeds, config.tour_frames)
+
+
+def digest(config: DataConfig) -> str:
+    """16 hexadecimal digits that change with every setting of the tours and with the renderer's source."""
+    import ufmstar_torch.eval.tour as package
+
+    settings = {name: getattr(config, f"tour_{name}") for name in ("frames", "stride", "size", "fov")}
+    settings["style"] = asdict(style_of(config.tour_style))
+    sources = sorted(Path(str(package.__file__)).parent.glob("*.py"))
+    result = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    for source in (*sources, Path(__file__)):
+        result.update(source.read_bytes())
+    return result.hexdigest()[:16]
 
 
 def tour_file(folder: Path, seed: int) -> Path:
@@ -145,7 +118,7 @@ def tour_file(folder: Path, seed: int) -> Path:
     return folder / f"{seed}.npy"
 
 
-def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
+def render_tour(folder: Path, config: DataConfig, seed: int) -> None:
     """Renders one tour into its file, unless it exists."""
     from ufmstar_torch.eval.tour import tour_sequence
 
@@ -154,16 +127,16 @@ def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
         return
     sequence = tour_sequence(
         seed,
-        frames=settings.frames * settings.stride,
-        size=settings.size,
-        style=settings.style,
-        fov=settings.fov,
+        frames=config.tour_frames * config.tour_stride,
+        size=config.tour_size,
+        style=config.tour_style,
+        fov=config.tour_fov,
         path_seed=0,  # the longest way, from anywhere on it
     )
-    maps = [("image", np.uint8, (3, *settings.size)), ("depth", np.uint16, settings.size)]
-    frames = np.empty(settings.frames, [*maps, ("pose", np.float64, (4, 4)), ("camera", np.float64, (3, 3))])
-    for i in range(settings.frames):
-        frame = sequence[i * settings.stride]
+    maps = [("image", np.uint8, (3, *config.tour_size)), ("depth", np.uint16, config.tour_size)]
+    frames = np.empty(config.tour_frames, [*maps, ("pose", np.float64, (4, 4)), ("camera", np.float64, (3, 3))])
+    for i in range(config.tour_frames):
+        frame = sequence[i * config.tour_stride]
         assert frame.image is not None
         assert frame.depth is not None
         depth = np.rint(frame.depth / _UNIT).clip(0, _FARTHEST)
@@ -171,8 +144,8 @@ def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
     write_atomic(file, partial(np.save, arr=frames))
 
 
-def _render(folder: Path, seeds: list[int], settings: TourSettings, workers: int) -> None:
-    task = partial(render_tour, folder, settings)
+def _render(folder: Path, seeds: list[int], config: DataConfig) -> None:
+    task, workers = partial(render_tour, folder, config), min(config.render_workers, len(seeds))
     if workers == 1:
         for seed in seeds:
             task(seed)
