@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from layouts import truth, write_generic
 from training_data import PLAIN, Numbered, loader, numbers, nyu_frame, truncated, write_nyu
 
+from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
 from ufmstar_torch.train import (
     Augmentation,
@@ -20,9 +21,9 @@ from ufmstar_torch.train import (
     DataConfig,
     DepthDataModule,
     EpochBatches,
-    NyuFrames,
     SampleDataset,
     SampleError,
+    SequenceFrames,
 )
 from ufmstar_torch.train.data import sample_loader
 from ufmstar_torch.train.samples import RawSample, SampleKey, make_sample
@@ -129,7 +130,7 @@ def test_a_data_module_gives_each_process_its_share_and_tells_broken_files(tmp_p
         seen += [batch["depth"].sum().item() for batch in data.val_dataloader()]
         list(data.train_dataloader())
     assert sorted(seen) == pytest.approx(sorted(float(nyu_frame(100 + i)[1].sum()) for i in range(3)))
-    assert data.bad_files() == (str(root / "train" / "kitchen_1" / "9.h5"),)
+    assert data.bad_files() == ("nyu_train/kitchen_1__9",)
 
 
 # Lightning 2.6 asks torch's pytree in a way that newer versions of torch deprecate.
@@ -222,8 +223,8 @@ def test_loading_leaves_the_global_generator_alone():
 @pytest.mark.slow
 def test_worker_processes_load_the_same_and_report_broken_files(tmp_path):
     """Spawned; what they find broken is known here, and they know what epoch it is."""
-    frames = NyuFrames(write_nyu(tmp_path), "train")
-    truncated(frames.files[1], 0.5)
+    frames = SequenceFrames([open_sequence(write_nyu(tmp_path) / "train")])
+    truncated(tmp_path / "train" / "kitchen_0" / "10.h5", 0.5)
 
     def made(workers):
         augmentation = Augmentation(AugmentationConfig(crop="random"))
@@ -236,4 +237,4 @@ def test_worker_processes_load_the_same_and_report_broken_files(tmp_path):
             one.batch_sampler.sampler.set_epoch(epoch)
         for one, two in zip(alone, apart, strict=True):
             assert all(torch.equal(one[name].nan_to_num(-1), two[name].nan_to_num(-1)) for name in one)
-    assert apart.dataset.bad_files() == alone.dataset.bad_files() == (str(frames.files[1]),)
+    assert apart.dataset.bad_files() == alone.dataset.bad_files() == (frames.name(1),)

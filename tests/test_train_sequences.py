@@ -16,7 +16,7 @@ from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.train import SampleDataset, SampleError, SequenceFrames, tour_frames
 from ufmstar_torch.train.data_config import Part
 from ufmstar_torch.train.sequence_data import open_rgbd
-from ufmstar_torch.train.tour_data import TourFrames, tour_file
+from ufmstar_torch.train.tour_data import digest, tour_file
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_stored_tours_are_the_rendered_ones(tours):
 def test_tours_are_rendered_once_and_completed(tours, tmp_path):
     folder, frames = tours
     shutil.copytree(folder, tmp_path / "cache")
-    inside = tmp_path / "cache" / frames.folder.name
+    inside = tmp_path / "cache" / f"tours-{digest(TINY)}"
     times = {path.name: path.stat().st_mtime_ns for path in inside.iterdir()}
     tour_frames([5, 6], replace(TINY, cache=str(tmp_path / "cache")))
     assert times == {path.name: path.stat().st_mtime_ns for path in inside.iterdir()}
@@ -121,11 +121,13 @@ def test_tours_are_rendered_once_and_completed(tours, tmp_path):
 
 
 def test_a_truncated_cache_file_is_named(tours, tmp_path):
-    folder, frames = tours
+    folder, _ = tours
     shutil.copytree(folder, tmp_path / "cache")
-    inside = tmp_path / "cache" / frames.folder.name
-    truncated(tour_file(inside, 5), 0.5)
-    copy = TourFrames(inside, [5, 6], 3)
-    with pytest.raises(SampleError, match=r"5\.npy\[1\]"):
+    config = replace(TINY, cache=str(tmp_path / "cache"))
+    copy = tour_frames([5, 6], config)
+    truncated(tour_file(tmp_path / "cache" / f"tours-{digest(TINY)}", 5), 0.5)
+    with pytest.raises(SampleError, match=r"tour-5/1: .*5\.npy"):
         copy.load(1)
-    np.testing.assert_array_equal(copy.load(3).depth, frames.load(3).depth)
+    assert copy.load(3).depth.any()
+    with pytest.raises(ValueError, match=r"5\.npy"):
+        tour_frames([5], config)

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.train.losses import loss_sums as loss_sums
     from ufmstar_torch.train.module import NonFiniteLossError as NonFiniteLossError
     from ufmstar_torch.train.module import TrainingModule as TrainingModule
-    from ufmstar_torch.train.nyu import NyuFrames as NyuFrames
     from ufmstar_torch.train.nyu import convert_labelled as convert_labelled
     from ufmstar_torch.train.own_network import own_job as own_job
     from ufmstar_torch.train.own_network import train_module as train_module

@@ -10,14 +10,15 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
+from ufmstar_torch.eval.sequences.nyu import PARTS
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.augment import Augmentation
 from ufmstar_torch.train.batches import EpochBatches
 from ufmstar_torch.train.data_config import DataConfig, Part
-from ufmstar_torch.train.nyu import NyuFrames
-from ufmstar_torch.train.samples import FrameSource, Sample, SampleDataset, clips
+from ufmstar_torch.train.samples import Sample, SampleDataset, clips
 from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
-from ufmstar_torch.train.tour_data import TourFrames, tour_frames
+from ufmstar_torch.train.tour_data import tour_frames
 
 
 class DepthDataModule(LightningDataModule):
@@ -111,16 +112,15 @@ def sample_loader(dataset: SampleDataset, batches: EpochBatches, workers: int = 
     )
 
 
-def sources(config: DataConfig) -> tuple[FrameSource, FrameSource]:
+def sources(config: DataConfig) -> tuple[SequenceFrames, SequenceFrames]:
     """The frames to train on, and those to validate on. Raises OSError, ValueError: as ``DepthDataModule.setup``."""
     c = config
     if c.kind == "nyu":
-        return NyuFrames(c.paths[0], "train"), NyuFrames(c.paths[0], "val")
+        train, validation = (SequenceFrames([open_sequence(Path(c.paths[0]) / part)]) for part in PARTS)
+        return train, validation
     if c.kind == "tour":
         seeds = range(c.first_tour, c.first_tour + c.tours + c.validation_tours)
-        folder = tour_frames(seeds, c).folder
-        parts = seeds[: c.tours], seeds[c.tours :]
-        return TourFrames(folder, parts[0], c.tour_frames), TourFrames(folder, parts[1], c.tour_frames)
+        return tour_frames(seeds[: c.tours], c), tour_frames(seeds[c.tours :], c)
     return _sequences(c)
 
 

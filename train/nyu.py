@@ -1,8 +1,5 @@
-"""NYU Depth V2 in FastDepth's layout: ``train|val/<scene>/*.h5`` with ``rgb`` and ``depth``, and its conversion.
-
-``rgb`` is uint8 [3, H, W], ``depth`` floating-point [H, W] in metres along the optical axis, registered to
-``rgb``; 0 or not finite = none. The archive that FastDepth names is gone; :func:`convert_labelled` makes the
-layout from the labelled file that the dataset's own site offers (docs/training.md).
+"""NYU Depth V2 in FastDepth's layout (``eval.sequences.nyu`` reads it), from the labelled file that the dataset's own
+site offers: the archive that FastDepth names is gone (docs/training.md).
 """
 
 from __future__ import annotations
@@ -14,50 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ufmstar_torch.atomic import write_atomic
-from ufmstar_torch.eval.sequences.frame import FrameError
-from ufmstar_torch.eval.sequences.intrinsics import pinhole, scale_intrinsics
-from ufmstar_torch.eval.sequences.nyu import INTRINSICS, NATIVE_SIZE, PARTS, part_files, read_h5
-from ufmstar_torch.train.samples import RawSample, SampleError
 
 if TYPE_CHECKING:
     import h5py
 
 # Without a split, every fourth scene in alphabetical order belongs to the validation part.
 _VALIDATION_EVERY = 4
-
-
-class NyuFrames:
-    """The frames of a part, "train" or "val", of the dataset in a folder, in the order of scenes and numbers. Raises
-    ValueError: another part; FileNotFoundError: no such folder, or no h5 file in it."""
-
-    def __init__(self, root: str | Path, part: str) -> None:
-        if part not in PARTS:
-            raise ValueError(f"part must be 'train' or 'val', got {part!r}")
-        folder = Path(root) / part
-        self.files = tuple(part_files(folder))
-        if not self.files:
-            raise FileNotFoundError(f"{folder} holds no <scene>/*.h5: expected FastDepth's layout of NYU Depth V2")
-
-    def __len__(self) -> int:
-        return len(self.files)
-
-    def name(self, index: int) -> str:
-        """The file."""
-        return str(self.files[index])
-
-    def runs(self) -> list[range]:
-        """None: the frames have no poses."""
-        return []
-
-    def load(self, index: int) -> RawSample:
-        """Reads a file; nothing stays open, so that worker processes share nothing. Raises SampleError: it cannot be
-        read, lacks ``rgb`` or ``depth``, or they have other types or shapes."""
-        path = self.files[index]
-        try:
-            rgb, depth = read_h5(path)
-        except FrameError as error:
-            raise SampleError(str(path), error.reason) from error
-        return RawSample(rgb, depth.astype(np.float32), _intrinsics(path, depth.shape[0], depth.shape[1]))
 
 
 def convert_labelled(
@@ -104,15 +63,6 @@ def convert_labelled(
             if not path.exists():
                 _write(path, images[i].transpose(0, 2, 1), depths[i].T)
     return {"train": len(scenes) - len(validation), "val": len(validation)}
-
-
-def _intrinsics(path: Path, height: int, width: int) -> np.ndarray:
-    """[3, 3] of images of that size; files that were cropped have none."""
-    try:
-        return scale_intrinsics(pinhole(*INTRINSICS), NATIVE_SIZE, (height, width))
-    except ValueError as error:
-        reason = f"is {width} x {height}, not a resized 640 x 480: its intrinsics are not known"
-        raise SampleError(str(path), reason) from error
 
 
 def _matlab_string(characters: h5py.Dataset) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypedDict
+from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 import numpy as np
 import torch
@@ -14,6 +14,9 @@ from torch.utils.data import Dataset
 from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.augment import Augmentation
+
+if TYPE_CHECKING:
+    from ufmstar_torch.train.sequence_data import SequenceFrames
 
 _LOG = logging.getLogger(__name__)
 _UNKNOWN = torch.full((4, 4), torch.nan, dtype=torch.float64)  # a pose
@@ -62,24 +65,6 @@ class RawSample:
     T_world_cam: np.ndarray | None = None  # [4, 4] float64 camera-to-world [m]; None = not known
 
 
-class FrameSource(Protocol):
-    """Frames by number."""
-
-    def __len__(self) -> int: ...
-
-    def name(self, index: int) -> str:
-        """The file of frame ``index``, for messages."""
-        ...
-
-    def load(self, index: int) -> RawSample:
-        """Decodes frame ``index``; raises :class:`SampleError` where its file is broken."""
-        ...
-
-    def runs(self) -> list[range]:
-        """Numbers of frames that follow one another on a known path, of all paths; [] of single images."""
-        ...
-
-
 class SampleDataset(Dataset[Sample]):
     """The frames of a source as samples for a network.
 
@@ -100,7 +85,7 @@ class SampleDataset(Dataset[Sample]):
 
     def __init__(
         self,
-        source: FrameSource,
+        source: SequenceFrames,
         preprocess: Preprocess,
         augmentation: Augmentation | None = None,
         *,
@@ -170,7 +155,7 @@ def make_sample(
     return Sample(image=x[0], depth=depth.contiguous(), valid=depth > 0, intrinsics=K_network, T_world_cam=pose)
 
 
-def clips(source: FrameSource, length: int) -> list[range]:
+def clips(source: SequenceFrames, length: int) -> list[range]:
     """The frames of a source in clips that do not overlap; what is left at the end of a path is in none. Raises
     ValueError: there is none."""
     whole = [run[i : i + length] for run in source.runs() for i in range(0, len(run) - length + 1, length)]

@@ -1,6 +1,6 @@
 """Rendered tours as training frames, each rendered once into a memory-mapped file.
 
-A tour's file is ``<seed>.npy``, an array [F] of records: ``image`` (uint8 [3, H, W]), ``depth`` (uint16 [H, W] in
+A tour's file is ``<seed>.npy``, an array [F] of records: ``image`` (uint8 [H, W, 3]), ``depth`` (uint16 [H, W] in
 millimetres, 0 = none), ``pose`` (float64 [4, 4], camera-to-world) and ``camera`` (float64 [3, 3]). It is written
 atomically. The name of its folder is a digest of everything that decides the content, the renderer's source included,
 so that other settings and other versions have folders of their own.
@@ -27,9 +27,10 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.array_files import read_npy
 from ufmstar_torch.atomic import write_atomic
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, make_sequence
 from ufmstar_torch.eval.tour.style import style_of
 from ufmstar_torch.train.data_config import DataConfig
-from ufmstar_torch.train.samples import RawSample, SampleError
+from ufmstar_torch.train.sequence_data import SequenceFrames
 
 _LOG = logging.getLogger(__name__)
 # [m] Twice the largest error of a stored depth; the largest depth is 65 m.
@@ -37,46 +38,11 @@ _UNIT = 1e-3
 _FARTHEST = np.iinfo(np.uint16).max
 
 
-class TourFrames:
-    """The stored frames of some tours, ``frames`` of each. Build one with :func:`tour_frames`."""
-
-    def __init__(self, folder: Path, seeds: Iterable[int], frames: int) -> None:
-        self.folder, self.seeds, self.frames = folder, tuple(seeds), frames
-        self._maps: dict[int, NDArray[Any]] = {}
-
-    def __getstate__(self) -> dict[str, object]:
-        # A worker process maps the files itself: a pickled map would be a copy of all of it.
-        return {**self.__dict__, "_maps": {}}
-
-    def __len__(self) -> int:
-        return len(self.seeds) * self.frames
-
-    def name(self, index: int) -> str:
-        """The tour's file and the frame."""
-        return f"{tour_file(self.folder, self.seeds[index // self.frames])}[{index % self.frames}]"
-
-    def runs(self) -> list[range]:
-        """The frames of every tour."""
-        return [range(n, n + self.frames) for n in range(0, len(self), self.frames)]
-
-    def load(self, index: int) -> RawSample:
-        """Reads a frame. Raises SampleError: the tour's file is missing or truncated."""
-        seed, number = self.seeds[index // self.frames], index % self.frames
-        try:
-            if seed not in self._maps:
-                self._maps[seed] = read_npy(tour_file(self.folder, seed), mapped=True)
-            frame = self._maps[seed][number]
-            metres = frame["depth"].astype(np.float32) * np.float32(_UNIT)
-            return RawSample(frame["image"].copy(), metres, frame["camera"], frame["pose"])
-        except (OSError, ValueError, IndexError) as error:
-            raise SampleError(self.name(index), f"cannot be read: {error}") from error
-
-
 def tour_frames(
     seeds: Iterable[int],
     config: DataConfig,
-) -> TourFrames:
-    """The frames of tours, which are rendered if the cache does not have them.
+) -> SequenceFrames:
+    """The frames of some tours, which are rendered if the cache does not have them.
 
     After an interruption it goes on with the missing tours. Several processes may call it at the same time (those of a
     distributed run do): they render in different orders, and skip tours that another process has stored.
@@ -87,6 +53,7 @@ def tour_frames(
 
     Raises:
         OSError: the cache cannot be written.
+        ValueError: a tour's file is damaged.
     """
     seeds = tuple(seeds)
     user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ufmstar_torch" / "tours"
@@ -97,7 +64,7 @@ def tour_frames(
     if missing:
         _LOG.info("rendering %d tours of %d frames into %s", len(missing), config.tour_frames, folder)
         _render(folder, missing, config)
-    return TourFrames(folder, seeds, config.tour_frames)
+    return SequenceFrames([stored_tour(folder, seed) for seed in seeds])
 
 
 def digest(config: DataConfig) -> str:
@@ -118,6 +85,34 @@ def tour_file(folder: Path, seed: int) -> Path:
     return folder / f"{seed}.npy"
 
 
+def stored_tour(folder: Path, seed: int) -> FrameSequence:
+    """The frames of a tour's file. Raises OSError, ValueError: it cannot be read."""
+    file = tour_file(folder, seed)
+    frames = read_npy(file, mapped=True)
+    entries = [
+        Entry(str(i), pose, partial(_image, file, i), partial(_depth, file, i)) for i, pose in enumerate(frames["pose"])
+    ]
+    size = frames["depth"].shape[1:]
+    camera = np.array(frames["camera"][0])
+    return make_sequence(f"tour-{seed}", "tour", entries, camera, image_size=size, depth_size=size)
+
+
+def _image(file: Path, number: int) -> NDArray[np.uint8]:
+    return np.array(_record(file, number)["image"])
+
+
+def _depth(file: Path, number: int) -> NDArray[np.float32]:
+    return _record(file, number)["depth"].astype(np.float32) * np.float32(_UNIT)
+
+
+def _record(file: Path, number: int) -> Any:
+    """A frame of a tour's file. Raises FrameError: it is missing or truncated."""
+    try:
+        return read_npy(file, mapped=True)[number]
+    except (OSError, ValueError, IndexError) as error:
+        raise FrameError(file, f"cannot be read: {error}") from error
+
+
 def render_tour(folder: Path, config: DataConfig, seed: int) -> None:
     """Renders one tour into its file, unless it exists."""
     from ufmstar_torch.eval.tour import tour_sequence
@@ -133,14 +128,14 @@ def render_tour(folder: Path, config: DataConfig, seed: int) -> None:
         fov=config.tour_fov,
         path_seed=0,  # the longest way, from anywhere on it
     )
-    maps = [("image", np.uint8, (3, *config.tour_size)), ("depth", np.uint16, config.tour_size)]
+    maps = [("image", np.uint8, (*config.tour_size, 3)), ("depth", np.uint16, config.tour_size)]
     frames = np.empty(config.tour_frames, [*maps, ("pose", np.float64, (4, 4)), ("camera", np.float64, (3, 3))])
     for i in range(config.tour_frames):
         frame = sequence[i * config.tour_stride]
         assert frame.image is not None
         assert frame.depth is not None
         depth = np.rint(frame.depth / _UNIT).clip(0, _FARTHEST)
-        frames[i] = (frame.image.transpose(2, 0, 1), depth, frame.T_world_cam, frame.intrinsics)
+        frames[i] = (frame.image, depth, frame.T_world_cam, frame.intrinsics)
     write_atomic(file, partial(np.save, arr=frames))
 
 

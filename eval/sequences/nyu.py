@@ -58,26 +58,6 @@ def read(path: Path, options: Options) -> FrameSequence:
     return assemble("nyu", folder, entries, Lens(INTRINSICS, NATIVE_SIZE), options, name=name, size=size, posed=False)
 
 
-def read_h5(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """``rgb`` [3, H, W] uint8 and ``depth`` [H, W] floating-point [m] as they are; nothing stays open. Raises
-    FrameError: it cannot be read, lacks one of them, or they have other types or shapes."""
-    import h5py
-
-    try:
-        with h5py.File(path, "r") as file:
-            if missing := {"rgb", "depth"} - set(file):
-                raise KeyError(f"no dataset {min(missing)!r}, only {sorted(file)}")
-            rgb, depth = np.asarray(file["rgb"]), np.asarray(file["depth"])
-    except _BROKEN as error:
-        raise FrameError(path, f"cannot be read: {error}") from error
-    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[0] != 3 or 0 in rgb.shape:
-        raise FrameError(path, f"rgb must be uint8 [3, H, W], got {rgb.dtype} {list(rgb.shape)}")
-    if not np.issubdtype(depth.dtype, np.floating) or depth.shape != rgb.shape[1:]:
-        expected = f"floating-point {list(rgb.shape[1:])}"
-        raise FrameError(path, f"depth must be {expected} as rgb is, got {depth.dtype} {list(depth.shape)}")
-    return rgb, depth
-
-
 def _files(path: Path) -> list[Path]:
     """The files of a part or of a scene of one; none of anything else."""
     if path.resolve().name in PARTS:
@@ -88,8 +68,28 @@ def _files(path: Path) -> list[Path]:
 
 
 def _image(path: Path) -> np.ndarray:
-    return np.ascontiguousarray(read_h5(path)[0].transpose(1, 2, 0))
+    rgb = _dataset(path, "rgb")
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[0] != 3 or 0 in rgb.shape:
+        raise FrameError(path, f"rgb must be uint8 [3, H, W], got {rgb.dtype} {list(rgb.shape)}")
+    return np.ascontiguousarray(rgb.transpose(1, 2, 0))
 
 
 def _depth(path: Path, scale: float) -> np.ndarray:
-    return positive((read_h5(path)[1] * np.float64(scale)).astype(np.float32))
+    depth = _dataset(path, "depth")
+    if not np.issubdtype(depth.dtype, np.floating) or depth.ndim != 2 or 0 in depth.shape:
+        raise FrameError(path, f"depth must be floating-point [H, W], got {depth.dtype} {list(depth.shape)}")
+    return positive((depth * np.float64(scale)).astype(np.float32))
+
+
+def _dataset(path: Path, name: str) -> np.ndarray:
+    """A dataset of a file as it is; nothing stays open, so that processes share nothing. Raises FrameError: it is not
+    there, or cannot be read."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            if name not in file:
+                raise KeyError(f"no dataset {name!r}, only {sorted(file)}")
+            return np.asarray(file[name])
+    except _BROKEN as error:
+        raise FrameError(path, f"cannot be read: {error}") from error
