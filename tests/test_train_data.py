@@ -14,6 +14,7 @@ from layouts import truth, write_generic
 from training_data import PLAIN, Numbered, loader, numbers, nyu_frame, truncated, write_nyu
 
 from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.models import Preprocess
 from ufmstar_torch.train import (
     Augmentation,
@@ -22,27 +23,23 @@ from ufmstar_torch.train import (
     DepthDataModule,
     EpochBatches,
     SampleDataset,
-    SampleError,
     SequenceFrames,
 )
 from ufmstar_torch.train.data import sample_loader
-from ufmstar_torch.train.samples import RawSample, SampleKey, make_sample
+from ufmstar_torch.train.samples import SampleKey, make_sample
 
 
 def test_a_sample_is_what_the_network_and_the_losses_take():
-    raw = RawSample(
-        np.arange(3 * 6 * 8, dtype=np.uint8).reshape(3, 6, 8),
-        np.array([[1.0, 0.0, np.nan, np.inf, -2.0, 3.0, 4.0, 5.0]] * 6, np.float32),
-        np.eye(3),
-    )
-    sample = make_sample(raw, PLAIN, None, (0, 0, 0))
-    torch.testing.assert_close(sample["image"], torch.from_numpy(raw.image).float() / 255)
+    image = np.arange(3 * 6 * 8, dtype=np.uint8).reshape(6, 8, 3)
+    depth = np.array([[1.0, 0.0, np.nan, np.inf, -2.0, 3.0, 4.0, 5.0]] * 6, np.float32)
+    sample = make_sample(Frame(0, "a", image, depth, np.eye(4), np.eye(3)), PLAIN, None, (0, 0, 0))
+    torch.testing.assert_close(sample["image"], torch.from_numpy(image).permute(2, 0, 1).float() / 255)
     assert sample["depth"][0].tolist() == [1, 0, 0, 0, 0, 3, 4, 5]
     assert sample["valid"][0].tolist() == [True, False, False, False, False, True, True, True]
     assert [sample[k].dtype for k in ("image", "depth", "valid", "intrinsics")] == [
         torch.float32, torch.float32, torch.bool, torch.float64,
     ]  # fmt: skip
-    assert np.isnan(raw.depth[0, 2])  # the frame is left as it was
+    assert np.isnan(depth[0, 2])  # the frame is left as it was
 
 
 def test_epoch_and_index_decide_the_augmentation():
@@ -60,7 +57,7 @@ def test_epoch_and_index_decide_the_augmentation():
 def test_a_broken_file_stops_the_run_with_its_name():
     dataset = SampleDataset(Numbered(5, broken=(2,)), PLAIN)
     assert dataset[1]["depth"][0, 0] == 2
-    with pytest.raises(SampleError, match="frame-2: torn"):
+    with pytest.raises(FrameError, match="frame-2: torn"):
         dataset[2]
 
 

@@ -11,9 +11,9 @@ import torch
 from layouts import write_generic, write_scannet, write_tum
 from training_data import PLAIN, TINY, truncated
 
-from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.train import SampleDataset, SampleError, SequenceFrames, tour_frames
+from ufmstar_torch.train import SampleDataset, SequenceFrames, tour_frames
 from ufmstar_torch.train.data_config import Part
 from ufmstar_torch.train.sequence_data import open_rgbd
 from ufmstar_torch.train.tour_data import digest, tour_file
@@ -48,7 +48,7 @@ def test_frames_of_a_sequence_are_the_readers(tmp_path):
     assert frames.name(half) == f"{sequence.name}/{sequence.names[0]}"
     for index in (0, 1, half):
         frame, raw = sequence[index % half], frames.load(index)
-        np.testing.assert_array_equal(raw.image.transpose(1, 2, 0), frame.image)
+        np.testing.assert_array_equal(raw.image, frame.image)
         np.testing.assert_array_equal(raw.depth, frame.depth)
         np.testing.assert_array_equal(raw.intrinsics, frame.intrinsics)
 
@@ -64,7 +64,7 @@ def test_a_broken_image_of_a_sequence_is_named_or_skipped(tmp_path):
     path, _ = write_generic(tmp_path)
     frames = SequenceFrames([open_sequence(path)])
     truncated(path / "images" / "9.png", 0.4)
-    with pytest.raises(SampleError, match=r"walk/9: .*9\.png"):
+    with pytest.raises(FrameError, match=r"walk/9: .*9\.png"):
         frames.load(2)
     dataset = SampleDataset(frames, PLAIN, on_bad_file="skip")
     assert torch.equal(dataset[2]["image"], dataset[3]["image"])
@@ -101,7 +101,7 @@ def test_stored_tours_are_the_rendered_ones(tours):
     sequence = tour_sequence(6, frames=12, size=(24, 32), path_seed=0)
     for i in range(3):
         frame, raw = sequence[4 * i], frames.load(3 + i)
-        np.testing.assert_array_equal(raw.image.transpose(1, 2, 0), frame.image)
+        np.testing.assert_array_equal(raw.image, frame.image)
         np.testing.assert_allclose(raw.depth, frame.depth, atol=5.1e-4)
         np.testing.assert_array_equal(raw.intrinsics, frame.intrinsics)
 
@@ -126,7 +126,7 @@ def test_a_truncated_cache_file_is_named(tours, tmp_path):
     config = replace(TINY, cache=str(tmp_path / "cache"))
     copy = tour_frames([5, 6], config)
     truncated(tour_file(tmp_path / "cache" / f"tours-{digest(TINY)}", 5), 0.5)
-    with pytest.raises(SampleError, match=r"tour-5/1: .*5\.npy"):
+    with pytest.raises(FrameError, match=r"tour-5/1: .*5\.npy"):
         copy.load(1)
     assert copy.load(3).depth.any()
     with pytest.raises(ValueError, match=r"5\.npy"):

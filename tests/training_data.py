@@ -5,6 +5,7 @@ from __future__ import annotations
 import h5py
 import numpy as np
 
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.models import Preprocess
 from ufmstar_torch.train import (
     Augmentation,
@@ -12,10 +13,8 @@ from ufmstar_torch.train import (
     DataConfig,
     EpochBatches,
     SampleDataset,
-    SampleError,
 )
 from ufmstar_torch.train.data import sample_loader
-from ufmstar_torch.train.samples import RawSample
 
 SMALL = (48, 64)  # NYU's aspect ratio
 PLAIN = Preprocess()
@@ -56,10 +55,11 @@ class Numbered:
     def name(self, index: int) -> str:
         return f"frame-{index}"
 
-    def load(self, index: int) -> RawSample:
+    def load(self, index: int) -> Frame:
         if index in self.broken:
-            raise SampleError(self.name(index), "torn")
-        return RawSample(np.full((3, 6, 8), index, np.uint8), np.full((6, 8), index + 1, np.float32), np.eye(3) + 2)
+            raise FrameError(self.name(index), "torn")
+        image, depth = np.full((6, 8, 3), index, np.uint8), np.full((6, 8), index + 1, np.float32)
+        return Frame(index, self.name(index), image, depth, np.eye(4), np.eye(3) + 2)
 
 
 def numbers(batch) -> list[int]:

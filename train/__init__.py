@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.train.presets import Recipe as Recipe
     from ufmstar_torch.train.presets import preset as preset
     from ufmstar_torch.train.samples import SampleDataset as SampleDataset
-    from ufmstar_torch.train.samples import SampleError as SampleError
     from ufmstar_torch.train.sequence_data import SequenceFrames as SequenceFrames
     from ufmstar_torch.train.settings import FitSettings as FitSettings
     from ufmstar_torch.train.settings import Job as Job

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 import numpy as np
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from ufmstar_torch.eval.sequences.frame import FrameError
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.augment import Augmentation
 
@@ -19,16 +18,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.train.sequence_data import SequenceFrames
 
 _LOG = logging.getLogger(__name__)
-_UNKNOWN = torch.full((4, 4), torch.nan, dtype=torch.float64)  # a pose
-
-
-class SampleError(FrameError):
-    """A sample's file is missing, truncated, or does not hold what it should."""
-
-    @property
-    def name(self) -> str:
-        """The file."""
-        return str(self.path)
 
 
 class Sample(TypedDict):
@@ -53,16 +42,6 @@ class SampleKey(NamedTuple):
     epoch: int
     frame: int
     counts: bool = True
-
-
-@dataclass(frozen=True, eq=False)
-class RawSample:
-    """A frame with depth registered to its image, at the size it is stored in."""
-
-    image: np.ndarray  # [3, H, W] uint8 RGB
-    depth: np.ndarray  # [H, W] float32 [m]; 0 or not finite = none
-    intrinsics: np.ndarray  # [3, 3] float64 [px]
-    T_world_cam: np.ndarray | None = None  # [4, 4] float64 camera-to-world [m]; None = not known
 
 
 class SampleDataset(Dataset[Sample]):
@@ -107,24 +86,24 @@ class SampleDataset(Dataset[Sample]):
 
     def __getitem__(self, key: int | SampleKey) -> Sample:
         """The sample of a frame, (epoch, frame) as ``EpochBatches`` yields it; a frame's number alone is of epoch 0.
-        Raises IndexError: no such frame; SampleError: a broken file with ``on_bad_file="raise"``, or none that can be
+        Raises IndexError: no such frame; FrameError: a broken file with ``on_bad_file="raise"``, or none that can be
         read."""
         epoch, index, counts = SampleKey(*key) if isinstance(key, tuple) else SampleKey(0, key)
         if not 0 <= index < len(self):
             raise IndexError(f"index must lie in [0, {len(self)}), got {index}")
-        raw, number = self._readable(index)
-        sample = make_sample(raw, self.preprocess, self.augmentation, (self.seed, epoch, index))
+        frame, number = self._readable(index)
+        sample = make_sample(frame, self.preprocess, self.augmentation, (self.seed, epoch, index))
         if not counts or (self.evaluate and number != index):
             sample["valid"] = torch.zeros_like(sample["valid"])
         if number != index:  # perhaps of another path
-            sample["T_world_cam"] = _UNKNOWN.clone()
+            sample["T_world_cam"] = torch.full_like(sample["T_world_cam"], torch.nan)
         return sample
 
     def bad_files(self) -> tuple[str, ...]:
         """The broken files met so far, in this process and in the workers of its loaders."""
         return tuple(self.source.name(index) for index in self._bad.nonzero()[:, 0].tolist())
 
-    def _readable(self, index: int) -> tuple[RawSample, int]:
+    def _readable(self, index: int) -> tuple[Frame, int]:
         """Frame ``index``, or else the next that can be read, and its number."""
         for step in range(len(self)):
             candidate = (index + step) % len(self)
@@ -132,26 +111,26 @@ class SampleDataset(Dataset[Sample]):
                 continue
             try:
                 return self.source.load(candidate), candidate
-            except SampleError as error:
+            except FrameError as error:
                 if self.on_bad_file == "raise":
                     raise
                 self._bad[candidate] = True
                 _LOG.warning("skipped a broken file: %s", error)
-        raise SampleError(self.source.name(index), f"and all others of {len(self)} files are broken")
+        raise FrameError(self.source.name(index), f"and all others of {len(self)} files are broken")
 
 
 def make_sample(
-    raw: RawSample, preprocess: Preprocess, augmentation: Augmentation | None, seed: tuple[int, ...]
+    frame: Frame, preprocess: Preprocess, augmentation: Augmentation | None, seed: tuple[int, ...]
 ) -> Sample:
     """A stored frame as the network sees it: augmented, then preprocessed; ``seed`` is the augmentation's."""
-    image, depth, K = (torch.from_numpy(np.array(part)) for part in (raw.image, raw.depth, raw.intrinsics))
-    image = image.contiguous().to(torch.float32) / 255
+    parts = (frame.image, frame.depth, frame.intrinsics, frame.T_world_cam)
+    image, depth, K, pose = (torch.from_numpy(np.array(part)) for part in parts)
+    image = image.permute(2, 0, 1).contiguous().to(torch.float32) / 255
     depth = torch.where(depth.isfinite() & (depth > 0), depth, 0.0).to(torch.float32)
     if augmentation is not None:
         image, depth, K = augmentation(image, depth, K, seed)
     x, K_network = preprocess(image[None], K)
     depth = preprocess.apply_depth(depth)
-    pose = _UNKNOWN.clone() if raw.T_world_cam is None else torch.from_numpy(np.array(raw.T_world_cam))
     return Sample(image=x[0], depth=depth.contiguous(), valid=depth > 0, intrinsics=K_network, T_world_cam=pose)
 
 

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.generic import has_images_and_depth, open_unposed
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.layout import layout_of
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.train.data_config import Part
-from ufmstar_torch.train.samples import RawSample, SampleError
 
 
 class SequenceFrames:
@@ -53,8 +53,9 @@ class SequenceFrames:
         posed = [number for number in range(len(self.sequences)) if self.sequences[number].posed and number in of]
         return [range(of.index(number), of.index(number) + of.count(number)) for number in posed]
 
-    def load(self, index: int) -> RawSample:
-        """Decodes a frame. Raises SampleError: a file is missing, cannot be decoded, or has not the sequence's size."""
+    def load(self, index: int) -> Frame:
+        """A frame with an image and, at its pixels, depth; its pose is NaN where it is not known. Raises FrameError: a
+        file is missing, cannot be decoded, or has not the sequence's size."""
         number, i = self._frames[index]
         try:
             frame = self.sequences[number][i]
@@ -62,11 +63,11 @@ class SequenceFrames:
                 raise FrameError(frame.name, "has no image")
             depth = truth_at(frame, frame.intrinsics, (frame.image.shape[0], frame.image.shape[1]))
         except FrameError as error:
-            raise SampleError(self.name(index), str(error)) from error
+            raise FrameError(self.name(index), str(error)) from error
         if depth is None:
-            raise SampleError(self.name(index), "has no depth map")
-        pose = frame.T_world_cam if self.sequences[number].posed else None
-        return RawSample(frame.image.transpose(2, 0, 1), depth.astype(np.float32), frame.intrinsics, pose)
+            raise FrameError(self.name(index), "has no depth map")
+        pose = frame.T_world_cam if self.sequences[number].posed else np.full((4, 4), np.nan)
+        return replace(frame, depth=depth.astype(np.float32), depth_intrinsics=None, T_world_cam=pose)
 
 
 def open_rgbd(source: str | Path) -> FrameSequence:
