@@ -76,8 +76,8 @@ def test_skipping_takes_the_next_good_frame_whatever_came_before(order, caplog):
     assert "frame-2: torn" in caplog.text
 
 
-def module(tmp_path, preprocess=PLAIN, **config):
-    data = DepthDataModule(DataConfig(**config), preprocess)
+def module(tmp_path, preprocess=PLAIN, batch_size=8, **config):
+    data = DepthDataModule(DataConfig(**config), preprocess, batch_size)
     data.setup("fit")
     return data
 
@@ -114,8 +114,8 @@ def test_parts_must_not_overlap(tmp_path):
 def test_a_data_module_gives_each_process_its_share_and_tells_broken_files(tmp_path):
     root = write_nyu(tmp_path)
     truncated(root / "train" / "kitchen_1" / "9.h5", 0.3)
-    config = {"kind": "nyu", "paths": (str(root),), "on_bad_file": "skip", "batch_size": 1, "augmentation": None}
-    data = module(tmp_path, **config)
+    config = {"kind": "nyu", "paths": (str(root),), "on_bad_file": "skip", "augmentation": None}
+    data = module(tmp_path, batch_size=1, **config)
     with pytest.raises(RuntimeError, match="setup"):
         DepthDataModule(data.config, PLAIN).train_dataloader()
     seen = []

@@ -73,7 +73,7 @@ def room():
 
 def batch_of(source):
     """All clips of a source as one batch."""
-    data = DepthDataModule(DataConfig(batch_size=CLIP, augmentation=None), PLAIN, CLIP)
+    data = DepthDataModule(DataConfig(augmentation=None), PLAIN, CLIP, clip_frames=CLIP)
     data.train_set = training_data_module.SampleDataset(source, PLAIN)
     chosen = [frame for clip in clips(source, CLIP) for frame in clip]
     samples = [data.train_set[i] for i in chosen]

@@ -55,7 +55,7 @@ class DataOptions:
 
     data: str | None = option(None, choices=KINDS)
     root: tuple[str, ...] = ()
-    config: dict[str, Any] = fields_of(DataConfig, without=("kind", "paths", "batch_size", "seed", "augmentation"))
+    config: dict[str, Any] = fields_of(DataConfig, without=("kind", "paths", "augmentation"))
     no_augmentation: bool = False
     augment: dict[str, Any] = fields_of(AugmentationConfig, "augment.")
 

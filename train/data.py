@@ -29,6 +29,8 @@ class DepthDataModule(LightningDataModule):
     Args:
         config: where frames come from.
         preprocess: the network's.
+        batch_size: frames per step and process.
+        seed: of the order and the augmentation.
         clip_frames: frames that follow one another and stay together in training. From two on, frames are augmented
             in colour alone: a zoom that divides depth, or a mirror, does not leave the camera's path as it is.
 
@@ -39,11 +41,14 @@ class DepthDataModule(LightningDataModule):
         clips: of the training part, after ``setup``; None with ``clip_frames = 1``.
     """
 
-    def __init__(self, config: DataConfig, preprocess: Preprocess, clip_frames: int = 1) -> None:
+    def __init__(
+        self, config: DataConfig, preprocess: Preprocess, batch_size: int = 8, *, seed: int = 0, clip_frames: int = 1
+    ) -> None:
         super().__init__()
-        if config.batch_size % clip_frames:
-            raise ValueError(f"batch_size {config.batch_size} of a process must be a multiple of {clip_frames} frames")
-        self.config, self.preprocess, self.clip_frames = config, preprocess, clip_frames
+        if batch_size % clip_frames:
+            raise ValueError(f"batch_size {batch_size} of a process must be a multiple of {clip_frames} frames")
+        self.config, self.preprocess = config, preprocess
+        self.batch_size, self.seed, self.clip_frames = batch_size, seed, clip_frames
         self.clips: list[range] | None = None
         self.train_set: SampleDataset | None = None
         self.validation_set: SampleDataset | None = None
@@ -65,7 +70,7 @@ class DepthDataModule(LightningDataModule):
             self.clips = clips(train, self.clip_frames)
             config = None if config is None else replace(config, scale=(1.0, 1.0), rotation=0.0, flip=0.0)
         augmentation = None if config is None else Augmentation(config)
-        self.train_set = SampleDataset(train, self.preprocess, augmentation, seed=c.seed, on_bad_file=c.on_bad_file)
+        self.train_set = SampleDataset(train, self.preprocess, augmentation, seed=self.seed, on_bad_file=c.on_bad_file)
         self.validation_set = SampleDataset(validation, self.preprocess, on_bad_file=c.on_bad_file, evaluate=True)
 
     def train_dataloader(self) -> DataLoader[Sample]:
@@ -85,11 +90,11 @@ class DepthDataModule(LightningDataModule):
             raise RuntimeError("call setup() before asking for a loader")
         rank, world = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
         c = self.config
-        order: dict[str, Any] = {"seed": c.seed, "rank": rank, "world": world, "shuffle": shuffle}
+        order: dict[str, Any] = {"seed": self.seed, "rank": rank, "world": world, "shuffle": shuffle}
         if shuffle and self.clips is not None:
-            batches = EpochBatches(len(self.clips), c.batch_size // self.clip_frames, clips=self.clips, **order)
+            batches = EpochBatches(len(self.clips), self.batch_size // self.clip_frames, clips=self.clips, **order)
         else:
-            batches = EpochBatches(len(dataset), c.batch_size, **order)
+            batches = EpochBatches(len(dataset), self.batch_size, **order)
         if shuffle and self.trainer is not None:
             # Workers load ahead before Lightning announces the epoch, which is not 0 in a resumed training.
             progress: Any = self.trainer.fit_loop.epoch_progress.current

@@ -82,9 +82,7 @@ class DataConfig(Checked):
         tour_fov: horizontal field of view [degrees].
         cache: folder for rendered tours; empty = the user's cache folder.
         render_workers: processes that render.
-        batch_size: frames per step and process.
         workers: processes that load frames; 0 = the training's own.
-        seed: of the order and the augmentation.
         augmentation: of the training part, or None.
         on_bad_file: "raise" or "skip", see ``SampleDataset``.
 
@@ -107,9 +105,7 @@ class DataConfig(Checked):
     tour_fov: float = number(70.0, "fov", "degrees", 20, 120)
     cache: str = ""
     render_workers: int = number(1, "N", "processes", 1)
-    batch_size: int = number(8, "B", "frames", 1)
     workers: int = number(0, "N", "processes", 0)
-    seed: int = number(0, "seed", "1", 0)
     augmentation: AugmentationConfig | None = field(default_factory=AugmentationConfig)
     on_bad_file: str = choice("raise", "skip")
 

@@ -30,7 +30,7 @@ _SPEED = ("workers", "render_workers", "cache")
 
 def identity(job: Job) -> dict[str, Any]:
     """The settings that decide the weights."""
-    data = {name: value for name, value in asdict(job.data).items() if name not in (*_SPEED, "seed", "batch_size")}
+    data = {name: value for name, value in asdict(job.data).items() if name not in _SPEED}
     s = job.settings
     session = {"seed": s.seed, "init": s.init, "trainable": s.trainable, "precision": s.precision}
     return {"recipe": job.recipe.to_dict(), "data": data, **session}

@@ -6,7 +6,6 @@ import logging
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
 import lightning.pytorch as pl
@@ -74,8 +73,8 @@ def make_data(job: Job, member: int, world: int) -> DepthDataModule:
     processes."""
     if job.recipe.batch_size % world:
         raise ValueError(f"batch_size {job.recipe.batch_size} must be a multiple of the {world} processes")
-    config = replace(job.data, batch_size=job.recipe.batch_size // world, seed=job.seed(member))
-    data = DepthDataModule(config, job.recipe.network.input(), job.recipe.clip_frames)
+    order = {"seed": job.seed(member), "clip_frames": job.recipe.clip_frames}
+    data = DepthDataModule(job.data, job.recipe.network.input(), job.recipe.batch_size // world, **order)
     data.setup("fit")
     return data
 

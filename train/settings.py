@@ -66,7 +66,7 @@ class Job:
     """Recipe, data and settings of a training: values that pickle."""
 
     recipe: Recipe  # decides the weights
-    data: DataConfig  # where samples come from; its batch size and seed are replaced by the recipe's and the member's
+    data: DataConfig  # where samples come from
     settings: FitSettings  # of this session
     # the network of one's own that the recipe is about, with the weights to start from; None = a file or random ones
     backbone: nn.Module | None = field(default=None, compare=False)
