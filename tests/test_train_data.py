@@ -10,8 +10,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from layouts import truth, write_generic
-from training_data import PLAIN, Numbered, loader, numbers, nyu_frame, truncated, write_nyu
+from layouts import truncate, truth, write_generic
+from training_data import PLAIN, Numbered, loader, numbers, nyu_frame, write_nyu
 
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
@@ -113,7 +113,7 @@ def test_parts_must_not_overlap(tmp_path):
 
 def test_a_data_module_gives_each_process_its_share_and_tells_broken_files(tmp_path):
     root = write_nyu(tmp_path)
-    truncated(root / "train" / "kitchen_1" / "9.h5", 0.3)
+    truncate(root / "train" / "kitchen_1" / "9.h5", 0.3)
     config = {"kind": "nyu", "paths": (str(root),), "on_bad_file": "skip", "augmentation": None}
     data = module(tmp_path, batch_size=1, **config)
     with pytest.raises(RuntimeError, match="setup"):
@@ -221,7 +221,7 @@ def test_loading_leaves_the_global_generator_alone():
 def test_worker_processes_load_the_same_and_report_broken_files(tmp_path):
     """Spawned; what they find broken is known here, and they know what epoch it is."""
     frames = SequenceFrames([open_sequence(write_nyu(tmp_path) / "train")])
-    truncated(tmp_path / "train" / "kitchen_0" / "10.h5", 0.5)
+    truncate(tmp_path / "train" / "kitchen_0" / "10.h5", 0.5)
 
     def made(workers):
         augmentation = Augmentation(AugmentationConfig(crop="random"))

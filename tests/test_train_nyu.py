@@ -5,8 +5,10 @@ from __future__ import annotations
 import h5py
 import numpy as np
 import pytest
+from layouts import truncate
+from layouts_more import write_h5
 from scipy.io import savemat
-from training_data import PLAIN, nyu_frame, truncated, write_h5, write_nyu
+from training_data import PLAIN, nyu_frame, write_nyu
 
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.train import SampleDataset, SequenceFrames, convert_labelled, nyu
@@ -33,8 +35,8 @@ def test_nyu_frames_are_what_the_files_hold(tmp_path):
 RGB, DEPTH = nyu_frame(0)
 BROKEN = {
     "empty": lambda p: p.write_bytes(b""),
-    "half": lambda p: truncated(p, 0.5),
-    "last byte": lambda p: truncated(p, 0.9999),
+    "half": lambda p: truncate(p, 0.5),
+    "last byte": lambda p: truncate(p, 0.9999),
     "text": lambda p: p.write_text("<html>404</html>" * 200),
     "folder": lambda p: (p.unlink(), p.mkdir()),
     "gone": lambda p: p.unlink(),

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from layouts import write_generic, write_scannet, write_tum
-from training_data import PLAIN, TINY, truncated
+from layouts import truncate, write_generic, write_scannet, write_tum
+from training_data import PLAIN, TINY
 
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
@@ -63,7 +63,7 @@ def test_depth_with_a_camera_of_its_own_is_seen_by_the_images(tmp_path):
 def test_a_broken_image_of_a_sequence_is_named_or_skipped(tmp_path):
     path, _ = write_generic(tmp_path)
     frames = SequenceFrames([open_sequence(path)])
-    truncated(path / "images" / "9.png", 0.4)
+    truncate(path / "images" / "9.png", 0.4)
     with pytest.raises(FrameError, match=r"walk/9: .*9\.png"):
         frames.load(2)
     dataset = SampleDataset(frames, PLAIN, on_bad_file="skip")
@@ -125,7 +125,7 @@ def test_a_truncated_cache_file_is_named(tours, tmp_path):
     shutil.copytree(folder, tmp_path / "cache")
     config = replace(TINY, cache=str(tmp_path / "cache"))
     copy = tour_frames([5, 6], config)
-    truncated(tour_file(tmp_path / "cache" / f"tours-{digest(TINY)}", 5), 0.5)
+    truncate(tour_file(tmp_path / "cache" / f"tours-{digest(TINY)}", 5), 0.5)
     with pytest.raises(FrameError, match=r"tour-5/1: .*5\.npy"):
         copy.load(1)
     assert copy.load(3).depth.any()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import h5py
 import numpy as np
+from layouts_more import write_h5
 
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.models import Preprocess
@@ -24,14 +24,6 @@ TINY = DataConfig(tour_frames=3, tour_stride=4, tour_size=(24, 32))
 def nyu_frame(number: int, size=SMALL) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(number)
     return rng.integers(0, 256, (3, *size), np.uint8), rng.uniform(0.5, 9, size).astype(np.float32)
-
-
-def write_h5(path, rgb, depth, **others):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with h5py.File(path, "w") as file:
-        for name, value in {"rgb": rgb, "depth": depth, **others}.items():
-            if value is not None:
-                file[name] = value
 
 
 def write_nyu(root, frames=6):
@@ -64,10 +56,6 @@ class Numbered:
 
 def numbers(batch) -> list[int]:
     return [round(x.item()) - 1 for x in batch["depth"][:, 3, 4]]
-
-
-def truncated(path, share):
-    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
 
 
 def loader(length=23, **options):
