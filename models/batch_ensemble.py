@@ -13,14 +13,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
-from operator import itemgetter
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.models.batch_layer import BatchLayer, Selection
-from ufmstar_torch.models.distribution import DepthDistribution
+from ufmstar_torch.models.distribution import DepthDistribution, images_of
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.networks_in_turn import combine
@@ -119,10 +118,10 @@ class BatchEnsemble(DepthNetwork):
     def forward(self, image: Tensor) -> DepthPrediction:
         """The members' mixture of ``image`` [B, 3, H, W]: mean depth [B, H, W] [m], mean A and the variance
         between the members as E [m^2], from one pass with a batch of N B."""
-        prediction = self.distribution(image).prediction()
+        distribution = self.distribution(image)
         # In training mode a network with heads at several scales has as many blocks of members; the first predicts.
-        starts = [n * len(image) for n in range(self.members)]
-        return combine([prediction.mapped(itemgetter(slice(start, start + len(image)))) for start in starts])
+        parts = [slice(n * len(image), (n + 1) * len(image)) for n in range(self.members)]
+        return combine([images_of(distribution, part).prediction() for part in parts])
 
     def member(self, n: int) -> BatchEnsembleMember:
         """Member n as a network, with the weights of this one: nothing is copied. Raises IndexError: no such member."""

@@ -5,7 +5,7 @@ The losses need the parameters of the distribution, UfM* its moments (``DepthPre
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -57,3 +57,8 @@ class EvidentialDepth:
 
 
 DepthDistribution = PointDepth | GaussianDepth | EvidentialDepth
+
+
+def images_of(distribution: DepthDistribution, images: slice) -> DepthDistribution:
+    """The distribution of some images of a batch."""
+    return replace(distribution, **{name: value[images] for name, value in vars(distribution).items()})

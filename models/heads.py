@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth
+from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth, images_of
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -134,8 +134,8 @@ class UncertaintyNetwork(DepthNetwork):
 
     def forward(self, image: Tensor) -> DepthPrediction:
         """Depth [B, H, W] [m] and the head's variances [m^2] of ``image`` as ``preprocess`` returns it."""
-        prediction = self.distribution(image).prediction()
-        return prediction.mapped(lambda value: value[: len(image)]) if self.training else prediction
+        distribution = self.distribution(image)
+        return (images_of(distribution, slice(len(image))) if self.training else distribution).prediction()
 
 
 def with_head(backbone: Backbone, method: str, scales: int = 1) -> UncertaintyNetwork:
