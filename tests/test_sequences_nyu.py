@@ -56,7 +56,7 @@ def test_broken_files_are_counted(written):
     root, _ = written
     val = root / "val"
     truncate(val / "kitchen_1" / "9.h5")
-    write_h5(val / "kitchen_1" / "10.h5", np.zeros((3, 48, 64), np.uint8), None)
+    write_h5(val / "kitchen_1" / "10.h5", np.zeros((3, 24, 32), np.uint8), None)
     write_h5(val / "office_2" / "11.h5", np.zeros((3, 24, 32), np.uint8), np.ones((24, 32), np.float32))
     sequence, errors = open_sequence(root), []
     assert sequence.image_size == (24, 32)  # of the first that can be read
