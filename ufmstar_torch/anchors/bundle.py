@@ -34,9 +34,9 @@ _MEMORY = 0.8
 # Degrees of freedom of a position's distribution; Gauss-Newton steps, and those for inverse depths alone before.
 _STUDENT, _STEPS, _DEPTH_STEPS = 4.0, 4, 6
 # A pose begins another trajectory where the score test of its error, chi-squared with six degrees of freedom, exceeds
-# the one, and the error's mean square, as shifts of a position, the other [px^2]. Where this happens again within so
-# many frames, poses are noisier than is known.
-_SURPRISE, _SHIFT, _APART = 60.0, 1.0, 10
+# the one and so many times what it has been lately, and the error's mean square, as shifts of a position, the last
+# [px^2]. Otherwise poses are noisier than is known yet.
+_SURPRISE, _TIMES, _SHIFT = 60.0, 5.0, 1.0
 # Corners and views from which on poses are refined.
 _ENOUGH, _VIEWS = 8, 3
 
@@ -54,7 +54,7 @@ class PoseRefinement(SavedState):
     HELD: ClassVar = {
         "_variance": "given_pose_variance",
         "_last": "last_pose_error",
-        "_since": "frames_since_jump",
+        "_lately": "surprise_lately",
         "correlated": "correlated_pose_variance",
         "shared": "remaining_pose_variance",
     }
@@ -67,7 +67,7 @@ class PoseRefinement(SavedState):
         self._variance = np.full(2, _FIRST**2 / 2)  # of a position, by w and by s [px^2]
         self._last = np.zeros((2, 3))  # w and s of the last pose as shifts of a position [px]
         self.correlated, self.shared, self.jumped = 0.0, 0.0, False
-        self._since = _APART
+        self._lately = _SURPRISE
 
     @property
     def given(self) -> float:
@@ -92,7 +92,7 @@ class PoseRefinement(SavedState):
         """
         from ufmstar_torch.kernels.bundle_cpu import FAR, NEAR, equations, inverse_depths  # compiles when first needed
 
-        self.shared, self.jumped, self._since = 0.0, False, min(self._since + 1, _APART)
+        self.shared, self.jumped = 0.0, False
         tracks, views = seen[:, -1] & (seen.sum(1) > 1), np.flatnonzero(seen.any(0))
         if tracks.sum() < _ENOUGH or len(views) < _VIEWS:
             return T_world_cam
@@ -107,12 +107,11 @@ class PoseRefinement(SavedState):
             for _ in range(_STEPS):
                 A, b, by_error, alone = equations(ray, precision, poses, rho, 1 / depth, _STUDENT)
                 A, b = _INFORMATION * A, _INFORMATION * b
-                if not error.any() and self._surprising(A[-6:, -6:], b[-6:], prior[-6:], unit):
-                    self.jumped, self._since = self._since == _APART, 0
-                    if self.jumped:
-                        return T_world_cam
+                if not error.any() and self._jumps(A[-6:, -6:], b[-6:], prior[-6:], unit):
+                    self.jumped = True
+                    return T_world_cam
                 A = A + np.diag(prior)
-                step = np.linalg.solve(A, b - prior * error)
+                step = np.asarray(np.linalg.solve(A, b - prior * error), np.float64)
                 poses, error = moved(poses, step), error + step
                 rho = (rho + alone - by_error @ step).clip(FAR / depth, NEAR / depth)
             covariance = np.linalg.inv(A)
@@ -124,14 +123,15 @@ class PoseRefinement(SavedState):
         refined[views] = poses
         return refined
 
-    @staticmethod
-    def _surprising(
-        A: NDArray[np.float64], b: NDArray[np.float64], prior: NDArray[np.float64], unit: NDArray[np.float64]
+    def _jumps(
+        self, A: NDArray[np.float64], b: NDArray[np.float64], prior: NDArray[np.float64], unit: NDArray[np.float64]
     ) -> bool:
-        """Score test of the newest pose by its part of the equations A d = b at the given poses."""
-        surprise = b @ np.linalg.solve(A + 2 * A / prior @ A, b)  # the views before have errors too
+        """Judge the newest given pose by its part of the equations A d = b."""
+        surprise = float(b @ np.linalg.solve(A + 2 * A / prior @ A, b))  # the views before have errors too
         shift = np.linalg.solve(A, b).reshape(2, 3) / unit
-        return bool(surprise > _SURPRISE and np.square(shift).sum() > 3 * _SHIFT)
+        jumps = surprise > max(_SURPRISE, _TIMES * self._lately) and np.square(shift).sum() > 3 * _SHIFT
+        self._lately = _MEMORY * self._lately if jumps else max(surprise, _MEMORY * self._lately)
+        return bool(jumps)
 
     def _learn(self, error: NDArray[np.float64], remains: NDArray[np.float64]) -> None:
         """Follow the given poses' errors by the newest one's [2, 3] and its posterior variance, in pixels."""
