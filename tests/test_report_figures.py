@@ -24,7 +24,7 @@ from ufmstar_torch.eval.report.figures_curves import (
     draw_error,
     entropies,
 )
-from ufmstar_torch.eval.report.figures_sweep import Point, default_value, draw_sweep, sweep_lines, sweeps
+from ufmstar_torch.eval.report.figures_sweep import default_value, draw_sweep, sweep_lines, sweeps
 from ufmstar_torch.eval.report.means import difference, mean_of
 from ufmstar_torch.eval.report.names import NLL
 from ufmstar_torch.eval.report.style import (
@@ -142,8 +142,8 @@ def swept() -> Results:
     return in_memory({(row, ("d", s)): {"nll": levels[s] + values[row], "ece_delta": 0.1} for row, s in pairs})
 
 
-def points_of(results: Results) -> tuple[Point, ...]:
-    """The points of plain UfM* over the rotation noise."""
+def points_of(results: Results) -> dict[float, Any]:
+    """The records of plain UfM* by rotation noise."""
     lines = sweep_lines(results, "ensemble", "rotation_noise")
     return next(line.points for line in lines if line.method == UFM_STAR.method and not line.rest)
 
@@ -152,13 +152,13 @@ class TestSweeps:
     def test_points_rise_and_seeds_are_averaged_first(self, swept):
         assert sweeps(swept) == [("ensemble", "rotation_noise")]
         result = points_of(swept)
-        assert [point.value for point in result] == [0.0, 2.0, 5.0]
-        assert [len(point.rows) for point in result] == [1, 2, 1]
-        mean = mean_of(result[1].records, NLL)
+        assert list(result) == [0.0, 2.0, 5.0]
+        assert [len(records) for records in result.values()] == [5, 10, 5]
+        mean = mean_of(result[2.0], NLL)
         assert (mean.value, mean.sequences) == (pytest.approx(5.2), 5)
         deviation = math.sqrt((4.0**2 + 1.0**2 + 5.0**2 + 1.0**2 + 1.0**2) / 4)
         assert mean.half == pytest.approx(2.7764451051977934 * deviation / math.sqrt(5))
-        change = difference(result[2].records, result[0].records, NLL)
+        change = difference(result[5.0], result[0.0], NLL)
         assert (change.value, change.half) == (pytest.approx(0.5), pytest.approx(0.0, abs=1e-9))
 
     def test_lines_bands_and_the_base_alone(self, swept):
@@ -168,7 +168,7 @@ class TestSweeps:
         np.testing.assert_allclose(line.get_xdata(), [0, 2, 5])
         np.testing.assert_allclose(line.get_ydata(), [5.0, 5.2, 5.5])
         assert (dashed.get_linestyle(), set(dashed.get_ydata())) == ("--", {7.0})
-        half = mean_of(points_of(swept)[0].records, NLL).half
+        half = mean_of(points_of(swept)[0.0], NLL).half
         band = above.collections[0].get_paths()[0].vertices
         assert band[:, 1].min() == pytest.approx(5.0 - half)
         assert figure.axes[-1].get_xlabel() == "rotation noise [°]"
@@ -229,26 +229,25 @@ def row(**values: Any) -> Row:
 def test_anchored_rows_are_a_line_that_goes_through_the_row_without_noise(anchored, name, values):
     lines = sweep_lines(anchored, "depth_only", name)
     tracked = [line for line in lines if dict(line.rest) == {"anchors": "corners"}]
-    assert [point.value for point in tracked[0].points] == pytest.approx(values)
-    (at_default,) = (point for point in tracked[0].points if point.value == default_value(name))
-    assert at_default.rows == (row(anchors="corners"),)
+    assert list(tracked[0].points) == pytest.approx(values)
+    assert [r.row for r in tracked[0].points[default_value(name)]] == [row(anchors="corners")]
     assert tracked[0].words == "anchored"
     # And no row of another line is among those of plain UfM*.
     (alone,) = (line for line in lines if line.method == STAR and not line.rest)
-    assert all(not r.setting.anchors for point in alone.points for r in point.rows)
+    assert not any(r.row.setting.anchors for records in alone.points.values() for r in records)
 
 
 def test_numbers_of_anchors_begin_with_none(anchored):
     lines = {line.words: line for line in sweep_lines(anchored, "depth_only", "anchor_count") if len(line.points) > 1}
     assert set(lines) == {"anchored", "truth anchors"}
-    assert [point.value for point in lines["truth anchors"].points] == [0, 5, 20, 100, 300]
-    assert [point.value for point in lines["anchored"].points] == [0, 5, 20, MOST]
+    assert list(lines["truth anchors"].points) == [0, 5, 20, 100, 300]
+    assert list(lines["anchored"].points) == [0, 5, 20, MOST]
     # Plain UfM* where no row says 0; and a row that says nothing has as many as the tracker follows.
-    assert lines["anchored"].points[0].rows == (Row(STAR),)
-    assert lines["anchored"].points[-1].rows == (row(anchors="corners"),)
-    assert lines["truth anchors"].points[0].rows == (row(anchors="truth", anchor_count=0),)
+    assert lines["anchored"].points[0][0].row == Row(STAR)
+    assert lines["anchored"].points[MOST][0].row == row(anchors="corners")
+    assert lines["truth anchors"].points[0][0].row == row(anchors="truth", anchor_count=0)
     both = results_of([row(anchors="truth"), *(row(anchors="truth", anchor_count=n) for n in (0, 20))])
-    assert [point.value for point in sweep_lines(both, "depth_only", "anchor_count")[0].points] == [0, 20, TRUTH_COUNT]
+    assert list(sweep_lines(both, "depth_only", "anchor_count")[0].points) == [0, 20, TRUTH_COUNT]
 
 
 def test_words_and_switches_are_no_values():

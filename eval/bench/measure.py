@@ -8,9 +8,8 @@ bytes are its 4.0 MB.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -21,7 +20,6 @@ from ufmstar_torch.eval.bench.energy import CPU, GPU, Energy, EnergyMeter, diffe
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
 from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, Part, TimedParts, inference_of, time_parts
 from ufmstar_torch.eval.bench.timing import most_threads, paired_ratio, pinned_threads, spread
-from ufmstar_torch.eval.engine.clock import synchronize
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
@@ -84,12 +82,9 @@ def measure(
             raise ValueError(f"{sequence.name} has {len(frames)} readable frames, the plan needs {wanted}")
         devices = {"device": device, "multiview_device": multiview_device}
         parts = time_parts(chosen, networks, frames, warm_up=plan.warm_up, **devices)
-        work = {}
-        for (owner, part), calls in parts.calls.items():
-            where = multiview_device if part == MULTIVIEW else device
-            work[owner, part] = (_unit(where), [partial(_finish, call, where) for call in calls])
+        units = {DEPTH: _unit(device), NETWORK: _unit(device), MULTIVIEW: _unit(multiview_device)}
+        work = {part: (units.get(part[1], units[NETWORK]), calls) for part, calls in parts.calls.items()}
         energy = measure_energy(meter, work, seconds=plan.seconds, windows=plan.windows)
-    units = {DEPTH: _unit(device), NETWORK: _unit(device), MULTIVIEW: _unit(multiview_device)}
     gpu = None if on_gpu is None else torch.cuda.get_device_name(on_gpu)
     return {
         "format": 1,
@@ -180,11 +175,6 @@ def _obstacle(row: Row, networks: Mapping[str, TimedNetwork]) -> str | None:
 
 def _unit(device: torch.device) -> str:
     return CPU if device.type == "cpu" else GPU
-
-
-def _finish(call: Callable[[], object], device: torch.device) -> None:
-    call()
-    synchronize(device)
 
 
 # ---- the lines of the result ----

@@ -153,21 +153,19 @@ def _contrasts(model: UncertainDepth, sequence: FrameSequence) -> list[Contrast]
 def contrast_figures(contrasts: list[Contrast]) -> dict[str, float]:
     """RMSE [m] where the network is confident, at high disagreement and elsewhere; its sigma and sqrt(M) [m] at high
     disagreement; and the share of these pixels."""
-    contradicted = np.concatenate([c.error[c.contradicted] for c in contrasts])
-    agreed = np.concatenate([c.error[c.confident & ~c.contradicted] for c in contrasts])
-    sigma = np.concatenate([c.aleatoric_sigma[c.contradicted] for c in contrasts])
-    disagreement = np.concatenate([c.disagreement[c.contradicted] for c in contrasts])
-    pixels = sum(int(c.usable.sum()) for c in contrasts)
+    high = [c.contradicted for c in contrasts]
+    low = [c.confident & ~c.contradicted for c in contrasts]
 
-    def rms(values: NDArray[np.float32]) -> float:
+    def rms(name: str, masks: list[NDArray[np.bool_]]) -> float:
+        values = np.concatenate([getattr(c, name)[mask] for c, mask in zip(contrasts, masks, strict=True)])
         return float(np.sqrt(np.square(values, dtype=np.float64).mean())) if values.size else math.nan
 
     return {
-        "share": contradicted.size / max(pixels, 1),
-        "rmse_high": rms(contradicted),
-        "rmse_low": rms(agreed),
-        "aleatoric_sigma_high": rms(sigma),
-        "disagreement_high": rms(disagreement),
+        "share": int(np.sum(high)) / max(int(np.sum([c.usable for c in contrasts])), 1),
+        "rmse_high": rms("error", high),
+        "rmse_low": rms("error", low),
+        "aleatoric_sigma_high": rms("aleatoric_sigma", high),
+        "disagreement_high": rms("disagreement", high),
     }
 
 

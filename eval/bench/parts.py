@@ -73,7 +73,8 @@ class TimedParts:
 
     Attributes:
         warm_up: frames at the beginning that are not counted.
-        calls: the parts that were run, one call per frame, which can be repeated in this order.
+        calls: the parts that were run, one call per frame, which can be repeated in this order; each returns when its
+            device has finished.
         staged: by row's label, the stages of UfM*.
         memory: by row's label, what the multiview step keeps after the last frame.
         size: of the depth maps, "224 x 224" [px].
@@ -94,13 +95,20 @@ class TimedParts:
         """Time the parts of frame ``number`` on a device; what they return."""
         results = {}
         for part in list(calls)[:: -1 if number % 2 else 1]:
-            self.calls.setdefault(part, []).append(calls[part])
+            call = partial(_finish, calls[part], device)
+            self.calls.setdefault(part, []).append(call)
             synchronize(device)
             started = time.perf_counter()
-            results[part] = calls[part]()
-            synchronize(device)
+            results[part] = call()
             self._ms.setdefault(part, []).append(1e3 * (time.perf_counter() - started))
         return results
+
+
+def _finish(call: Callable[[], Any], device: torch.device) -> Any:
+    """What a call returns, when its device has finished."""
+    result = call()
+    synchronize(device)
+    return result
 
 
 def inference_of(row: Row) -> str:

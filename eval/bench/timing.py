@@ -55,23 +55,16 @@ def pinned_threads(count: int) -> Iterator[None]:
 
 def spread(milliseconds: Sequence[float]) -> dict[str, float | int]:
     """Median, interquartile range, quartiles and minimum [ms] of at least one measurement, and their count."""
-    low, middle, high = (float(q) for q in np.percentile(np.asarray(milliseconds, np.float64), (25, 50, 75)))
-    return {
-        "median_ms": middle,
-        "iqr_ms": high - low,
-        "q1_ms": low,
-        "q3_ms": high,
-        "min_ms": float(min(milliseconds)),
-        "count": len(milliseconds),
-    }
+    low, middle, high = np.percentile(milliseconds, (25, 50, 75)).tolist()
+    quartiles = {"median_ms": middle, "iqr_ms": high - low, "q1_ms": low, "q3_ms": high}
+    return {**quartiles, "min_ms": float(min(milliseconds)), "count": len(milliseconds)}
 
 
 def paired_ratio(numerator: Sequence[float], denominator: Sequence[float]) -> dict[str, float | int]:
     """Median and quartiles of the ratios of measurements taken one right after the other. Another program that slows
     both down for a while then cancels, as it does not in a ratio of medians."""
-    ratios = np.asarray(numerator, np.float64) / np.asarray(denominator, np.float64)
-    low, middle, high = (float(q) for q in np.percentile(ratios, (25, 50, 75)))
-    return {"median": middle, "q1": low, "q3": high, "count": len(ratios)}
+    low, middle, high = np.percentile(np.divide(numerator, denominator), (25, 50, 75)).tolist()
+    return {"median": middle, "q1": low, "q3": high, "count": len(numerator)}
 
 
 class StagedStep:

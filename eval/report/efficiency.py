@@ -124,16 +124,16 @@ def _sum(parts: Sequence[tuple[float, float, float]]) -> str:
 def megabytes(size: float) -> str:
     """Bytes as megabytes (10^6), as the paper prints them: 1245, 74.6, 0.03, <0.01."""
     value = size / 1e6
-    if 0 < value < _SMALLEST:
-        return "<0.01"
-    return f"{value:.{0 if value >= 1000 or value == 0 else 1 if value >= 1 else 2}f}"
+    return _printed(value, 0 if value >= 1000 or value == 0 else 1 if value >= 1 else 2)
 
 
 def _percent(value: float) -> str:
     """Format a percentage as the paper prints it: 90.0, 0.2, 0.03, <0.01."""
-    if 0 < value < _SMALLEST:
-        return "<0.01"
-    return f"{value:.{1 if value >= 0.095 or value == 0 else 2}f}"
+    return _printed(value, 1 if value >= 0.095 or value == 0 else 2)
+
+
+def _printed(value: float, decimals: int) -> str:
+    return "<0.01" if 0 < value < _SMALLEST else f"{value:.{decimals}f}"
 
 
 def _digits(value: float) -> str:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -31,21 +31,14 @@ _OF_ANCHORS = ("anchor", "track_noise", "posterior")
 _ANCHORED = {CORNERS: "anchored", DENSE: "dense anchors", TRUTH: "truth anchors"}
 
 
-class Point(NamedTuple):
-    """A value of a setting, the rows that have it (several where noise was drawn with several seeds), their records."""
-
-    value: float
-    rows: tuple[Row, ...]
-    records: tuple[Record, ...]
-
-
 @dataclass(frozen=True, eq=False)
 class SweepLine:
     """A method over the values of a setting, nothing else being changed along it."""
 
     method: Method
     rest: Rest  # what all its rows change beside that setting, sorted by name; () for the method as it is
-    points: tuple[Point, ...]  # in rising order of the values
+    # Values of the setting in rising order, each with its records (of several rows where noise has several seeds).
+    points: Mapping[float, Sequence[Record]]
 
     @property
     def words(self) -> str:
@@ -77,12 +70,10 @@ def sweep_lines(results: Results, base: str, name: str) -> list[SweepLine]:
             plain = groups.get((method, without), {})
             if len(by_value) > 1 and 0.0 in plain:
                 by_value.setdefault(0.0, plain[0.0])
-
-    def point(value: float, rows: Sequence[Row]) -> Point:
-        return Point(value, tuple(rows), tuple(record for row in rows for record in results.of(row)))
-
     return [
-        SweepLine(method, rest, tuple(point(value, rows) for value, rows in sorted(by_value.items())))
+        SweepLine(
+            method, rest, {value: [r for row in by_value[value] for r in results.of(row)] for value in sorted(by_value)}
+        )
         for (method, rest), by_value in groups.items()
     ]
 
@@ -137,7 +128,7 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
         if line.rest:
             looks[line] = Look(line.words or looks[line].name, *(_FIXED.get(line.rest) or next(others)))
     shown = (*SHOWN, names.SPEARMAN) if any("anchors" in dict(line.rest) for line in drawn) else SHOWN
-    values = sorted({point.value for line in drawn if len(line.points) > 1 for point in line.points})
+    values = sorted({value for line in drawn if len(line.points) > 1 for value in line.points})
     word, unit = names.SETTINGS.get(name, (names.setting_name(name), ""))
     title = f"{word[:1].upper()}{word[1:]}: {BASES[base][0]}, {names.count(len(results.sequences()), 'sequence')}"
     figure = style.new_figure(4.0 * len(shown), 3.4, title)
@@ -158,8 +149,8 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
 
 def _draw_line(axes: Any, line: SweepLine, look: Look, quantity: names.Quantity) -> list[float]:
     """Means over the values of a setting with their band; dashed without a band for reference. Returns the means."""
-    means = [(point.value, mean_of(point.records, quantity)) for point in line.points]
-    known = [(x, mean.value, mean.half) for x, mean in means if math.isfinite(mean.value)]
+    means = {value: mean_of(records, quantity) for value, records in line.points.items()}
+    known = [(x, mean.value, mean.half) for x, mean in means.items() if math.isfinite(mean.value)]
     if not known:
         return []
     x, y, half = np.array(known).T

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.efficiency import efficiency_tables
 from ufmstar_torch.eval.report.means import MIN_SEQUENCES
 from ufmstar_torch.eval.report.names import row_labels
 from ufmstar_torch.eval.report.pictures import Picture
-from ufmstar_torch.eval.report.tables import overview, sequence_tables
+from ufmstar_torch.eval.report.table import Table
 from ufmstar_torch.eval.run.files import write_atomic
 
 PAGE = "report.html"
@@ -29,30 +28,33 @@ CURVES, COST = ("calibration", "error", "entropy", "sweep"), ("latency",)
 
 
 def write_page(
-    results: Results, figures: Sequence[Path], pictures: Sequence[Picture], undrawn: Mapping[str, str]
+    results: Results,
+    tables: Mapping[str, Sequence[Table]],
+    figures: Sequence[Path],
+    pictures: Sequence[Picture],
+    undrawn: Mapping[str, str],
 ) -> Path:
-    """Write the report into the folder of the evaluation: tables, figures (SVG, whose names begin with their kind),
-    pictures with their words, and what is missing; its path.
+    """Write the report into the folder of the evaluation: tables (of ``tables.all_tables``), figures (SVG, whose names
+    begin with their kind), pictures with their words, and what is missing; its path.
 
     Raises:
         ValueError: a picture cannot be read.
         ImportError: Pillow or Jinja2 is missing.
     """
-    main, *further = overview(results)
-    cost = [] if results.efficiency is None else efficiency_tables(results.efficiency)
+    parts: dict[str, list[Table]] = {"main": [], "efficiency": [], "further": []}
+    for name, listed in tables.items():
+        kind = name.partition("-")[0]
+        parts[kind if kind in parts else "further"] += listed
     made = {name: results.about.get(name) for name in ("networks", "settings", "versions", "machine")}
     digests = {f"{r.dataset}, {r.sequence}": r.provenance.get("sequence") for r in results.records}
     made["sequences (SHA-256)"] = {name: digest for name, digest in digests.items() if digest}
     text = _template().render(
         results=results,
         networks=", ".join(dict.fromkeys(record.network for record in results.records)),
-        main=main,
+        tables=parts,
         curves=_figures(figures, CURVES),
         pictures=[(picture, _embedded(results.out / "figures" / picture.file)) for picture in pictures],
         cost_figures=_figures(figures, COST),
-        cost=[table for table in cost if not table.is_empty],
-        further=[table for tables in further for table in tables.values()],
-        sequences=[table for dataset in results.datasets for table in sequence_tables(results, dataset)],
         limits=limits(results, undrawn),
         min_sequences=MIN_SEQUENCES,
         command=command(results.about),

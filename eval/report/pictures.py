@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from hashlib import sha256
-from itertools import groupby
+from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,6 +39,7 @@ class Picture(NamedTuple):
     file: str  # name within the figures' folder
     title: str
     caption: str  # how to read it
+    rows: tuple[str, ...] = ()  # labels of the rows that it shows
 
 
 Drawing = tuple[str, Callable[[], Picture]]
@@ -66,13 +67,9 @@ def file_name(*parts: str) -> str:
 
 def choose(examples: Sequence[Example], most: int) -> list[Example]:
     """Frames of as many sequences as possible: the last of each first, since by then most has been seen twice."""
-    turns = [
-        (turn, number, example)
-        for number, (_, group) in enumerate(groupby(examples, key=lambda e: (e.dataset, e.sequence)))
-        for turn, example in enumerate(reversed(list(group)))
-    ]
-    first = sorted(turns, key=lambda entry: entry[:2])[:most]
-    return [example for _, _, example in sorted(first, key=lambda entry: (entry[1], entry[0]))]
+    groups = [list(of)[::-1] for _, of in groupby(examples, key=lambda e: (e.dataset, e.sequence))]
+    first = [example for turn in zip_longest(*groups) for example in turn if example is not None][:most]
+    return [example for group in groups for example in group if example in first]
 
 
 def strip_rows(rows: Sequence[Row], base: str) -> list[Row]:
@@ -156,7 +153,7 @@ def draw_strip(folder: Path, example: Example, rows: Sequence[str], base: str) -
         "A good standard deviation σ looks like the error beside it. NLL is bright where a row is overconfident; its "
         "colours are the same in all strips. Lengths share one scale."
     )
-    return Picture(name, f"{example.title}: {Method(base).name}", caption)
+    return Picture(name, f"{example.title}: {Method(base).name}", caption, tuple(example.labels[row] for row in rows))
 
 
 def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Picture:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,12 +54,12 @@ def find_rooms(folder: Path) -> dict[str, list[Snapshot]]:
     ValueError: a file cannot be read or holds something else; the message names it.
     """
     rooms: dict[str, list[Snapshot]] = {}
-    for file in sorted((folder / "room").glob("*.npz"), key=lambda f: _natural(f.stem)):
+    for file in sorted((folder / "room").glob("*.npz")):
         row, _, frame = file.stem.partition("_")
         if row and frame:
             stored = load_arrays(file, _STORED)
             rooms.setdefault(row, []).append(Snapshot(frame, *(stored[name].astype(np.float64) for name in _STORED)))
-    return rooms
+    return {row: sorted(snapshots, key=lambda snapshot: len(snapshot.path)) for row, snapshots in rooms.items()}
 
 
 def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourScale:
@@ -125,11 +124,6 @@ def _limits(view: Array, snapshots: Sequence[Snapshot]) -> tuple[Array, Array]:
     size, middle = high - low, (low + high) / 2
     size = np.maximum(size, [size[1] / 1.4, size[0] / 2.5])
     return middle - size / 2, middle + size / 2
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """A key that puts frame 9 before frame 10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 # ---- Gaussians seen from far away by an orthographic camera, and the ellipses that covariances leave on its image ----

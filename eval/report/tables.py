@@ -188,37 +188,29 @@ def _cost_note(efficiency: Mapping[str, Any]) -> str:
 # ---- files ----
 
 
-def write_tables(results: Results) -> list[Path]:
-    """Write ``tables/NAME.md``, ``.tex`` and ``.csv``: those of :func:`overview`, ``sequences-DATASET`` for single
-    sequences, and ``efficiency`` with the paper's table 2 below ours where it was measured; their paths."""
+def all_tables(results: Results) -> dict[str, list[Table]]:
+    """The tables by the name of their file, without empty ones: "main", "differences" and "extra" over all sequences
+    and, where there are several data sets, over those of each ("main-DATASET"); "sequences-DATASET" of single
+    sequences; "efficiency" with the paper's table 2 below ours where it was measured."""
     files: dict[str, list[Table]] = {}
-    for tables in overview(results):
-        for dataset, table in tables.items():
+    for make in (main_table, difference_table, extra_table):
+        for dataset in (None, *(results.datasets if len(results.datasets) > 1 else ())):
+            table = make(results, dataset)
             files[table.name if dataset is None else f"{table.name}-{dataset}"] = [table]
-    for dataset in results.datasets:
-        files[f"sequences-{dataset}"] = sequence_tables(results, dataset)
-    if results.efficiency is not None:
-        files["efficiency"] = efficiency_tables(results.efficiency)
-    folder = results.out / "tables"
+    files |= {f"sequences-{dataset}": sequence_tables(results, dataset) for dataset in results.datasets}
+    files["efficiency"] = efficiency_tables(results.efficiency) if results.efficiency else []
+    kept = {name: [table for table in listed if not table.is_empty] for name, listed in files.items()}
+    return {name: listed for name, listed in kept.items() if listed}
+
+
+def write_tables(folder: Path, files: Mapping[str, Sequence[Table]]) -> list[Path]:
+    """Write ``NAME.md``, ``.tex`` and ``.csv`` of :func:`all_tables` into a folder; their paths."""
     folder.mkdir(exist_ok=True)
     written = []
-    for name, listed in files.items():
-        if shown := [table for table in listed if not table.is_empty]:
-            forms = {
-                "md": "\n".join(map(markdown, shown)),
-                "tex": "\n".join(map(latex, shown)),
-                "csv": table_csv(shown),
-            }
-            written += [_write_text(folder / f"{name}.{kind}", text) for kind, text in forms.items()]
+    for name, tables in files.items():
+        forms = {"md": "\n".join(map(markdown, tables)), "tex": "\n".join(map(latex, tables)), "csv": table_csv(tables)}
+        written += [_write_text(folder / f"{name}.{kind}", text) for kind, text in forms.items()]
     return written
-
-
-def overview(results: Results) -> list[dict[str | None, Table]]:
-    """The main table, paired differences and further figures: each over all sequences (None) and, where there are
-    several data sets, over those of each, as far as they are not empty."""
-    over = (None, *(results.datasets if len(results.datasets) > 1 else ()))
-    made = [{d: make(results, d) for d in over} for make in (main_table, difference_table, extra_table)]
-    return [{d: table for d, table in tables.items() if not table.is_empty} for tables in made]
 
 
 def write_tidy(results: Results) -> Path:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.report.data import Results
+from ufmstar_torch.eval.report.names import count
 from ufmstar_torch.eval.report.table import markdown
 from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.eval.report.write import Report
@@ -39,8 +40,8 @@ def summary(results: Results) -> str:
     if results.missing:
         counts = Counter((dataset, sequence) for dataset, sequence, _ in results.missing)
         lines = [f"  {dataset}, {sequence}: {rows} row(s)" for (dataset, sequence), rows in counts.items()]
-        more = [f"  and {len(lines) - 10} more sequences"] if len(lines) > 10 else []
-        parts.append("\n".join(["not evaluated yet (`ufmstar eval ... --resume` goes on):", *lines[:10], *more]))
+        title = f"not evaluated yet: {count(len(lines), 'sequence')} (`ufmstar eval ... --resume` goes on):"
+        parts.append("\n".join([title, *lines[:10]]))
     parts += [f"note: {note}" for note in results.notes]
     return "\n".join(parts)
 

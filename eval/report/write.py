@@ -13,7 +13,7 @@ from ufmstar_torch.eval.report.data import Results, load_results
 from ufmstar_torch.eval.report.page import write_page
 from ufmstar_torch.eval.report.pictures import Picture, pictures_of
 from ufmstar_torch.eval.report.style import save_figure
-from ufmstar_torch.eval.report.tables import write_tables, write_tidy
+from ufmstar_torch.eval.report.tables import all_tables, write_tables, write_tidy
 from ufmstar_torch.eval.run.files import remove_temporaries
 
 # Errors of drawing, after which a report goes on without the picture.
@@ -42,10 +42,12 @@ def write_report(out: Path, *, figures: bool = True) -> Report:
     # Remains of a killed report; eval.json and the records belong to `ufmstar eval`.
     for pattern in ("tables/.*.tmp", "figures/.*.tmp", ".results.*.tmp", ".table.*.tmp", ".report.*.tmp"):
         remove_temporaries(out.glob(pattern))
-    files = [write_tidy(results), *write_tables(results)]
-    undrawn: dict[str, str] = {}
+    tables = all_tables(results)
+    files, undrawn = [write_tidy(results), *write_tables(out / "tables", tables)], dict[str, str]()
     if figures:
-        files += _draw(results, undrawn)
+        drawn, pictures = _draw(results, undrawn)
+        page = write_page(results, tables, drawn, pictures, undrawn)
+        files += [*drawn, *(out / "figures" / picture.file for picture in pictures), page]
     return Report(files, undrawn)
 
 
@@ -64,8 +66,8 @@ def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
     yield "latency stages", partial(figures_cost.draw_stages, results)
 
 
-def _draw(results: Results, undrawn: dict[str, str]) -> list[Path]:
-    """Draw figures and pictures into ``figures/``, and write the page; their paths."""
+def _draw(results: Results, undrawn: dict[str, str]) -> tuple[list[Path], list[Picture]]:
+    """Draw figures and pictures into ``figures/``, and note why some could not be drawn."""
     folder = results.out / "figures"
     folder.mkdir(exist_ok=True)
     figures: list[Path] = []
@@ -81,5 +83,4 @@ def _draw(results: Results, undrawn: dict[str, str]) -> list[Path]:
                 figures.append(path)
         except _DRAWING_ERRORS as error:
             undrawn[name] = " ".join(str(error).split()) or type(error).__name__
-    page = write_page(results, figures, pictures, undrawn)
-    return [*figures, *(folder / picture.file for picture in pictures), page]
+    return figures, pictures
