@@ -130,7 +130,7 @@ class PoseRefinement(SavedState):
         surprise = float(b @ np.linalg.solve(A + 2 * A / prior @ A, b))  # the views before have errors too
         shift = np.linalg.solve(A, b).reshape(2, 3) / unit
         jumps = surprise > max(_SURPRISE, _TIMES * self._lately) and np.square(shift).sum() > 3 * _SHIFT
-        self._lately = _MEMORY * self._lately if jumps else max(surprise, _MEMORY * self._lately)
+        self._lately = max(surprise, _MEMORY * self._lately)
         return bool(jumps)
 
     def _learn(self, error: NDArray[np.float64], remains: NDArray[np.float64]) -> None:
