@@ -131,12 +131,15 @@ def test_too_few_corners_or_views_leave_the_poses_as_they_are():
     np.testing.assert_array_equal(PoseRefinement().refine(pixel, only_two, poses, K, 2.0), poses)
 
 
-def test_absurd_corners_give_finite_poses():
+@pytest.mark.parametrize("metres", [1, 1e6, 1e12, 1e150, 1e300])
+def test_absurd_corners_and_poses_give_finite_poses(metres):
     rng = np.random.default_rng(0)
     poses, pixel = scene(rng)
-    for scale in (1e3, 1e9, 1e15):
-        refinement = PoseRefinement()
-        refined = refinement.refine(rng.normal(0, scale, pixel.shape), np.ones(pixel.shape[:2], bool), poses, K, 2.0)
+    poses[:, :3, 3] *= metres
+    for scale in (0, 1e3, 1e9, 1e15):
+        refinement, seen = PoseRefinement(), np.ones(pixel.shape[:2], bool)
+        with np.errstate(all="ignore"):
+            refined = refinement.refine(pixel + rng.normal(0, scale, pixel.shape), seen, poses, K, 2.0)
         assert np.isfinite(refined).all()
         assert all(np.isfinite(value).all() for value in map(np.asarray, refinement.state().values()))
 

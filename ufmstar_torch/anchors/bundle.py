@@ -117,6 +117,8 @@ class PoseRefinement(SavedState):
             covariance = np.linalg.inv(A)
         except np.linalg.LinAlgError:  # singular: numbers that are far out of scale
             return T_world_cam
+        if not (np.isfinite(poses).all() and np.isfinite(covariance).all()):
+            return T_world_cam
         self.shared = float(np.median((by_error @ covariance * by_error).sum(1)))
         self._learn(error[-6:].reshape(2, 3) / unit, covariance.diagonal()[-6:].reshape(2, 3) / unit**2)
         refined = T_world_cam.copy()
