@@ -14,7 +14,7 @@ EXAMPLE = Path(example.__file__)
 
 @pytest.mark.slow
 def test_its_table_has_every_row(tmp_path, capsys, monkeypatch):
-    few = {"tours": 1, "validation_tours": 1, "tour_frames": 4, "batch_size": 4, "cache": str(tmp_path)}
+    few = {"tours": 1, "validation_tours": 1, "tour_frames": 4, "cache": str(tmp_path)}
     monkeypatch.setattr(example, "DATA", replace(example.DATA, **few))
     monkeypatch.setattr(example, "ROOMS", ("tour:1?frames=3&size=96x128",))
     train = example.train_module
