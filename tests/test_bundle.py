@@ -45,6 +45,7 @@ def relative_angles(poses, truth):
     return np.rad2deg(Rotation.from_matrix(one @ other.swapaxes(1, 2)).magnitude())
 
 
+@pytest.mark.numerics
 @given(st.integers(0, 2**31))
 def test_a_step_is_that_of_the_dense_problem(seed):
     rng = np.random.default_rng(seed)
@@ -61,6 +62,7 @@ def test_a_step_is_that_of_the_dense_problem(seed):
     np.testing.assert_allclose(alone - by_error @ error, expected[24:], atol=1e-6 * scale)
 
 
+@pytest.mark.numerics
 def test_inverse_depths_alone_are_those_of_the_scene():
     poses, pixel = scene(np.random.default_rng(0))
     ray = (pixel - K[:2, 2]) / K[0, 0]
@@ -70,6 +72,7 @@ def test_inverse_depths_alone_are_those_of_the_scene():
         np.testing.assert_allclose(again, positions[:-1], atol=1e-6)
 
 
+@pytest.mark.numerics
 @given(st.integers(0, 2**31))
 def test_moving_is_the_exponential_map(seed):
     rng = np.random.default_rng(seed)
