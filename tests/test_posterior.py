@@ -321,6 +321,19 @@ def test_a_frame_without_anchors_keeps_the_correction_learns_nothing_and_grows_l
     assert float(last) > 1.2 * float(first)
 
 
+def test_poses_that_contradict_the_images_make_a_stream_forget():
+    """Of two streams, the poses of the second contradict its images: its depth is the network's again."""
+    ufm = UfMStar(CONFIG)
+    for depth, T, anchors in ufm_frames(streams=2):
+        ufm(depth, T, K, anchors=anchors)
+    shared, none = torch.tensor([0.0, torch.inf]), torch.zeros(anchors.depth.shape, dtype=torch.bool)
+    out = ufm(depth, T, K, anchors=dataclasses.replace(anchors, valid=none, shared=shared))
+    kept, forgotten = ((out.posterior()[0][i] / depth[i])[out.valid[i]] for i in range(2))
+    assert 1.1 < float(kept.median()) < 2
+    torch.testing.assert_close(forgotten, torch.ones_like(forgotten))
+    assert ufm.posterior.any(1).tolist() == [True, False]
+
+
 def test_state_saved_and_loaded_goes_on_to_the_bit():
     frames = list(ufm_frames(4))
     whole, first, second = (UfMStar(CONFIG) for _ in range(3))

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from landmark_runs import walk
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.anchors.tracker import LandmarkTracker, off_lines
+from ufmstar_torch.anchors.epipolar import off_lines
+from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.kernels.triangulate_cpu import triangulate
 

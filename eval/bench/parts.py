@@ -105,7 +105,7 @@ class TimedParts:
 
 
 def _finish(call: Callable[[], Any], device: torch.device) -> Any:
-    """What a call returns, when its device has finished."""
+    """Return the result of a call, once the device has finished."""
     result = call()
     synchronize(device)
     return result

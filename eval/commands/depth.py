@@ -170,9 +170,12 @@ class UfMOptions:
         return defaults
 
     def load_recalibration(self, weights: tuple[str, ...], source: DepthSource) -> Recalibration | None:
-        """The recalibration of the option, or of the file beside the weights; None: there is neither. Raises
-        FileNotFoundError: the named file does not exist; ValueError: it is no recalibration, or was fitted under other
-        settings or to another network."""
+        """Read the recalibration that the option names, or else the one beside the weights, if there is one.
+
+        Raises:
+            FileNotFoundError: the named file does not exist.
+            ValueError: it is no recalibration, or was fitted under other settings or to another network.
+        """
         name = self.recalibration
         if name == "none" or (name is None and not (weights and beside(weights[0]).is_file())):
             return None

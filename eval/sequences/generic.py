@@ -97,7 +97,7 @@ def open_unposed(path: Path, options: Options) -> FrameSequence:
 
 
 def _lens(root: Path, options: Options, size: Size) -> Lens | None:
-    """The camera of a file beside the images; None where the options have one."""
+    """Read the camera from a file beside the images, unless the options name one."""
     if options.intrinsics is not None:
         return None
     return Lens.of(read_intrinsics(_given_or_found(root, None, INTRINSICS, "intrinsics")), size)

@@ -82,8 +82,10 @@ def _depth(path: Path, scale: float) -> np.ndarray:
 
 
 def _dataset(path: Path, name: str) -> np.ndarray:
-    """A dataset of a file as it is; nothing stays open, so that processes share nothing. Raises FrameError: it is not
-    there, or cannot be read."""
+    """Read a dataset of an HDF5 file, and close the file: processes share no open file.
+
+    Raises FrameError: the dataset is missing or unreadable.
+    """
     import h5py
 
     try:

@@ -19,6 +19,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.bundle import PoseRefinement
 from ufmstar_torch.anchors.corners import find, follow
+from ufmstar_torch.anchors.epipolar import NEAREST, off_lines, weighted_median
 from ufmstar_torch.anchors.saved_state import SavedState, saved_image
 from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.optional import optional
@@ -36,12 +37,10 @@ _DRIFT = 0.6
 _MEMORY, _LONG = 0.8, 4
 # Why an image has no landmark.
 _NO_TRACK, _NO_DEPTH = "no corner followed from the frame before", "no parallax, or no track that fits the poses"
-# Share of the median depth: the position of a nearer point in an image is not computed but bounded.
-_NEAREST = 1e-3
 # Depths of a scene, over the median: where the poses allow a corner's point to be. Half of the corners lie nearer than
 # the median, which says little while it is not known well; of an image without motion, as of one that is frozen, all
 # would be farther.
-_NEAR, _FAR, _MEDIAN_DEPTH, _AHEAD = 1 / 50, 10.0, 1.0, 0.98
+_NEAR, _FAR, _MEDIAN_DEPTH = 1 / 50, 10.0, 1.0
 # Share of the running comparison with the poses that remains after a frame; the motion of a corner that shows a depth,
 # and of an image that stands still [px].
 _FOLLOWS, _MOVES, _STILL = 0.6, 1.0, 0.2
@@ -334,12 +333,12 @@ class LandmarkTracker(SavedState):
         distance, rho, baseline = off_lines(*views, self._K, _NEAR * self._depth, far)
         cell = (views[0] * _CELLS / self._gray.shape[::-1]).astype(np.int64).clip(0, _CELLS - 1) @ [1, _CELLS]
         weight = 1 / np.bincount(cell)[cell]  # by area: a thing that moves by itself may have most of the corners
-        now = _median(distance, weight) / _MEDIAN
+        now = weighted_median(distance, weight) / _MEDIAN
         self._off = now if self._off < 0 else _FOLLOWS * self._off + (1 - _FOLLOWS) * now
         self.baseline = float(np.median(baseline))
         shows = (rho > 0) & (motion > _MOVES)
         if shows.sum() >= _ENOUGH:
-            self._depth *= (1 / _median(rho[shows], weight[shows]) / self._depth) ** (1 - _MEMORY)
+            self._depth *= (1 / weighted_median(rho[shows], weight[shows]) / self._depth) ** (1 - _MEMORY)
 
     def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Positions [N, 2] in the new image and which corners could be followed there and back [N]."""
@@ -364,7 +363,7 @@ class LandmarkTracker(SavedState):
 
         def seen_by(pose: NDArray[np.float64]) -> NDArray[np.float64]:
             cam = (point - pose[:3, 3]) @ pose[:3, :3]
-            return np.asarray(cam @ K[:2].T / np.maximum(cam[:, 2:], _NEAREST * usual))
+            return np.asarray(cam @ K[:2].T / np.maximum(cam[:, 2:], NEAREST * usual))
 
         return np.asarray(position + seen_by(T) - seen_by(last))
 
@@ -441,50 +440,6 @@ class LandmarkTracker(SavedState):
 def contradiction(error: float, limit: float) -> str:
     """The warning that no depth is used, where corners lie ``error`` px from their epipolar lines."""
     return f"poses contradict the images: corners lie {error:.1f} px from their epipolar lines, at most {limit:.1f}"
-
-
-def off_lines(
-    position: NDArray, before: NDArray, T: NDArray, T_before: NDArray, K: NDArray, near: float, far: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Distances of matches from the part of the epipolar line on which two poses allow points of a
-    scene. Without parallax, that is a point; a match that moved the wrong way, or not at all, lies beyond its end.
-
-    Args:
-        position: [N, 2] (u, v) in the present view [px].
-        before: [N, 2] in an earlier one.
-        T: [4, 4] camera-to-world of the present view [m].
-        T_before: [N, 4, 4] of the earlier ones.
-        K: [3, 3] [px].
-        near, far: range of the depths [m].
-
-    Returns:
-        [N] distances [px], [N] inverse depths of the nearest points of the whole lines [1/m], [N] baselines [m].
-    """
-    rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ np.linalg.inv(K).T
-    into = T_before[:, :3, :3].transpose(0, 2, 1)
-    moved = (into @ (T[:3, 3] - T_before[:, :3, 3])[..., None])[..., 0]
-    x, b = (into @ (T[:3, :3] @ rays.T).T[..., None])[..., 0] @ K.T, moved @ K.T
-
-    # In front of the earlier camera too: 1/z < x_z/-b_z.
-    most = np.where(b[:, 2] < 0, _AHEAD * x[:, 2] / np.maximum(-b[:, 2], 1e-12), np.inf)
-
-    def seen(depth: float) -> NDArray[np.float64]:
-        point = x + b * np.minimum(1 / depth, most)[:, None]
-        return np.asarray(point[:, :2] / np.maximum(point[:, 2:], _NEAREST))
-
-    start = seen(near)
-    way, from_start = seen(far) - start, before - start
-    share = (from_start * way).sum(1) / np.maximum(np.square(way).sum(1), 1e-12)
-    off = from_start - share.clip(0, 1)[:, None] * way
-    speed = b[:, :2] - before * b[:, 2:]
-    rho = ((before * x[:, 2:] - x[:, :2]) * speed).sum(1) / np.maximum(np.square(speed).sum(1), 1e-12)
-    return np.linalg.norm(off, axis=1), rho, np.linalg.norm(moved, axis=1)
-
-
-def _median(values: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
-    """Weighted."""
-    order = values.argsort()
-    return float(values[order[np.searchsorted(weight[order].cumsum(), weight.sum() / 2)]])
 
 
 def checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:

@@ -256,7 +256,7 @@ def _distance(b: int, pair: _Pairs, segments: Sequence[Floats], config: UfMStarC
 def _counts(
     frame: FrameInput, pairs: Sequence[_Pairs], joined: _Joined, unmeasured: Sequence[int]
 ) -> dict[str, Tensor]:
-    """The statistics [B] that the step counts itself, beside the pixels that are not measured."""
+    """Count the step's statistics [B]; ``unmeasured`` holds the pixels that no two views compare."""
     totals = np.zeros((len(_COUNTS), len(pairs)), np.int64)
     valid, seen_in = array(frame.valid), array(joined.mixture["count"])
     for b, (pair, one, new, gone) in enumerate(zip(pairs, joined.seen, joined.new, joined.dropped, strict=True)):
