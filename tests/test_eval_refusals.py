@@ -137,7 +137,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: tour("tour:1?frames=3&frames=4"), "twice"),
     (lambda: tour("tour:1", fps=30.0), "takes no fps"),
     (lambda: tour("tour:1", intrinsics=np.eye(3)), "takes no intrinsics"),
-    (lambda: open_sequence("tour:1", "tum"), "layout must be auto"),
+    (lambda: open_sequence("tour:1", "tum"), "takes no layout"),
     (lambda: make_tour(-1), "seed must be"),
     (lambda: make_tour(True), "seed must be"),
     (lambda: make_tour(1, "attic"), "style must be one of"),

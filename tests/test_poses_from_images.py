@@ -39,7 +39,7 @@ def test_a_walk_without_poses_gets_them(walk, reconstructed):
     assert (found["state"], found["scale_from"], found["gaps"]) == ("finished", "trajectory", [])
     assert found["models"] == [found["keyframes"]]
     assert found["residual"] < 0.03
-    sequence = open_sequence(reconstructed, depth=str(folder / "depth"))
+    sequence = open_sequence(reconstructed, truth=str(folder / "depth"))
     assert sequence.metric
     np.testing.assert_allclose(sequence.intrinsics, tour.intrinsics, atol=1e-9)  # known, and kept
     for frame in sequence:

@@ -161,7 +161,7 @@ def test_the_command_has_networks_and_what_was_chosen() -> None:
     for settings, words in (
         ({}, ""),
         ({"frames": [None, None, None], "bins": "authors"}, " --bins authors"),
-        ({"frames": [0, 8, None], "trajectory": "slam.txt", "depth_scale": 0.001},
-         " --frames 0:8: --trajectory slam.txt --depth-scale 0.001"),
+        ({"frames": [0, 8, None], "trajectory": "slam.txt", "truth_scale": 0.001},
+         " --frames 0:8: --trajectory slam.txt --truth-scale 0.001"),
     ):  # fmt: skip
         assert command({**about, "settings": settings}) == f"{begin}{words} --out OUT"

@@ -104,7 +104,7 @@ def test_a_lens_is_undone(tmp_path, coefficients, fisheye):
     column, row = np.meshgrid(np.arange(64.0), np.arange(48.0))
     layouts.write_image(path / "images" / "0.png", np.stack([3 * column, 4 * row, 0 * row], -1).astype(np.uint8))
     layouts.write_depth_png(path / "depth" / "0.png", 1 + column + row, 100)
-    frame = open_sequence(path, depth_scale=0.01)[0]
+    frame = open_sequence(path, truth_scale=0.01)[0]
     assert frame.depth_intrinsics is None
     K = frame.intrinsics
     np.testing.assert_allclose(K[:2, 2], written.K[:2, 2], atol=1e-9)

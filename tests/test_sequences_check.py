@@ -118,7 +118,7 @@ def test_the_check_recognises_inverted_poses_and_wrong_scale(recording):
     entries = tuple(dataclasses.replace(e, T_world_cam=np.linalg.inv(e.T_world_cam)) for e in sequence.entries)
     result = check_sequence(dataclasses.replace(sequence, entries=entries))
     assert [problem.startswith("the poses look world-to-camera") for problem in result.problems] == [True]
-    result = check_sequence(open_sequence(path, depth_scale=wrong_scale))
+    result = check_sequence(open_sequence(path, truth_scale=wrong_scale))
     assert [problem.startswith("depth looks too") for problem in result.problems] == [True]
     assert result.scale == pytest.approx(1 / factor, rel=0.1)
 

@@ -127,14 +127,14 @@ def test_sparse_depth_maps_pair_by_number(tmp_path):
     write_depth_png(path / "maps" / "depth_0008.png", truth.depths[1], 4000, scale_text="0.00025")
     write_depth_png(path / "maps" / "depth_0012.png", truth.depths[5], 4000, scale_text="0.00025")
     assert open_sequence(path).without_depth == ("7", "8", "9", "10", "11", "12")
-    sequence = open_sequence(path, depth="maps")
+    sequence = open_sequence(path, truth="maps")
     assert sequence.without_depth == ("7", "9", "10", "11")
     np.testing.assert_allclose(sequence[1].depth, truth.depths[1], atol=2e-4)
     np.testing.assert_allclose(sequence[5].depth, truth.depths[5], atol=2e-4)
     for file in (path / "maps").iterdir():
         file.rename(file.with_name(file.name.replace("00", "99")))
     with pytest.raises(ValueError, match=r"no depth map \(.*\) is named like an image \(7"):
-        open_sequence(path, depth="maps")
+        open_sequence(path, truth="maps")
 
 
 def test_depth_named_by_its_own_timestamps(tmp_path):

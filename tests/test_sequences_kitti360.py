@@ -140,15 +140,15 @@ def test_depth_maps_of_the_user(written, tmp_path):
     root, truth = written
     for i in (0, 3):
         layouts.write_depth_png(tmp_path / "maps" / f"{NAMES[i]}.png", truth.depths[i], 256)
-    sequence = open_sequence(root, depth=tmp_path / "maps")
+    sequence = open_sequence(root, truth=tmp_path / "maps")
     assert sequence.without_depth == (NAMES[1], NAMES[2], NAMES[4])
     np.testing.assert_allclose(sequence[3].depth, truth.depths[3], atol=1 / 512 + 1e-5)
     with pytest.raises(ValueError, match="scans goes with depth from the laser"):
-        open_sequence(root, depth=tmp_path / "maps", scans=1)
+        open_sequence(root, truth=tmp_path / "maps", scans=1)
     (tmp_path / "other").mkdir()
     layouts.write_depth_png(tmp_path / "other" / "77.png", truth.depths[0], 256)
     with pytest.raises(ValueError, match=r"no depth map .* is named like an image"):
-        open_sequence(root, depth=tmp_path / "other")
+        open_sequence(root, truth=tmp_path / "other")
 
 
 def test_missing_and_broken_files(root):

@@ -173,9 +173,9 @@ def _scale_remedy(factor: float, sequence: FrameSequence, path: str | Path, opti
 
 def _metres_per_unit(sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> float | None:
     """The scale with which depth files are read now; None where it has no say (a laser, a rendered tour)."""
-    if sequence.layout == "tour" or (sequence.layout == "kitti360" and options.get("depth") is None):
+    if sequence.layout == "tour" or (sequence.layout == "kitti360" and options.get("truth") is None):
         return None
-    raw = open_sequence(path, **{**options, "depth_scale": 1.0})
+    raw = open_sequence(path, **{**options, "truth_scale": 1.0})
     for entry, stored in zip(sequence.entries, raw.entries, strict=True):
         if entry.load_depth is None or stored.load_depth is None:
             continue

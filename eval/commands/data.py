@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import ClassVar
 
 from ufmstar_torch.eval.check.data_check import check_data, lines, page
-from ufmstar_torch.eval.commands.opening import SequenceOptions
 from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
 from ufmstar_torch.eval.run.files import to_json
 from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of, require_layout
+from ufmstar_torch.eval.sequences.options import Options
 
 # With one of these the user means one sequence, whatever lies below its folder.
 _OF_ONE = ("trajectory", "images", "drive")
@@ -38,7 +38,7 @@ class CheckOptions:
     path: str = positional()
     pairs: int = 8
     json: bool = False
-    opening: SequenceOptions
+    opening: Options
 
 
 read = reader(CheckOptions, "ufmstar data")
@@ -63,7 +63,7 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
         OSError: no such path.
         ValueError: an option out of range, or nothing below the folder has a known layout.
     """
-    path, opening = options.path, options.opening.arguments()
+    path, opening = options.path, options.opening.changed()
     require_layout(options.opening.layout, options.opening.plugin)
     one = path.startswith("tour:") or any(name in opening for name in _OF_ONE)
     if not one:  # a folder that fits several layouts is one too, whose layout must be named

@@ -12,7 +12,6 @@ import torch
 from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
-from ufmstar_torch.eval.commands.opening import SequenceOptions
 from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, option, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.load import NetworkChoice
@@ -20,6 +19,7 @@ from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
+from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
 from ufmstar_torch.eval.suite.shards import EvalOutcome, evaluate_suite
 from ufmstar_torch.eval.suite.work_items import ALL, Shard, find_work, read_names
@@ -126,7 +126,7 @@ class EvalOptions(MachineOptions):
     dry_run: bool = False
     what: SuiteOptions
     data: DataOptions
-    opening: SequenceOptions
+    opening: Options
     output: EvalOutputOptions
 
     def __post_init__(self) -> None:
@@ -177,7 +177,7 @@ def job_from(options: EvalOptions) -> EvalJob:
     if further and not suite.efficiency:
         given = ", ".join(text.partition("=")[0] for text in what.network)
         raise ValueError(f"--network: every base once, but in a suite that measures time and energy, got {given}")
-    opening = {name: value for name, value in options.opening.arguments().items() if name != "layout"}
+    opening = {name: value for name, value in options.opening.changed().items() if name != "layout"}
     only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
     where: dict[str, Any] = {"layout": options.opening.layout, "plugin": options.opening.plugin}
     items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, **where)

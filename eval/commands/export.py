@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from ufmstar_torch.eval.commands.opening import SequenceOptions
 from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
 from ufmstar_torch.eval.run import export
 from ufmstar_torch.eval.run.export_bag import export_bag
 from ufmstar_torch.eval.run.rerun_log import export_rerun
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.open import open_sequence
+from ufmstar_torch.eval.sequences.options import Options
 
 _EXPORTERS: dict[str, Callable[..., str]] = {
     "depth": export.export_depth, "cloud": export.export_cloud, "tum": export.export_trajectory,
@@ -69,6 +69,5 @@ def main(options: ExportOptions) -> int:
 def _sequence(out: Path) -> FrameSequence:
     """The recording of a run. Raises FileNotFoundError, ValueError: it is there no more, or the summary is damaged."""
     settings = export.run_settings(out)
-    names = [f.name for f in fields(SequenceOptions) if f.name in settings]
-    values: dict[str, Any] = {name: tuple(v) if isinstance(v := settings[name], list) else v for name in names}
-    return open_sequence(settings["sequence"], **SequenceOptions(**values).arguments())
+    values = {f.name: settings[f.name] for f in fields(Options) if settings.get(f.name) not in (None, [])}
+    return open_sequence(settings["sequence"], **values)

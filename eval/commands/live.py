@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.commands.depth import NetworkOptions, UfMOptions
-from ufmstar_torch.eval.commands.opening import SequenceOptions
 from ufmstar_torch.eval.commands.options import MachineOptions, option, positional, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars
 from ufmstar_torch.eval.engine.anchors import landmarks_of
@@ -30,9 +29,10 @@ from ufmstar_torch.eval.run.folder import FolderKind, output_folder, remover
 from ufmstar_torch.eval.run.machine import share_threads
 from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
 from ufmstar_torch.eval.sequences import live as sources
-from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics, read_intrinsics
+from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
 from ufmstar_torch.eval.sequences.live import LiveEvent
 from ufmstar_torch.eval.sequences.open import open_sequence
+from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
 from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.pipeline import UncertainDepth
@@ -80,7 +80,7 @@ class LiveOptions(MachineOptions):
     overwrite: bool = False
     view: bool = False
     json: bool = False
-    opening: SequenceOptions
+    opening: Options
     network: NetworkOptions
     uncertainty: UfMOptions
 
@@ -119,8 +119,7 @@ def main(options: LiveOptions) -> int:
         with usage_errors(ImportError, OSError, ValueError):
             if options.out is not None:
                 kind.earlier(options.out, resume=False, overwrite=options.overwrite)
-            given = parse_intrinsics(options.opening.intrinsics, "--intrinsics")
-            K = None if given is None else read_intrinsics(given)
+            K = None if (given := options.opening.intrinsics) is None else read_intrinsics(given)
             events = _events(options)
             model = _model(options)
             view = RerunLog(open_viewer()[0]) if options.view else None
@@ -181,7 +180,7 @@ def _events(options: LiveOptions) -> Iterator[LiveEvent]:
     """The source's images and poses; errors as ``open_sequence``."""
     opening = options.opening
     if options.recorded:
-        sequence = open_sequence(options.source, **opening.arguments())
+        sequence = open_sequence(options.source, **opening.changed())
         if not sequence.posed:
             raise ValueError(f"{options.source} has no poses; ufmstar poses computes them")
         return sources.replay(sequence, options.speed)

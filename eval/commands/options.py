@@ -215,7 +215,7 @@ def as_dict(options: Any) -> dict[str, Any]:
 def _add_options(parser: ArgumentParser, group: Any, options: type, full: bool) -> None:
     hints, (_, help_) = get_type_hints(options), _documentation(options)
     for f in sorted(fields(options), key=lambda f: f.name not in options.__annotations__):  # what is inherited last
-        hint = hints[f.name]
+        hint = f.metadata.get("type", hints[f.name])
         if "fields_of" in f.metadata:
             _add_fields(group, f.metadata["fields_of"], full)
         elif is_dataclass(hint) and isinstance(hint, type):
@@ -241,7 +241,7 @@ def _form(f: Field[Any], hint: Any) -> tuple[list[str], dict[str, Any]]:
         kind = reduce(or_, (part for part in parts if part is not types.NoneType))
     if get_origin(kind) is tuple and get_args(kind)[-1] is Ellipsis:
         kind = get_args(kind)[0]
-        how |= {"nargs": "+"} | ({} if default is MISSING else {"default": list(default)})
+        how |= {"nargs": "+"} | ({} if default in (MISSING, None) else {"default": list(default)})
         if f.metadata.get("repeat"):
             how["action"] = "extend"
     elif "const" in f.metadata:
@@ -300,7 +300,7 @@ def _build(options: type[T], values: Mapping[str, Any]) -> T:
     hints = get_type_hints(options)
     built: dict[str, Any] = {}
     for f in fields(options):
-        hint = hints[f.name]
+        hint = f.metadata.get("type", hints[f.name])
         if "fields_of" in f.metadata:
             built[f.name] = _settings(f.metadata["fields_of"], values)
         elif is_dataclass(hint) and isinstance(hint, type):

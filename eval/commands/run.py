@@ -13,7 +13,6 @@ import torch
 from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, LandmarkSource
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, UfMOptions
-from ufmstar_torch.eval.commands.opening import SequenceOptions
 from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, positional, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.anchors import landmarks_of
@@ -26,6 +25,7 @@ from ufmstar_torch.eval.run.scale import network_scale, require_metric
 from ufmstar_torch.eval.run.summary import FINISHED, INTERRUPTED
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_slice
 from ufmstar_torch.eval.sequences.open import open_sequence, scale_poses
+from ufmstar_torch.eval.sequences.options import Options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class StreamOptions(MachineOptions):
     """
 
     frames: str | None = None
-    opening: SequenceOptions
+    opening: Options
     network: NetworkOptions
     maps: MapOptions
     uncertainty: UfMOptions
@@ -117,7 +117,7 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         FileNotFoundError, NotADirectoryError: no such file or folder.
         ModuleNotFoundError: an optional package is missing.
     """
-    sequence, ufm = open_sequence(path, **options.opening.arguments()), options.uncertainty
+    sequence, ufm = open_sequence(path, **options.opening.changed()), options.uncertainty
     if not sequence.posed:
         raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
     indices = range(len(sequence))[parse_slice(options.frames)]

@@ -58,7 +58,7 @@ def read(path: Path, options: Options) -> FrameSequence:
             frames.append(Skipped(image.stem, "no camera at its time"))
             continue
         lenses[image.stem] = _lens(cameras[camera_of[number]])
-        load_depth = depth_loader(depths[depth_of[number]] if number in depth_of else None, options.depth_scale)
+        load_depth = depth_loader(depths[depth_of[number]] if number in depth_of else None, options.truth_scale)
         frames.append(frame_of_image(image.stem, image, load_depth, timestamp=float(times[number])))
     return assemble("arkitscenes", path, frames, lenses, options, read_poses=partial(_trajectory, root / _POSES))
 

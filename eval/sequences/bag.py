@@ -163,7 +163,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     for number, (time, place) in enumerate(content.images):
         load_depth = None
         if number in paired:
-            load_depth = partial(_decoded, ros.depth, bag, content.depths[paired[number]][1], options.depth_scale)
+            load_depth = partial(_decoded, ros.depth, bag, content.depths[paired[number]][1], options.truth_scale)
         T = content.pose(time + options.time_offset, options.max_pose_gap) if options.trajectory is None else UNKNOWN
         name = f"{number:06d}"
         if T is None:

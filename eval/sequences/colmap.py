@@ -74,7 +74,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         if view.camera not in cameras:
             raise ValueError(f"{_file(model, 'images')}: image {view.name!r} has the camera {view.camera}, not listed")
         lenses[name] = cameras[view.camera]
-        load_depth = depth_loader(depth_of.get(name), options.depth_scale)
+        load_depth = depth_loader(depth_of.get(name), options.truth_scale)
         time = None if times is None else float(times[number])
         frames.append(frame_of_image(name, folder / view.name, load_depth, _pose(view, model), time))
     metric = _metric(root) and model == root / MODEL

@@ -66,7 +66,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     root = path if path.is_dir() else path.parent
     images, size = open_images(path, options)
     read_poses = partial(read_trajectory, _given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
-    frames = _with_depth(images, root, options, options.depth_scale)
+    frames = _with_depth(images, root, options, options.truth_scale)
     # Of a generic sequence, ``fps`` counts images, whatever their names.
     counted = replace(options, trajectory=None)
     return assemble("generic", path, frames, _lens(root, options, size), counted, size=size, read_poses=read_poses)
@@ -79,14 +79,14 @@ def has_images_and_depth(path: Path) -> bool:
 
 def open_unposed(path: Path, options: Options) -> FrameSequence:
     """Opens images with depth maps for uses that need no poses, such as training: a sequence with ``posed`` False.
-    Images without a depth map are skipped. Without ``depth_scale``, maps beside TUM's ``depth.txt`` are in 1/5000 m.
+    Images without a depth map are skipped. Without ``truth_scale``, maps beside TUM's ``depth.txt`` are in 1/5000 m.
     Raises ValueError: images, depth maps or intrinsics are not found, or no depth map fits an image."""
     options.reject("unposed", "trajectory", "T_color_depth")
     if not has_images_and_depth(path):
         raise ValueError(f"{path} must hold one of {', '.join(IMAGES)} and one of {', '.join(DEPTHS)}")
     first = next(name for name in IMAGES if (path / name).is_dir())
     images, size = open_images(path, replace(options, images=options.images or path / first))
-    scale = options.depth_scale
+    scale = options.truth_scale
     if scale is None and (path / "depth.txt").is_file():
         scale = TUM_SCALE
     frames = [
@@ -155,9 +155,9 @@ def listed_times(folder: Path, files: list[Path]) -> np.ndarray | None:
 
 
 def depth_folder(root: Path, inside: Path, options: Options) -> Path | None:
-    """The folder of depth maps: ``options.depth``, or else one of ``DEPTHS`` in a folder; None without any."""
-    if options.depth is not None:
-        return resolve(root, options.depth)
+    """The folder of depth maps: ``options.truth``, or else one of ``DEPTHS`` in a folder; None without any."""
+    if options.truth is not None:
+        return resolve(root, options.truth)
     return next((inside / name for name in DEPTHS if (inside / name).is_dir()), None)
 
 

@@ -84,10 +84,10 @@ def read(path: Path, options: Options) -> FrameSequence:
     numbers = [int(image.stem) for image in images]
     times = _times(folder / "timestamps.txt", numbers)
     poses = _poses(root, drive, camera) if options.trajectory is None else dict.fromkeys(numbers, UNKNOWN)
-    maps = {} if options.depth is None else pair_depth([i.stem for i in images], resolve(folder, options.depth))
+    maps = {} if options.truth is None else pair_depth([i.stem for i in images], resolve(folder, options.truth))
     frames = [
         frame_of_image(
-            image.stem, image, depth_loader(maps.get(image.stem), options.depth_scale, _SCALE), poses[number], time
+            image.stem, image, depth_loader(maps.get(image.stem), options.truth_scale, _SCALE), poses[number], time
         )
         if number in poses
         else Skipped(image.stem, "no pose for this frame number")
@@ -95,7 +95,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     ]
     lens, name = Lens.of(P[:, :3], (height, width)), drive if camera == "00" else f"{drive}_{folder.name}"
     sequence = assemble("kitti360", folder, frames, lens, options, name=name, size=size)
-    if options.depth is None:
+    if options.truth is None:
         if options.depth_intrinsics is not None:
             raise ValueError("depth_intrinsics goes with a folder of depth maps, not with depth from the laser")
         return _with_laser(sequence, root, drive, camera, poses, options)

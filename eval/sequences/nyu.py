@@ -46,7 +46,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     images were cropped and ``intrinsics`` are not given, or no file can be read."""
     folder = parts(path)[0]
     files = _files(folder)
-    scale = 1.0 if options.depth_scale is None else options.depth_scale
+    scale = 1.0 if options.truth_scale is None else options.truth_scale
     entries = [
         Entry(f"{file.parent.name}__{file.stem}", np.eye(4), partial(_image, file), partial(_depth, file, scale))
         for file in files

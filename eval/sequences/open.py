@@ -19,7 +19,7 @@ from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS, in_metres
 # The layouts that have a use for an option which not all have.
 _TAKEN_BY = {
     "images": ("colmap", "generic"),
-    "depth": ("kitti360", "colmap", "generic"),
+    "truth": ("kitti360", "colmap", "generic"),
     "depth_intrinsics": ("7scenes", "scannet", "sens", "kitti360", "generic"),
     "T_color_depth": ("7scenes",),
     "distortion": ("tum", "7scenes", "scannet", "sens", "tartanair", "kitti360", "generic"),
@@ -29,7 +29,7 @@ _TAKEN_BY = {
 }
 
 
-def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, **options: Any) -> FrameSequence:
+def open_sequence(path: str | Path, layout: str = "auto", **options: Any) -> FrameSequence:
     """Opens a sequence of posed images; nothing but headers and text files is read before it is indexed.
 
     Args:
@@ -37,10 +37,8 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
         layout: ``auto``, ``tum``, ``7scenes``, ``scannet``, ``sens``, ``tartanair``, ``kitti360``, ``nyu``, ``colmap``,
             ``transforms``, ``euroc``, ``bag``, ``stray``, ``arkitscenes``,
             ``generic``, or one of a plug-in.
-        poses: how they are written: ``camera-to-world`` (x right, y down, z forward), ``world-to-camera``, ``ned``
-            (camera-to-world, x forward, y right, z down) or ``opengl`` (x right, y up, z backward); what is
-            customary for a layout (TartanAir's NED) is known.
-        **options: by the names of :class:`~ufmstar_torch.eval.sequences.options.Options`, which explains them.
+        **options: by the names of :class:`~ufmstar_torch.eval.sequences.options.Options`, which explains them;
+            intrinsics may also be a matrix [3, 3] [px].
 
     Returns:
         The frames with a usable pose; ``skipped`` has the others.
@@ -51,19 +49,15 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
         ValueError: unknown or ambiguous layout (with what was looked for), an option out of range or of no
             use for the layout, malformed files (named by file and line), or no usable frame.
     """
-    if poses not in CONVENTIONS:
-        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
+    chosen = Options(layout=layout, **options)
     if str(path).startswith("tour:"):
-        if layout != "auto":
-            raise ValueError(f"layout must be auto for {path!r}, got {layout!r}")
-        if options:
-            raise ValueError(f"{path!r} takes no {', '.join(options)}: a tour's options stand in its name")
+        if refused := [name for name in chosen.changed() if name != "poses"]:
+            raise ValueError(f"{path!r} takes no {', '.join(refused)}: a tour's options stand in its name")
         # Imported on use, since that package imports this one.
-        return convert_poses(import_module("ufmstar_torch.eval.tour.sequence").open_tour(str(path)), poses)
+        return convert_poses(import_module("ufmstar_torch.eval.tour.sequence").open_tour(str(path)), chosen.poses)
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"path: no such file or folder: {path}")
-    chosen = Options(**options)
     explicit = chosen.images is not None or chosen.trajectory is not None
     layout = layout_of(layout, path, explicit, chosen.plugin)
     refused = [name for name, layouts in _TAKEN_BY.items() if layout in READERS and layout not in layouts]
@@ -81,7 +75,7 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
             return Lens.of(sequence.intrinsics_of(entry), size, coefficients, fisheye)
 
         sequence = undistort(sequence, lens_of, several=True)
-    sequence = convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), poses)
+    sequence = convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), chosen.poses)
     if chosen.max_truth is not None:
         sequence = sequence.changed(partial(_within, most=chosen.max_truth))
     return sequence if chosen.pose_scale is None else scale_poses(sequence, chosen.pose_scale)

@@ -1,53 +1,83 @@
-"""The options of ``open_sequence`` as one value, which every reader takes."""
+"""The options of ``open_sequence`` as one value, which every reader takes, and which commands have as options."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ufmstar_torch.eval.sequences.images import check_scale
-from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike
+from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, parse_intrinsics
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
+
+_WORD, _WORDS = {"type": str | None}, {"type": tuple[str, ...]}  # as commands take them
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Options:
-    """The options that a user may override. Raises ValueError: a number is out of its range."""
+    """Opening of sequences.
 
-    # Instead of the layout's own [px]: a file, a 3x3 matrix, or fx, fy, cx, cy; and those of the depth maps (7-Scenes,
-    # ScanNet, generic).
-    intrinsics: IntrinsicsLike | None = None
-    depth_intrinsics: IntrinsicsLike | None = None
-    # File in TUM or KITTI format whose camera-to-world poses, with our axes, replace the layout's own: those of
-    # ORB-SLAM3, BundleFusion, ... Inside the sequence's folder, or else from the working folder.
-    trajectory: str | Path | None = None
-    images: str | Path | None = None  # folder of images or video file (generic)
-    depth: str | Path | None = None  # folder of depth maps (generic, KITTI-360)
-    depth_scale: float | None = None  # metres per unit of the depth files, instead of the layout's own
-    max_time_difference: float = 0.02  # between paired colour and depth images [s] (TUM, generic)
-    # Poses are interpolated between samples at most this far apart [s]; at 0.1 s a hand that accelerates at 2 m/s^2
-    # departs 2.5 mm from the straight line.
+    Attributes:
+        layout: name of the layout (docs/data.md); auto: detect it from the files
+        intrinsics: camera of the images: a file, or fx fy cx cy [px]
+        distortion: lens distortion to undo: k1 k2 p1 p2 [k3 [k4 k5 k6]], fisheye k1 k2 k3 k4, or none (default:
+            TUM RGB-D's own)
+        depth_intrinsics: camera of the sequence's own depth maps: a file, or fx fy cx cy [px]
+        truth_scale: metres per unit of the sequence's own depth
+        max_truth: ground truth beyond this depth is ignored [m]
+        trajectory: file with poses (TUM or KITTI), used instead of the layout's own
+        poses: axes of the poses; ned: x forward, z down; opengl: y up, z back
+        pose_scale: metres per unit of poses and landmarks
+        fps: frames per second of images without timestamps
+        time_offset: seconds added to the times of the images [s]
+        max_pose_gap: longest gap over which poses are interpolated [s]
+        max_time_difference: longest time between a colour image and its depth map [s]
+        images: folder or video file with the images of a generic sequence
+        truth: folder with the ground-truth depth maps of a generic sequence
+        register: leave 7-Scenes' depth in its own camera
+        T_color_depth: 7-Scenes: file with the 4x4 transform from the depth to the colour camera [m]
+        topics: topics of a ROS bag; write a pose's as TOPIC=FRAME with the frame that it moves
+        drive: KITTI-360: name or number of a drive below the root
+        scans: KITTI-360: also use the laser scans of this many neighbouring frames
+        plugin: Python files with READERS (eval: also METHODS, METRICS)
+
+    Raises:
+        ValueError: a number is out of its range, or intrinsics are neither a file nor four numbers.
+    """
+
+    layout: str = "auto"
+    intrinsics: IntrinsicsLike | None = field(default=None, metadata=_WORDS)
+    distortion: str | Sequence[str | float] | None = field(default=None, metadata=_WORDS)
+    depth_intrinsics: IntrinsicsLike | None = field(default=None, metadata=_WORDS)
+    truth_scale: float | None = None
+    max_truth: float | None = None
+    trajectory: str | Path | None = field(default=None, metadata=_WORD)  # with our axes, camera-to-world
+    poses: str = field(default=OURS, metadata={"choices": tuple(CONVENTIONS)})
+    pose_scale: float | None = None
+    fps: float | None = None  # images of a layout that numbers them are counted by that number
+    time_offset: float = 0.0
+    # At 0.1 s a hand that accelerates at 2 m/s^2 departs 2.5 mm from the straight line.
     max_pose_gap: float = 0.1
-    # Frames per second of images without timestamps, or instead of the video's own, where a trajectory has timestamps.
-    # Images of a layout that numbers them are counted by that number.
-    fps: float | None = None
-    time_offset: float = 0.0  # added to the images' times [s]
-    register: bool = True  # warp 7-Scenes' depth into the colour camera
-    T_color_depth: np.ndarray | str | Path | None = None  # [4, 4] depth to colour camera [m], or its file (7-Scenes)
-    # Of the images' lens: k1 k2 p1 p2 [k3 [k4 k5 k6]], "fisheye" k1 k2 k3 k4, or "none". None: TUM's published one.
-    distortion: str | Sequence[str | float] | None = None
-    pose_scale: float | None = None  # metres per unit of the poses, and of a file of landmarks
-    plugin: Sequence[str] = ()  # files with readers of one's own (``plugins``)
-    max_truth: float | None = None  # depths beyond are no ground truth [m]: what a window shows
-    topics: Sequence[str] | None = None  # of a bag that has several; a pose's with =FRAME, whose pose it is
-    drive: str | int | None = None  # name or number of the drive, where the path is KITTI-360's root
-    # Laser scans of as many frames before and after a frame that are added to its own (KITTI-360); moving things smear.
-    scans: int | None = None
+    max_time_difference: float = 0.02
+    images: str | Path | None = field(default=None, metadata=_WORD)
+    truth: str | Path | None = field(default=None, metadata=_WORD)
+    register: bool = True
+    T_color_depth: np.ndarray | str | Path | None = field(default=None, metadata=_WORD)
+    topics: tuple[str, ...] = ()
+    drive: str | int | None = field(default=None, metadata=_WORD)
+    scans: int | None = None  # moving things smear
+    plugin: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        check_scale(self.depth_scale)
+        for name in ("intrinsics", "depth_intrinsics"):
+            if isinstance(words := getattr(self, name), tuple) and all(isinstance(word, str) for word in words):
+                object.__setattr__(self, name, parse_intrinsics(words, f"--{name.replace('_', '-')}"))
+        if self.poses not in CONVENTIONS:
+            raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {self.poses!r}")
+        check_scale(self.truth_scale)
         for name in ("max_time_difference", "max_pose_gap"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must be a time of at least 0 s, got {getattr(self, name)}")
@@ -60,10 +90,16 @@ class Options:
         if self.scans is not None and (self.scans < 0 or self.scans != int(self.scans)):
             raise ValueError(f"scans must be a number of laser scans on either side, at least 0, got {self.scans}")
 
+    def changed(self) -> dict[str, Any]:
+        """Those that are not the default, as a command line gives them: arguments of ``open_sequence``."""
+        of = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not f.default}
+        defaults = {f.name: f.default for f in fields(self)}
+        return {name: value for name, value in of.items() if defaults[name] is None or value != defaults[name]}
+
     def reject(self, layout: str, *names: str) -> None:
         """Raises ValueError where an option was given that the layout has no use for."""
         for name in names:
-            if getattr(self, name) is not None:
+            if name in self.changed():
                 other = "use layout='generic' to combine images, depth and a trajectory freely"
                 raise ValueError(f"layout {layout!r} takes no {name}: its files hold that; {other}")
 

@@ -45,7 +45,7 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 def _frame(path: Path, image: Path, options: Options) -> Entry | Skipped:
     pose, depth = path / "pose" / f"{image.stem}.txt", path / "depth" / f"{image.stem}.png"
-    load_depth = depth_loader(depth if depth.is_file() else None, options.depth_scale)
+    load_depth = depth_loader(depth if depth.is_file() else None, options.truth_scale)
     return frame_of_files(image.stem, image, pose if pose.is_file() else None, load_depth, options)
 
 

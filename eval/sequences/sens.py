@@ -66,7 +66,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         if header["frames"] > max(_FEW_FRAMES, (size := file.stat().st_size) // _FRAME.itemsize):
             raise ValueError(f"{file}: broken header: {header['frames']} frames cannot be in a file of {size:,} bytes")
         color_size, depth_size = (tuple(header[key].tolist()[::-1]) for key in ("color_size", "depth_size"))
-        scale = options.depth_scale or 1 / float(header["units_per_metre"])
+        scale = options.truth_scale or 1 / float(header["units_per_metre"])
         frames = _frames(opened, file, int(header["frames"]), depth_size, scale)
     for number in range(len(frames), int(header["frames"])):
         frames.append(Skipped(str(number), "beyond the end of the truncated file"))

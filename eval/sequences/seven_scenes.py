@@ -58,7 +58,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     color_size = first_image_size(kinds["color"] for kinds in files.values() if "color" in kinds) or _NATIVE_SIZE
     frames = []
     for name, kinds in files.items():
-        load = partial(_read_depth, kinds["depth"], options.depth_scale or _MILLIMETRE) if "depth" in kinds else None
+        load = partial(_read_depth, kinds["depth"], options.truth_scale or _MILLIMETRE) if "depth" in kinds else None
         frames.append(frame_of_files(name, kinds.get("color"), kinds.get("pose"), load, options))
     own_size = first_depth_size(frames)
     K_color = camera_matrix(options.intrinsics, pinhole(*_K_COLOR), _NATIVE_SIZE, color_size)

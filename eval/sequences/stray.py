@@ -62,7 +62,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         camera = tuple(value[name] for name in _FOCAL) if set(_FOCAL) <= value.keys() else pinhole_values(K)
         lenses[name] = Lens(camera, video.size)
         file = path / "depth" / f"{name}.png"
-        load = partial(_depth, file, path / "confidence" / file.name, options.depth_scale) if file.is_file() else None
+        load = partial(_depth, file, path / "confidence" / file.name, options.truth_scale) if file.is_file() else None
         frames.append(Entry(name, T, partial(video.read, int(index)), load, time))
     return assemble("stray", path, frames, lenses, options)
 

@@ -47,7 +47,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     for number, T in enumerate(CONVENTIONS["ned"].convert(trajectory.T_world_cam)):
         image = by_number.get(number, folder / "image_left" / f"{number:06d}_left.png")
         depth = folder / "depth_left" / f"{image.stem}_depth.npy"
-        load_depth = depth_loader(depth if depth.is_file() else None, options.depth_scale)
+        load_depth = depth_loader(depth if depth.is_file() else None, options.truth_scale)
         frames.append(frame_of_image(image.stem, image, load_depth, T))
     name = path.resolve().name if folder == path else f"{path.resolve().name}_{folder.name}"
     size = first_image_size(images) or _LENS.size

@@ -47,7 +47,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         frames = [dict(frame) for frame in content["frames"]]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{file}: expected JSON with a list 'frames' of objects: {error}") from error
-    scale = options.depth_scale or _number(content, "depth_unit_scale_factor", file, 0.001)
+    scale = options.truth_scale or _number(content, "depth_unit_scale_factor", file, 0.001)
     entries: list[Entry | Skipped] = []
     lenses = {}
     paths = [_path(frame, file) for frame in frames]

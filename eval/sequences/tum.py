@@ -43,7 +43,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     ``intrinsics`` is not given; a malformed line."""
     times, files = read_file_list(path / "rgb.txt")
     depth_files = _paired_depth(path, times, options.max_time_difference)
-    loaders = [depth_loader(depth_files.get(i), options.depth_scale, SCALE) for i in range(len(files))]
+    loaders = [depth_loader(depth_files.get(i), options.truth_scale, SCALE) for i in range(len(files))]
     frames = [
         frame_of_image(Path(file).stem, path / file, load_depth, timestamp=float(time))
         for file, load_depth, time in zip(files, loaders, times, strict=True)
