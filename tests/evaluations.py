@@ -16,7 +16,6 @@ from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
-from ufmstar_torch.eval.metrics.packed_sums import pack
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.suite.record import Record
@@ -42,9 +41,13 @@ TITLE = f"Title $x$ {HOSTILE}"
 SHAPE = (12, 16)
 
 
+def folder_of(out: Path, dataset: str, sequence: str) -> Path:
+    return out / "records" / WorkItem(dataset, sequence, path="", layout="").folder
+
+
 def write_examples(out: Path, dataset: str, sequence: str, rows: Sequence[Row]) -> None:
     """An example frame "7" with maps of the rows, and a room of the last one."""
-    folder = out / "records" / WorkItem(dataset, sequence, path="", layout="").folder
+    folder = folder_of(out, dataset, sequence)
     for name in ("examples", "room"):
         (folder / name).mkdir(parents=True)
     K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])
@@ -96,7 +99,7 @@ def write_sequence(
     out: Path, suite: str, dataset: str, sequence: str, rows: Iterable[Row], network: str = NETWORK
 ) -> None:
     """Records and sums of the rows on one sequence."""
-    folder = out / "records" / dataset / sequence
+    folder = folder_of(out, dataset, sequence)
     folder.mkdir(parents=True, exist_ok=True)
     rows = list(rows)
     references = {
@@ -108,9 +111,7 @@ def write_sequence(
     }
     for row in rows:
         judged, sums = judge(draw_maps(row, sequence), references)
-        packed = {name: {key: pack(value) for key, value in states.items()} for name, states in sums.items()}
-        torch.save(packed, folder / f"{row.slug}.pt")
-        record_of(suite, dataset, sequence, row, judged, network).save(folder / f"{row.slug}.json")
+        record_of(suite, dataset, sequence, row, judged, network).save(folder / f"{row.slug}.json", sums)
 
 
 def record_of(suite: str, dataset: str, sequence: str, row: Row, judged: Record, network: str = NETWORK) -> Record:
@@ -185,9 +186,9 @@ def write_evaluation(
     for dataset, sequence in sequences:
         write_sequence(out, suite, dataset, sequence, rows)
     for (dataset, sequence), reason in failed.items():
-        folder = out / "records" / dataset / sequence
+        folder = folder_of(out, dataset, sequence)
         folder.mkdir(parents=True)
-        values = {"sequence": sequence, "reason": reason, "rows": [row.slug for row in rows]}
+        values = {"dataset": dataset, "sequence": sequence, "reason": reason, "rows": [row.slug for row in rows]}
         (folder / "failed.json").write_text(json.dumps(values))
     return out
 

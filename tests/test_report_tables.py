@@ -35,7 +35,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting, setting_from
 from ufmstar_torch.eval.methods.suite import names, suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.data import Results, ResultsError, load_results
+from ufmstar_torch.eval.report.data import Results, load_results
 from ufmstar_torch.eval.report.means import Mean, difference, mean_of
 from ufmstar_torch.eval.report.names import NLL, row_labels
 from ufmstar_torch.eval.report.paper import paper_tables
@@ -59,6 +59,7 @@ from ufmstar_torch.eval.report.tables import (
 )
 from ufmstar_torch.eval.report.text import summary
 from ufmstar_torch.eval.report.write import write_report
+from ufmstar_torch.eval.suite.record import ResultsError
 
 ALONE, UFM, UFM_100K, UFM_STAR = ENSEMBLE
 SECOND = "records/scannet/x/Ensemble.json"
@@ -261,8 +262,6 @@ class TestLoading:
             ("eval.json", {"format": 99}, r"eval\.json is not the description"),
             ("eval.json", {"rows": [{"method": "Oracle"}]}, "a row that cannot be: no method is called 'Oracle'"),
             (SECOND, {"sequence": "x", "network": "Other"}, "mixed networks.*FastDepth in .*Other in "),
-            (SECOND, {"sequence": "x", "suite": "ablations"}, "of the suite 'ablations', not of 'paper-table-1'"),
-            (SECOND, {}, "of the same row on the same sequence"),
             (SECOND, {"format": 2}, r"Ensemble\.json is not a record of format 1"),
             (SECOND, {"method": "Oracle"}, r"Ensemble\.json: no method is called 'Oracle'"),
             (SECOND, {"setting": {"skip": -1}}, r"Ensemble\.json: Setting\.skip must lie"),

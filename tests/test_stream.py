@@ -97,16 +97,6 @@ def test_a_frame_that_no_row_selects_is_not_decoded(sequence):
     assert all(not result.rows and not result.skipped for result in sink.results if result.frame is None)
 
 
-def test_without_rows_it_only_reads(sequence):
-    watched, decoded = counted(sequence)
-    sink = Recorded("sink", [])
-    FrameStream(watched, range(2), []).drive([sink])
-    assert decoded == [0, 1]
-    assert [result.frame.index for result in sink.results] == [0, 1]
-    with pytest.raises(FrameError, match="cannot be decoded"):
-        FrameStream(counted(sequence, broken=(0,))[0], range(2), []).drive([])
-
-
 def test_an_unreadable_frame_is_skipped_by_the_rows_that_select_it_and_takes_no_turn(sequence):
     watched, _ = counted(sequence, broken=(2,))
     sink, rows = Recorded("sink", []), [in_turn("all"), in_turn("odd", setting=Setting(skip=2))]
@@ -210,8 +200,3 @@ def test_the_state_of_another_estimator_is_refused(tour):
         RowRunner("row", own_depth(), Alone()).load_state(gaussians.state())
     with pytest.raises(RuntimeError, match=r"Missing key.*mean"):
         gaussians.load_state({"image_index": torch.tensor(0)})
-
-
-def test_rows_of_one_key_are_refused(sequence):
-    with pytest.raises(ValueError, match="different keys"):
-        FrameStream(sequence, range(2), [in_turn(), in_turn()])

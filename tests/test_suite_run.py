@@ -92,13 +92,13 @@ def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path, whole):
     failed = json.loads((job.out / "records" / "rooms" / "birch" / "failed.json").read_text())
     assert (failed["sequence"], failed["dataset"], len(failed["rows"])) == ("birch", "rooms", 4)
     assert "poses.txt" in failed["reason"]
-    assert job.folder.failures(job.items).keys() == {"rooms/birch"}
+    assert job.folder.failures().keys() == {("rooms", "birch")}
     # Mended, it is tried again.
     write_rooms(root, ["birch"])
     stub = Stub()
     assert go(job, stub, resume=True)[0].finished
     assert [name for name, _ in stub.asked] == ["birch"]
-    assert not job.folder.failures(job.items)
+    assert not job.folder.failures()
     assert kept(job.out) == whole
 
 
@@ -113,9 +113,9 @@ def test_what_the_judge_cannot_use_is_broken_and_what_it_cannot_write_ends_all(r
 
     job = job_on(rooms, tmp_path / "out")
     go(job, fails(SequenceError("no frame has ground truth")))
-    assert job.folder.failures(job.items) == {"rooms/birch": "no frame has ground truth"}
+    assert job.folder.failures() == {("rooms", "birch"): "no frame has ground truth"}
     go(job, fails(RuntimeError("out of memory")), resume=True)
-    assert job.folder.failures(job.items) == {"rooms/birch": "out of memory"}
+    assert job.folder.failures() == {("rooms", "birch"): "out of memory"}
     for error in (CacheError("disk full"), OSError("disk full"), TypeError("a mistake of ours")):
         with pytest.raises(type(error)):
             go(job, fails(error), resume=True)
@@ -197,11 +197,11 @@ def test_a_kill_loses_the_sequence_at_work_alone(rooms, tmp_path, whole):
 def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, whole, monkeypatch):
     job, saved, write = job_on(rooms, tmp_path / "out"), [], Record.save
 
-    def save(self, path):
+    def save(self, path, sums):
         if len(saved) == 6:
             raise KeyboardInterrupt
         saved.append(path)
-        write(self, path)
+        write(self, path, sums)
 
     monkeypatch.setattr(Record, "save", save)
     with pytest.raises(KeyboardInterrupt):

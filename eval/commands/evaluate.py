@@ -21,6 +21,7 @@ from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.suite.job import EvalJob, require_methods, with_recalibrations
+from ufmstar_torch.eval.suite.record import ResultsError
 from ufmstar_torch.eval.suite.shards import EvalOutcome, evaluate_suite
 from ufmstar_torch.eval.suite.work_items import ALL, Shard, find_work, read_names
 
@@ -217,7 +218,7 @@ def _evaluate(options: EvalOptions) -> int:
 
 def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
     """Print the table, measure, draw the report, name what failed; the exit code."""
-    from ufmstar_torch.eval.report.data import ResultsError, load_results
+    from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
 

@@ -14,8 +14,7 @@ from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.engine.judge import CONFIDENCE, METRICS
 from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.report.data import Results, load_results, read_sums
-from ufmstar_torch.eval.suite.work_items import WorkItem
+from ufmstar_torch.eval.report.data import Results, load_results
 from ufmstar_torch.recalibrate import Recalibration
 
 
@@ -75,13 +74,11 @@ def _counts(results: Results, row: Row, covariate: str) -> dict[str, NDArray[Any
     [n, 3]. Raises ValueError: the network states none."""
     counts = {}
     for record in results.of(row):
-        item = WorkItem(record.dataset, record.sequence, path="", layout="")
-        path = results.out / "records" / item.folder / f"{row.slug}.pt"
-        sums = read_sums(path)
+        sums = record.sums()
         if covariate == CONFIDENCE and CONFIDENCE not in sums:
             raise ValueError(f"--covariate confidence needs a network that states one: {row.label} has none")
         chosen = (CONFIDENCE, "samples") if covariate == CONFIDENCE else (METRICS, "metrics.SpearmanCorrelation.joint")
-        counts[item.label] = sums[chosen[0]][chosen[1]].double().numpy()
+        counts[f"{record.dataset}/{record.sequence}"] = sums[chosen[0]][chosen[1]].double().numpy()
     return counts
 
 

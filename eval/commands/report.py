@@ -29,9 +29,10 @@ read = reader(ReportOptions, "ufmstar report")
 
 def main(options: ReportOptions) -> int:
     """Draw the report, and print the main table; the exit code."""
-    from ufmstar_torch.eval.report.data import ResultsError, load_results
+    from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
+    from ufmstar_torch.eval.suite.record import ResultsError
 
     with usage_errors(ResultsError):
         print(summary(load_results(options.out, with_sums=False)))

@@ -67,7 +67,7 @@ class FrameStream:
     Args:
         sequence: posed frames.
         indices: which of them, in order.
-        rows: with different keys. () only reads the frames, and a frame that cannot be read is an error.
+        rows: with different keys.
         store: of predictions; None = every prediction is computed.
         device: of the rows' estimators, where they want their maps.
         check: raises ``FrameError`` for a frame that no row is to use.
@@ -85,8 +85,6 @@ class FrameStream:
         check: Callable[[Frame], None] | None = None,
         start: int = 0,
     ) -> None:
-        if len({row.key for row in rows}) < len(rows):
-            raise ValueError(f"rows must have different keys, got {[row.key for row in rows]}")
         self.sequence, self.indices, self.rows = sequence, indices, tuple(rows)
         self._store, self._device, self._check = store, device or torch.device("cpu"), check
         self._names = sequence.names
@@ -99,7 +97,6 @@ class FrameStream:
 
         Raises:
             Stopped: ``stop`` returned True.
-            FrameError: without rows, a frame cannot be read.
         """
         with closing(prefetch(self.sequence, self._selected(), self._prepare)) as frames:
             for sink in sinks:
@@ -118,12 +115,12 @@ class FrameStream:
         return {row.key: row.state() for row in self.rows}
 
     def _next(self, frames: Iterator[Future[Frame]]) -> FrameResult:
-        """Process the next frame. Raises FrameError: without rows, it cannot be read."""
+        """Process the next frame."""
         number, index = self.position, self.indices[self.position]
         name = self._names[index]
         active = [row for row in self.rows if selects(row.setting, number)]
         self.position += 1
-        if self.rows and not active:
+        if not active:
             return FrameResult(number, index, name)
         ms: dict[str, float] = {}
         try:
@@ -137,8 +134,6 @@ class FrameStream:
             with timed(ms, "truth", self._device):
                 truths = _truths(frame, predictions)
         except FrameError as error:
-            if not self.rows:
-                raise
             return FrameResult(number, index, name, skipped={row.key: error.reason for row in active})
         results: dict[str, RowResult] = {}
         skipped: dict[str, str] = {}
@@ -150,9 +145,9 @@ class FrameStream:
         return FrameResult(number, index, name, frame, results, skipped, ms)
 
     def _selected(self) -> list[int]:
-        """Those of the remaining frames that a row selects; without rows all."""
+        """Those of the remaining frames that a row selects."""
         left = range(self.position, len(self.indices))
-        return [self.indices[n] for n in left if not self.rows or any(selects(row.setting, n) for row in self.rows)]
+        return [self.indices[n] for n in left if any(selects(row.setting, n) for row in self.rows)]
 
     def _prepare(self, frame: Frame) -> None:
         """Compute the networks' input in the thread that reads ahead, unless a store may have all predictions. Only

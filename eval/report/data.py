@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 import json
-import pickle
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
-from torch import Tensor
-
 from ufmstar_torch.eval.engine.judge import CONFIDENCE, METRICS
 from ufmstar_torch.eval.methods.row import Row, plain_rows, row_from
-from ufmstar_torch.eval.metrics.packed_sums import unpack
-from ufmstar_torch.eval.suite.folder import FAILED
-from ufmstar_torch.eval.suite.record import Record
+from ufmstar_torch.eval.suite.folder import FAILED, EvalFolder
+from ufmstar_torch.eval.suite.record import FORMAT, Record, ResultsError, Sums
 
-FORMAT = 1
-Sums = dict[str, dict[str, Tensor]]
 Curves = Mapping[str, list[float]]
-
-
-class ResultsError(ValueError):
-    """The folder is no evaluation, or its records do not belong together; the message names the file."""
 
 
 class Failed(NamedTuple):
@@ -94,6 +83,10 @@ class Results:
         """The label of the network of a base; None without a record."""
         return next((r.network for r in self.records if r.row.method.base == base), None)
 
+    def folder(self, dataset: str, sequence: str) -> Path:
+        """The folder of a sequence with a record."""
+        return next(r.path.parent for r in self.records if (r.dataset, r.sequence) == (dataset, sequence))
+
     @cached_property
     def _by_row(self) -> dict[Row, list[Record]]:
         groups: dict[Row, list[Record]] = {}
@@ -111,24 +104,18 @@ def load_results(out: Path, *, with_sums: bool = True) -> Results:
         OSError: a file cannot be read.
     """
     about = _about(out)
-    order, loaded = {row: number for number, row in enumerate(listed_rows(about))}, []
-    for path in (out / "records").rglob("*.json"):
-        if path.name != FAILED:
-            try:
-                record = Record.load(path)
-                place = record.dataset, record.sequence, order.get(record.row, len(order)), record.row.slug, path
-            except ValueError as error:
-                text = str(error)
-                raise ResultsError(text if str(path) in text else f"{path}: {text}") from error
-            loaded.append((place, record))
-    by_path = {place[-1]: record for place, record in sorted(loaded, key=lambda pair: pair[0])}
-    _check(out, about, by_path)
-    records, failed = tuple(by_path.values()), _failed(out)
+    order = {row: number for number, row in enumerate(listed_rows(about))}
+    loaded = [Record.load(path) for path in out.glob("records/*/*/*.json") if path.name != FAILED]
+    records = tuple(
+        sorted(loaded, key=lambda r: (r.dataset, r.sequence, order.get(r.row, len(order)), r.row.slug, r.path))
+    )
+    _check(out, records)
+    failed = tuple(sorted(Failed(*where, reason) for where, reason in EvalFolder(out).failures().items()))
     done = {(r.dataset, r.sequence, r.row) for r in records}
     broken = {(f.dataset, f.sequence) for f in failed}
     expected = sorted((s["dataset"], s["sequence"]) for s in about.get("sequences", []))
     missing = tuple((*s, row) for s in expected if s not in broken for row in order if (*s, row) not in done)
-    merged, notes = _merged(by_path) if with_sums else ({}, [])
+    merged, notes = _merged(records) if with_sums else ({}, [])
     return Results(out, about, records, merged, failed, missing, _read_json(out / "efficiency.json"), tuple(notes))
 
 
@@ -159,59 +146,42 @@ def _read_json(path: Path) -> Any:
         raise ResultsError(f"{path} is not JSON: {error}") from error
 
 
-def _check(out: Path, about: Mapping[str, Any], records: Mapping[Path, Record]) -> None:
-    """Raise ResultsError where there is no record, or records are not of one evaluation."""
+def _check(out: Path, records: Sequence[Record]) -> None:
+    """Raise ResultsError where there is no record, or records of one base are of several networks."""
     if not records:
         raise ResultsError(f"{out} holds no finished sequence yet (no record under {out / 'records'})")
-    networks: dict[str, tuple[str, Path]] = {}
-    seen: dict[tuple[str, str, Row], Path] = {}
-    for path, record in records.items():
-        if record.suite != about["suite"]:
-            raise ResultsError(f"{path} is of the suite {record.suite!r}, not of {about['suite']!r} as eval.json")
+    first: dict[str, Record] = {}
+    for record in records:
         base = record.row.method.base
-        network, first = networks.setdefault(base, (record.network, path))
-        if network != record.network:
+        other = first.setdefault(base, record)
+        if record.network != other.network:
             raise ResultsError(
-                f"records of {base} are of mixed networks, which have no common mean: {network} in {first}, "
-                f"{record.network} in {path}"
+                f"records of {base} are of mixed networks, which have no common mean: {other.network} in {other.path}, "
+                f"{record.network} in {record.path}"
             )
-        twin = seen.setdefault((record.dataset, record.sequence, record.row), path)
-        if twin != path:
-            raise ResultsError(f"{twin} and {path} are of the same row on the same sequence")
-
-
-def _failed(out: Path) -> tuple[Failed, ...]:
-    failed = []
-    for path in (out / "records").rglob(FAILED):
-        values = _read_json(path)
-        if not isinstance(values, dict) or "reason" not in values:
-            raise ResultsError(f"{path} does not say why a sequence failed")
-        dataset, sequence = values.get("dataset", path.parent.parent.name), values.get("sequence", path.parent.name)
-        failed.append(Failed(str(dataset), str(sequence), str(values["reason"])))
-    return tuple(sorted(failed))
 
 
 # ---- sums over sequences ----
 
 
-def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Curves], list[str]]:
+def _merged(records: Sequence[Record]) -> tuple[dict[tuple[str, Row], Curves], list[str]]:
     """Curves of each (dataset, row) from sums over its sequences; a note where a file is missing."""
-    groups: dict[tuple[str, Row], list[Path]] = {}
-    for path, record in records.items():
-        groups.setdefault((record.dataset, record.row), []).append(path.with_suffix(".pt"))
+    groups: dict[tuple[str, Row], list[Record]] = {}
+    for record in records:
+        groups.setdefault((record.dataset, record.row), []).append(record)
     merged, notes = {}, []
-    for (dataset, row), files in groups.items():
-        if gone := [path for path in files if not path.is_file()]:
+    for (dataset, row), of_row in groups.items():
+        if gone := [path for record in of_row if not (path := record.path.with_suffix(".pt")).is_file()]:
             notes.append(f"{dataset}, {row.label}: no curve over all sequences, {gone[0]} is not there")
             continue
         total: Sums = {}
         try:
-            for path in files:  # their order decides the last bits
-                total = _added(total, read_sums(path))
+            for record in of_row:  # their order decides the last bits
+                total = _added(total, record.sums())
             merged[dataset, row] = _curves(total)
         except RuntimeError as error:
             text = " ".join(str(error).split())[:200]
-            raise ResultsError(f"{path} holds sums of other metrics: {text}") from error
+            raise ResultsError(f"{record.path.with_suffix('.pt')} holds sums of other metrics: {text}") from error
     return merged, notes
 
 
@@ -225,17 +195,6 @@ def _added(total: Sums, sums: Sums) -> Sums:
         if name != CONFIDENCE:  # samples, no sums
             added[name] = {key: before[key] + v for key, v in states.items()} if name in total else states
     return added
-
-
-def read_sums(path: Path) -> Sums:
-    """``RowFigures.sums`` of one row on one sequence."""
-    try:
-        sums = torch.load(path, map_location="cpu", weights_only=True)
-    except (EOFError, KeyError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
-        raise ResultsError(f"{path} does not hold the sums of metrics: {' '.join(str(error).split())[:200]}") from error
-    if not isinstance(sums, dict) or METRICS not in sums or not all(isinstance(s, Mapping) for s in sums.values()):
-        raise ResultsError(f"{path} does not hold the sums of metrics by name")
-    return {name: {key: unpack(value) for key, value in states.items()} for name, states in sums.items()}
 
 
 def _curves(total: Sums) -> Curves:

@@ -20,7 +20,6 @@ from ufmstar_torch.eval.report.names import row_labels
 from ufmstar_torch.eval.report.rooms import Snapshot, draw_room, find_rooms
 from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.panels import Bar, GridRow, Panel, draw_grid
-from ufmstar_torch.eval.suite.work_items import WorkItem
 
 STRIP, BREAKDOWN, COMPARE, ROOM = "strip", "breakdown", "compare", "room"
 # So that a report of a hundred sequences stays one that can be read, and mailed.
@@ -50,7 +49,7 @@ def pictures_of(results: Results, folder: Path) -> Iterator[Drawing]:
     picture into ``folder``. Raises ValueError: an example cannot be read; the message names the file.
     """
     labels = {row.slug: label for row, label in row_labels(results.rows).items()}
-    examples = [e for place in results.sequences() for e in find_examples(_folder_of(results, place), *place, labels)]
+    examples = [e for place in results.sequences() for e in find_examples(results.folder(*place), *place, labels)]
     for e in choose(examples, MOST_FRAMES):
         yield from _of_frame(results, folder, e)
     yield from _of_rooms(results, folder)
@@ -100,18 +99,13 @@ def _of_frame(results: Results, folder: Path, e: Example) -> Iterator[Drawing]:
 def _of_rooms(results: Results, folder: Path) -> Iterator[Drawing]:
     drawn = 0
     for dataset, sequence in results.sequences():
-        rooms = find_rooms(_folder_of(results, (dataset, sequence)))
+        rooms = find_rooms(results.folder(dataset, sequence))
         # One row of each room is enough: the suite's first UfM* with its default settings.
         row = next((row for row in results.rows if row.slug in rooms and row.setting.plain), None)
         if row and drawn < MOST_ROOMS and any(len(snapshot.mean) for snapshot in rooms[row.slug]):
             drawn += 1
             path = folder / file_name(ROOM, dataset, sequence, row.slug)
             yield f"{sequence}: room", partial(_room, path, row_labels([row])[row], sequence, rooms[row.slug])
-
-
-def _folder_of(results: Results, place: tuple[str, str]) -> Path:
-    """The folder of a sequence, whose name need not be fit for one."""
-    return results.out / "records" / WorkItem(*place, path="", layout="").folder
 
 
 # ---- drawing: each writes its PNG into the folder and returns its words ----

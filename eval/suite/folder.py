@@ -17,14 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from ufmstar_torch.eval.engine.judge import RowFigures
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.metrics.packed_sums import pack
-from ufmstar_torch.eval.run.files import remove_temporaries, write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.files import remove_temporaries, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, hold, output_folder, remover
-from ufmstar_torch.eval.suite.record import FORMAT, Record
+from ufmstar_torch.eval.suite.record import FORMAT, Record, ResultsError
 from ufmstar_torch.eval.suite.work_items import ALL, Shard, WorkItem
 
 FAILED, CACHE = "failed.json", "cache"
@@ -83,7 +80,7 @@ class EvalFolder:
         records = {}
         for path in sorted(self.sequence_folder(item).glob("*.json")):
             if path.name != FAILED and path.with_suffix(".pt").is_file():
-                with suppress(ValueError):
+                with suppress(ResultsError):
                     records[path.stem] = Record.load(path)
         return records
 
@@ -105,11 +102,7 @@ class EvalFolder:
 
     def write(self, item: WorkItem, record: Record, result: RowFigures) -> None:
         """Store a row, completely or not at all. Raises OSError: it cannot be written."""
-        path = self.sequence_folder(item) / f"{result.row.slug}.json"
-        sums = {name: {key: pack(value) for key, value in states.items()} for name, states in result.sums.items()}
-        path.unlink(missing_ok=True)  # one that could not be read
-        write_atomic(path.with_suffix(".pt"), lambda file: torch.save(sums, file), durable=True)
-        record.save(path)
+        record.save(self.sequence_folder(item) / f"{result.row.slug}.json", result.sums)
 
     def fail(self, item: WorkItem, error: Exception | str, rows: Sequence[Row]) -> str:
         """Store why rows of a sequence cannot be computed, and return a line about it."""
@@ -118,17 +111,12 @@ class EvalFolder:
         write_json_atomic(self.sequence_folder(item) / FAILED, {**about, "rows": [row.slug for row in rows]})
         return f"{item.label}: failed: {reason}"
 
-    def failures(self, items: Iterable[WorkItem]) -> dict[str, str]:
-        """Reasons for which sequences cannot be judged, as :meth:`fail` stored them, by label."""
-        failures = {}
-        for item in items:
-            path = self.sequence_folder(item) / FAILED
-            if path.is_file():
-                try:
-                    failures[item.label] = str(json.loads(path.read_text(encoding="utf-8"))["reason"])
-                except (KeyError, TypeError, ValueError, RecursionError):
-                    failures[item.label] = f"{path} cannot be read"
-        return failures
+    def failures(self) -> dict[tuple[str, str], str]:
+        """Reasons for which sequences cannot be judged, as :meth:`fail` stored them, by data set and sequence."""
+        stored = [
+            json.loads(path.read_text(encoding="utf-8")) for path in sorted(self.path.glob(f"records/*/*/{FAILED}"))
+        ]
+        return {(one["dataset"], one["sequence"]): one["reason"] for one in stored}
 
     def succeeded(self, item: WorkItem) -> None:
         """Forget an earlier failure."""

@@ -1,18 +1,29 @@
-"""The record of one row on one sequence: the line from which every table and figure is made."""
+"""The record of one row on one sequence, from which every table and figure is made, and the sums behind it."""
 
 from __future__ import annotations
 
 import json
+import pickle
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
+from ufmstar_torch.eval.engine.judge import METRICS
 from ufmstar_torch.eval.methods.row import Row, row_from
-from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
+from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
 
 FORMAT = 1
+Sums = Mapping[str, Mapping[str, Tensor]]
+
+
+class ResultsError(ValueError):
+    """A folder is no evaluation, or its records do not belong together; the message names the file."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +50,7 @@ class Record:
     ms: Mapping[str, float] = field(default_factory=dict)
     # "versions", "machine", "device", "runtime" of the networks, digests of networks and sequence.
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    path: Path = field(default=Path(), compare=False)  # its file, ROW.json; its sums lie in ROW.pt beside it
 
     @cached_property
     def row(self) -> Row:
@@ -51,18 +63,39 @@ class Record:
         counts = {f"{group}.{key}": v for group in ("frames", "state", "ms") for key, v in getattr(self, group).items()}
         return {**self.figures, **{name: v for name, v in counts.items() if isinstance(v, int | float)}}
 
-    def save(self, path: Path) -> None:
-        """Write it as JSON, whole or not at all."""
-        write_json_atomic(path, {"format": FORMAT, **asdict(self)})
+    def save(self, path: Path, sums: Sums) -> None:
+        """Write it as JSON behind its sums, each whole or not at all: where there is a record, both are complete."""
+        path.unlink(missing_ok=True)  # one that could not be read
+        packed = {name: {key: pack(value) for key, value in states.items()} for name, states in sums.items()}
+        write_atomic(path.with_suffix(".pt"), lambda file: torch.save(packed, file), durable=True)
+        values = {name: value for name, value in asdict(self).items() if name != "path"}
+        write_json_atomic(path, {"format": FORMAT, **values})
+
+    def sums(self) -> Sums:
+        """``RowFigures.sums``. Raises ResultsError: the file holds none."""
+        path = self.path.with_suffix(".pt")
+        try:
+            stored = torch.load(path, map_location="cpu", weights_only=True)
+            packed = {METRICS: stored[METRICS], **stored}
+            return {name: {key: unpack(v) for key, v in states.items()} for name, states in packed.items()}
+        except (EOFError, KeyError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise ResultsError(f"{path} does not hold the sums of metrics: {reason}") from error
 
     @classmethod
     def load(cls, path: Path) -> Record:
-        """Read one. Raises ValueError: the file is not a record of this format; the message names it."""
+        """Read one. Raises ResultsError: the file is not a record of this format, or of no row; the message names
+        it."""
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
         except (ValueError, RecursionError) as error:
-            raise ValueError(f"{path} is not a record: {error}") from error
-        names = {f.name for f in fields(cls)}
+            raise ResultsError(f"{path} is not a record: {error}") from error
+        names = {f.name for f in fields(cls)} - {"path"}
         if not isinstance(values, dict) or values.pop("format", None) != FORMAT or values.keys() != names:
-            raise ValueError(f"{path} is not a record of format {FORMAT}")
-        return cls(**values)
+            raise ResultsError(f"{path} is not a record of format {FORMAT}")
+        record = cls(**values, path=path)
+        try:
+            _ = record.row
+        except ValueError as error:
+            raise ResultsError(f"{path}: {error}") from error
+        return record

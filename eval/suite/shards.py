@@ -97,7 +97,8 @@ def evaluate_suite(
                         report(line)
                 finished = True
     complete = all(folder.is_finished(item, job.suite.rows) for item in job.items)
-    return EvalOutcome(finished, stop(), complete, folder.failures(job.items))
+    failed, labels = folder.failures(), {(item.dataset, item.sequence): item.label for item in job.items}
+    return EvalOutcome(finished, stop(), complete, {labels[where]: failed[where] for where in labels.keys() & failed})
 
 
 def rank_of(environment: Mapping[str, str]) -> tuple[Shard, int]:
