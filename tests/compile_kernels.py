@@ -8,13 +8,13 @@ from pathlib import Path
 
 import torch
 
-from ufmstar_torch import AnchorConfig, MergeConfig, PosteriorConfig, UfMStar, UfMStarConfig, kernels
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig, kernels
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.eval.engine.warm_up import dense_anchors
 from ufmstar_torch.kernels.select import compile_triangulation
 
 NEAR = UfMStarConfig(backend="numba", regression="neighbourhood")
-EXACT = UfMStarConfig(backend="numba", merge=MergeConfig(every=1))
+EXACT = UfMStarConfig(backend="numba")
 
 
 def two_frames(config: UfMStarConfig, dtype: torch.dtype) -> None:

@@ -8,7 +8,7 @@ from ufmstar_torch.anchors.extension import AnchorExtension
 from ufmstar_torch.confidence import ConfidenceExtension
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension, Extensions
-from ufmstar_torch.kernels.select import select_anchors, select_merge, select_posterior
+from ufmstar_torch.kernels.select import select_anchors, select_posterior
 from ufmstar_torch.merge import MergeExtension
 from ufmstar_torch.posterior.extension import PosteriorExtension
 
@@ -27,5 +27,5 @@ def extensions_of(config: UfMStarConfig, further: Sequence[Extension] = ()) -> E
     if config.posterior is not None:
         each.append(PosteriorExtension(config, select_posterior))
     if config.merge is not None:
-        each.append(MergeExtension(config, select_merge))
+        each.append(MergeExtension(config))
     return Extensions([*each, *further], config)

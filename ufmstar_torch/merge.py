@@ -28,8 +28,9 @@ their shares at these points. Their means and covariances stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -38,7 +39,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension, FrameExtension, Total
 from ufmstar_torch.fixed_order import total
 from ufmstar_torch.frame import FrameInput
-from ufmstar_torch.gaussian import cholesky3, floor_covariance, storage_floor
+from ufmstar_torch.gaussian import cholesky3, floor_covariance, inverse_lower3, storage_floor
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import StepOutput
 from ufmstar_torch.regress import shares
@@ -49,37 +50,24 @@ _CHUNK = 2**19
 # Cubature points mu +- sqrt(3) L e_i: their mean and covariance are the component's.
 _POINTS = 6
 _REACH = 3**0.5
-
-
-@dataclass(frozen=True)
-class MergeKernels:
-    """The parts of :func:`merge` that look at pairs of components; both take a float64 mixture.
-
-    Attributes:
-        partition: see :func:`partition`.
-        own_shares: see :func:`own_shares`.
-    """
-
-    partition: Callable[[GaussianMixture, float], Tensor]
-    own_shares: Callable[[GaussianMixture, UfMStarConfig], Tensor]
+# A component's density at a point is left out below this share of the point's own density: K of them change a share
+# by less than K times this.
+_LEAST_SHARE = 1e-9
+# The components of one stream: the fields of its mixture and "sums" [n, C], in float64.
+Components = dict[str, Tensor]
 
 
 class MergeExtension(Extension):
-    """Merging every some frames.
+    """Merging every some frames. ``config``: with ``merge``."""
 
-    Args:
-        config: with ``merge``.
-        kernels: makes the kernels for a backend and a device's type.
-    """
-
-    def __init__(self, config: UfMStarConfig, kernels: Callable[[str, str], MergeKernels]) -> None:
-        self._config, self._kernels = config, kernels
+    def __init__(self, config: UfMStarConfig) -> None:
+        self._config = config
 
     def of_frame(
         self, frame: FrameInput, own: Sequence[Tensor], given: object, before: Sequence[FrameExtension], *, dense: bool
     ) -> FrameExtension:
         """Merging after this frame."""
-        return _MergeFrame(frame, self._config, self._kernels(self._config.backend, frame.depth.device.type))
+        return _MergeFrame(frame, self._config)
 
 
 class _MergeFrame(FrameExtension):
@@ -87,24 +75,23 @@ class _MergeFrame(FrameExtension):
 
     changes_mixture = True
 
-    def __init__(self, frame: FrameInput, config: UfMStarConfig, kernels: MergeKernels) -> None:
-        self._frame, self._config, self._kernels = frame, config, kernels
+    def __init__(self, frame: FrameInput, config: UfMStarConfig) -> None:
+        self._frame, self._config = frame, config
 
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
         """Merge the streams that are due, and count the components."""
-        state = merged(state, self._frame.fault == 0, self._config, self._kernels)
+        state = merged(state, self._frame.fault == 0, self._config)
         counts = {"components": state.mixture.components, "single_view": (state.count == 1).sum(1)}
         return state, replace(out, statistics=replace(out.statistics, **counts))
 
 
-def merged(state: UfMStarState, fine: Tensor, config: UfMStarConfig, kernels: MergeKernels) -> UfMStarState:
+def merged(state: UfMStarState, fine: Tensor, config: UfMStarConfig) -> UfMStarState:
     """The state after a frame, merged every ``merge.every`` frames of a stream.
 
     Args:
         state: of B streams, after the step.
         fine: [B] True where the frame was used.
         config: with ``merge``. Checking which streams are due waits for an accelerator.
-        kernels: which implementation of each part.
     """
     assert config.merge is not None
     if state.mean.device.type == "meta":
@@ -113,14 +100,12 @@ def merged(state: UfMStarState, fine: Tensor, config: UfMStarConfig, kernels: Me
     if not bool(due.any()):
         return state
     sums = torch.cat([state.mean.new_zeros(*state.weight.shape, 0), *state.by_component.values()], -1)
-    mixture, sums = merge(state.mixture, sums, due, config, kernels)
+    mixture, sums = merge(state.mixture, sums, due, config)
     parts = sums.split([value.shape[-1] for value in state.by_component.values()], -1) if state.by_component else ()
     return state.with_tensors(mixture.tensors() | dict(zip(state.by_component, parts, strict=True)))
 
 
-def merge(
-    mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarConfig, kernels: MergeKernels
-) -> tuple[GaussianMixture, Tensor]:
+def merge(mixture: GaussianMixture, sums: Tensor, due: Tensor, config: UfMStarConfig) -> tuple[GaussianMixture, Tensor]:
     """Join, then dissolve; the components that are left move up and keep their order.
 
     Args:
@@ -128,102 +113,116 @@ def merge(
         sums: [B, K, C] of observations beside it.
         due: [B] the streams to merge; the others stay as they are.
         config: ``merge``, which is not None, and ``prior_weight``.
-        kernels: which implementation of each part.
 
     Returns:
         The mixture [B, K] and the sums. What neither joined nor received anything is unchanged to the last bit.
     """
     assert config.merge is not None
-    before = mixture.to(torch.float64)
-    joined, moved, changed = _joined(before, sums.double(), kernels.partition(before, config.merge.loss))
-    floored = floor_covariance(joined.covariance, storage_floor(joined.covariance, mixture.covariance.dtype))
-    joined = joined.replace(covariance=torch.where(changed[..., None, None], floored, joined.covariance))
-    fewer, moved, received = _dissolved(joined, moved, kernels.own_shares(joined, config), config)
-    changed = (changed | received | ~fewer.valid) & due[:, None]
-
-    after, old = fewer.tensors() | {"sums": moved}, mixture.tensors() | {"sums": sums}
-    kept = {name: _where(changed, value.to(old[name].dtype), old[name]) for name, value in after.items()}
-    order = (kept["weight"] <= 0).to(torch.uint8).argsort(dim=1, stable=True)
-    packed = {name: torch.gather(v, 1, _as_index(order, v)) for name, v in kept.items()}
-    sums = packed.pop("sums")
-    return GaussianMixture(**packed), sums
+    every = mixture.tensors() | {"sums": sums}
+    after = {name: value.clone() for name, value in every.items()}
+    for b in due.nonzero().flatten().tolist():
+        n = int(mixture.components[b])
+        before = {name: v[b, :n].double() if v.is_floating_point() else v[b, :n] for name, v in every.items()}
+        left = dissolve(join(before, config.merge.loss, mixture.covariance.dtype), config)
+        for name, value in left.items():
+            after[name][b] = 0
+            after[name][b, : len(value)] = value.to(after[name].dtype)
+    sums = after.pop("sums")
+    return GaussianMixture(**after), sums
 
 
-def partition(mixture: GaussianMixture, limit: float) -> Tensor:
-    """[B, K] int64, the slot that each component joins, its own where it stays; the lower slot of a pair stays.
+def join(g: Components, limit: float, stored: torch.dtype) -> Components:
+    """Join those who are each other's best, in rounds, until no pair is within the limit; the former of a pair stays.
 
     Args:
-        mixture: [B, K] float64.
+        g: n components.
         limit: largest loss l of a pair [nat].
+        stored: dtype whose rounding the joint covariances must survive.
     """
-    slot = torch.arange(mixture.capacity, device=mixture.mean.device).expand(mixture.weight.shape)
-    into = slot.clone()
-    compared = mixture.count > 1
+    n = len(g["weight"])
+    fresh = torch.ones(n, dtype=torch.bool, device=g["weight"].device)
+    joined, pairs, loss = ~fresh, torch.zeros(2, 0, dtype=torch.int64, device=fresh.device), g["weight"][:0]
     while True:
-        best, partner = _best(mixture, compared)
-        mutual = (best <= limit) & (torch.gather(partner, 1, partner) == slot)
+        found = _close_pairs(g, fresh, limit)
+        pairs, loss = torch.cat([pairs, found[0]], 1), torch.cat([loss, found[1]])
+        mutual = _mutual(pairs, loss, len(fresh))
         if not bool(mutual.any()):
-            return into
-        stays, goes = mutual & (slot < partner), mutual & (slot > partner)
-        redirect = torch.where(goes, partner, slot)
-        into = torch.gather(redirect, 1, into)
-
-        def of_partner(value: Tensor, partner: Tensor = partner) -> Tensor:
-            return torch.gather(value, 1, _as_index(partner, value))
-
-        weight, mean, covariance = mixture.weight, mixture.mean, mixture.covariance
-        moments = _joint(
-            *(weight, of_partner(weight)), *(mean, of_partner(mean)), *(covariance, of_partner(covariance))
-        )
-        new = {"weight": weight + of_partner(weight), "mean": moments[0], "covariance": moments[1]}
-        old = mixture.tensors()
-        mixture = mixture.replace(
-            **{n: _where(goes, torch.zeros_like(v), _where(stays, v, old[n])) for n, v in new.items()}
-        )
-        compared = compared | (stays & of_partner(compared))
+            break
+        stays, goes = pairs[:, mutual]
+        first, second = ({name: value[which] for name, value in g.items()} for which in (stays, goes))
+        common = _joint(first, second)
+        fresh = torch.zeros_like(fresh).index_fill(0, stays, True)
+        left = torch.ones_like(fresh).index_fill(0, goes, False)
+        g = {name: value.index_copy(0, stays, common[name])[left] for name, value in g.items()}
+        same = (left & ~fresh)[pairs].all(0)
+        pairs, loss = (left.cumsum(0) - 1)[pairs[:, same]], loss[same]
+        joined, fresh = (joined | fresh)[left], fresh[left]
+    covariance = g["covariance"][joined]
+    floored = floor_covariance(covariance, storage_floor(covariance, stored))
+    return g | {"covariance": g["covariance"].index_copy(0, joined.nonzero().flatten(), floored)}
 
 
-def _best(mixture: GaussianMixture, compared: Tensor) -> tuple[Tensor, Tensor]:
-    """For each component, the least loss [B, K], infinite without a partner, and the first partner with it [B, K]."""
-    k = mixture.capacity
-    rows = max(1, _CHUNK // max(1, mixture.streams * k))
-    eye = torch.eye(3, dtype=torch.float64, device=mixture.mean.device)
-    covariance = torch.where(mixture.valid[..., None, None], mixture.covariance, eye)
-    weight = torch.where(mixture.valid, mixture.weight, torch.ones_like(mixture.weight))
-    log_det = _log_det(covariance)
-    result = []
-    for first in range(0, k, rows):
-        i, j = (slice(None), slice(first, first + rows), None), (slice(None), None)
-        _, S = _joint(weight[i], weight[j], mixture.mean[i], mixture.mean[j], covariance[i], covariance[j])
-        a, b = _parts(weight[i], weight[j])
-        loss = 0.5 * (_log_det(S) - a * log_det[i] - b * log_det[j]) / torch.minimum(a, b)
-        lighter, heavier = (
-            torch.where(weight[i] < weight[j], compared[i], compared[j]),
-            torch.where(weight[i] < weight[j], compared[j], compared[i]),
-        )
-        fits = mixture.valid[i] & mixture.valid[j] & ~(lighter & ~heavier)
-        own = torch.arange(k, device=loss.device)
-        fits &= own[first : first + rows, None] != own
-        result.append(torch.where(fits, loss, torch.inf).min(dim=2, keepdim=False))
-    values = torch.cat([f.values for f in result], 1)
-    return values, torch.cat([f.indices for f in result], 1)
+def _close_pairs(g: Components, fresh: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+    """Pairs i < j [2, P] within the limit of which one is ``fresh`` [n], and their losses [P].
+
+    log|Sigma| >= a log|Sigma_i| + b log|Sigma_j| + log(1 + a b q) with q >= d_x^2 / (a Sigma_i + b Sigma_j)_xx for
+    every axis, so l > limit where q > (exp(2 min(a, b) limit) - 1) / (a b), which is at most 4 (exp(limit) - 1).
+    """
+    slot = torch.arange(len(fresh), device=fresh.device)
+    reach, weight, mean = 4 * math.expm1(limit) * (1 + 1e-9), g["weight"], g["mean"]
+    spread, log_det = torch.diagonal(g["covariance"], dim1=-2, dim2=-1), _log_det(g["covariance"])
+    found = [(slot[:0].expand(2, 0), weight[:0])]
+    for i in slot[fresh].split(max(1, _CHUNK // max(1, len(fresh)))):
+        close = ~fresh | (slot > i[:, None])  # once, if both are
+        share = weight[i, None] / (weight[i, None] + weight)
+        for axis in range(3):
+            variance = share * spread[i, None, axis] + (1 - share) * spread[:, axis]
+            close &= (mean[i, None, axis] - mean[:, axis]).square() <= reach * variance
+        place, j = close.nonzero().unbind(1)
+        pair = torch.stack([torch.minimum(i[place], j), torch.maximum(i[place], j)])
+        first, second = ({name: value[which] for name, value in g.items()} for which in pair)
+        a, b = _parts(first, second)
+        volume = _log_det(_joint(first, second)["covariance"]) - a * log_det[pair[0]] - b * log_det[pair[1]]
+        loss = 0.5 * volume / torch.minimum(a, b)
+        lighter_first = first["weight"] < second["weight"]
+        lighter = torch.where(lighter_first, first["count"], second["count"])
+        heavier = torch.where(lighter_first, second["count"], first["count"])
+        within = (loss <= limit) & ~((lighter > 1) & (heavier == 1))
+        found.append((pair[:, within], loss[within]))
+    return torch.cat([pair for pair, _ in found], 1), torch.cat([loss for _, loss in found])
 
 
-def _parts(weight_a: Tensor, weight_b: Tensor) -> tuple[Tensor, Tensor]:
+def _mutual(pairs: Tensor, loss: Tensor, n: int) -> Tensor:
+    """[P] True where the two of a pair are each other's best: the least loss, and of equal ones the first partner."""
+    ends, others, twice = pairs.flatten(), pairs.flip(0).flatten(), loss.repeat(2)
+    best = loss.new_full((n,), torch.inf).scatter_reduce(0, ends, twice, "amin")
+    others = torch.where(twice == best[ends], others, n)
+    partner = torch.full((n,), n, device=ends.device).scatter_reduce(0, ends, others, "amin")
+    return (partner[pairs[0]] == pairs[1]) & (partner[pairs[1]] == pairs[0])
+
+
+def _parts(g: Components, h: Components) -> tuple[Tensor, Tensor]:
     """a and 1 - a."""
-    both = weight_a + weight_b
-    return weight_a / both, weight_b / both
+    both = g["weight"] + h["weight"]
+    return g["weight"] / both, h["weight"] / both
 
 
-def _joint(
-    weight_a: Tensor, weight_b: Tensor, mean_a: Tensor, mean_b: Tensor, cov_a: Tensor, cov_b: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Common mean and covariance of pairs; garbage, but no error, where both weights are 0."""
-    a, b = _parts(weight_a, weight_b)
-    d = mean_a - mean_b
-    between = (a * b)[..., None, None] * d[..., :, None] * d[..., None, :]
-    covariance = a[..., None, None] * cov_a + b[..., None, None] * cov_b + between
-    return a[..., None] * mean_a + b[..., None] * mean_b, covariance
+def _joint(g: Components, h: Components) -> Components:
+    """The components with the common moments of pairs."""
+    a, b = _parts(g, h)
+
+    def average(name: str) -> Tensor:
+        shape = (-1, *[1] * (g[name].dim() - 1))
+        return a.view(shape) * g[name] + b.view(shape) * h[name]
+
+    d = g["mean"] - h["mean"]
+    between = (a * b)[:, None, None] * d[:, :, None] * d[:, None, :]
+    return {name: average(name) for name in ("mean", "disagreement", "features")} | {
+        "covariance": average("covariance") + between,
+        "weight": g["weight"] + h["weight"],
+        "count": g["count"] + h["count"] - 1,
+        "sums": g["sums"] + h["sums"],
+    }
 
 
 def _log_det(S: Tensor) -> Tensor:
@@ -236,131 +235,62 @@ def _log_det(S: Tensor) -> Tensor:
     return torch.log(p0 * p1 * p2)
 
 
-def _joined(mixture: GaussianMixture, sums: Tensor, into: Tensor) -> tuple[GaussianMixture, Tensor, Tensor]:
-    """The mixture with the parts of a partition joined, empty where a component has gone; and which slots changed."""
-    w = mixture.weight[..., None]
-    add = _Sums(into, mixture.valid)
-    weight = add(w)
-    safe = torch.where(weight > 0, weight, torch.ones_like(weight))
-    mean = add(w * mixture.mean) / safe
-    offset = mixture.mean - torch.gather(mean, 1, _as_index(into, mean))
-    spread = mixture.covariance + offset[..., :, None] * offset[..., None, :]
-    new = GaussianMixture(
-        mean=mean,
-        covariance=(add(w * spread.flatten(2)) / safe).unflatten(-1, (3, 3)),
-        weight=weight[..., 0],
-        disagreement=(add(w * mixture.disagreement[..., None]) / safe)[..., 0],
-        count=add((mixture.count - 1)[..., None])[..., 0] + (weight[..., 0] > 0),
-        features=add(w * mixture.features) / safe,
-    )
-    joined = add.parts > 1
-    old, gone = mixture.tensors(), mixture.valid & (weight[..., 0] <= 0)
-    kept = {n: _where(joined | gone, v, old[n]) for n, v in new.tensors().items()}
-    return GaussianMixture(**kept), _where(joined | gone, add(sums), sums), joined
+def own_shares(g: Components, prior_weight: float) -> Tensor:
+    """[n] s_k, each component's share in explaining its own cubature points, with the exact sum over the components."""
+    mean, points, whitening = g["mean"], _cubature(g), inverse_lower3(cholesky3(g["covariance"]))
+    sigma = torch.diagonal(g["covariance"], dim1=-2, dim2=-1).sqrt()
+    log_peak = torch.diagonal(whitening, dim1=-2, dim2=-1).log().sum(-1) - 1.5 * math.log(2 * math.pi)
+    log_peak = log_peak + g["weight"].log()
+    evidence = mean.new_full((len(mean), _POINTS), prior_weight)
+    for i in torch.arange(len(mean), device=mean.device).split(max(1, _CHUNK // max(1, len(mean)))):
+        # The own density is peak exp(-3/2) at all six points; the radius [1] at which another falls below its share.
+        radius = (2 * (log_peak - log_peak[i, None] + 1.5 - math.log(_LEAST_SHARE))).clamp_min(0).sqrt()
+        near = torch.ones_like(radius, dtype=torch.bool)
+        for axis in range(3):
+            gap = (mean[i, None, axis] - mean[:, axis]).abs()
+            near &= gap <= _REACH * sigma[i, None, axis] + radius * sigma[:, axis]
+        place, k = near.nonzero().unbind(1)
+        squared = ((points[i[place]] - mean[k, None]) @ whitening[k].mT).square().sum(-1)
+        evidence.index_add_(0, i[place], torch.exp(log_peak[k, None] - 0.5 * squared))
+    return (torch.exp(log_peak - 1.5)[:, None] / evidence).mean(1)
 
 
-class _Sums:
-    """Sums over the parts of a partition ``into`` [B, K] (:func:`partition`) of the slots that are ``valid`` [B, K],
-    always in the order of the slots. ``parts`` [B, K]: how many slots went into each."""
-
-    def __init__(self, into: Tensor, valid: Tensor) -> None:
-        k = into.shape[1]
-        target = torch.where(valid, into, torch.full_like(into, k))  # one slot more catches what does not count
-        ordered, order = target.sort(dim=1, stable=True)
-        first = torch.searchsorted(ordered, ordered)
-        rank = torch.arange(k, device=into.device) - first
-        self._target, self._rank = target, torch.zeros_like(into).scatter(1, order, rank)
-        self._rounds = int(torch.where(valid, self._rank, torch.zeros_like(into)).max()) + 1 if into.numel() else 0
-        self.parts = self(valid[..., None].long())[..., 0]
-
-    def __call__(self, value: Tensor) -> Tensor:
-        """[B, K, C] -> [B, K, C]."""
-        k = value.shape[1]
-        out = torch.zeros_like(value)
-        for position in range(self._rounds):
-            turn = torch.where(self._rank == position, self._target, torch.full_like(self._target, k))
-            placed = value.new_zeros(value.shape[0], k + 1, value.shape[2])
-            out = out + placed.scatter(1, _as_index(turn, value), value)[:, :k]
-        return out
+def _cubature(g: Components) -> Tensor:
+    """[n, 6, 3] mu + sqrt(3) L e_i for i = 0, 1, 2, then mu - sqrt(3) L e_i [m]."""
+    steps = _REACH * cholesky3(g["covariance"]).mT
+    return g["mean"][:, None] + torch.cat([steps, -steps], dim=1)
 
 
-def own_shares(mixture: GaussianMixture, config: UfMStarConfig) -> Tensor:
-    """[B, K] s_k, each component's share in explaining its own cubature points; 0 for empty slots.
-
-    Args:
-        mixture: [B, K] float64.
-        config: ``prior_weight``; the sum is the exact one whatever ``regression`` is.
-    """
-    k = mixture.capacity
-    rows = max(1, _CHUNK // max(1, mixture.streams * k * _POINTS))
-    points = _cubature(mixture)
-    result = []
-    for first in range(0, k, rows):
-        share = _mean_shares(mixture, points[:, first : first + rows], config)
-        own = torch.arange(first, first + share.shape[1], device=share.device)
-        result.append(torch.gather(share, 2, own.expand(share.shape[:2])[..., None])[..., 0])
-    return torch.where(mixture.valid, torch.cat(result, 1), 0.0)
+def _mean_shares(g: Components, points: Tensor, config: UfMStarConfig) -> Tensor:
+    """[P, n] shares of all components at points [P, 6, 3], their mean over the six."""
+    mixture = GaussianMixture(**{name: value[None] for name, value in g.items() if name != "sums"})
+    exact, parts = config.replace(regression="exact"), points.split(max(1, _CHUNK // (_POINTS * mixture.capacity)))
+    share = torch.cat([shares(mixture, part.flatten(0, 1)[None], exact)[0] for part in parts])
+    return total(share.unflatten(0, (-1, _POINTS)), 1) / _POINTS
 
 
-def _cubature(mixture: GaussianMixture) -> Tensor:
-    """[B, K, 6, 3] mu + sqrt(3) L e_i for i = 0, 1, 2, then mu - sqrt(3) L e_i [m]."""
-    steps = _REACH * cholesky3(mixture.covariance).mT
-    return mixture.mean[:, :, None] + torch.cat([steps, -steps], dim=2)
-
-
-def _mean_shares(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> Tensor:
-    """[B, n, K] shares of all components at points [B, n, 6, 3], their mean over the six."""
-    share = shares(mixture, points.flatten(1, 2), config.replace(regression="exact"))
-    return total(share.unflatten(1, (-1, _POINTS)), 2) / _POINTS
-
-
-def _dissolved(
-    mixture: GaussianMixture, sums: Tensor, own: Tensor, config: UfMStarConfig
-) -> tuple[GaussianMixture, Tensor, Tensor]:
-    """The mixture and the sums without the components that others explain, and which slots received something."""
+def dissolve(g: Components, config: UfMStarConfig) -> Components:
+    """The components without those that others explain."""
     assert config.merge is not None
-    weak = mixture.valid & (own < config.merge.share)
-    number = int(weak.sum(1).max()) if weak.numel() else 0
-    if not number:
-        return mixture, sums, torch.zeros_like(weak)
-    slot = (~weak).to(torch.uint8).argsort(dim=1, stable=True)[:, :number]
+    weak = own_shares(g, config.prior_weight) < config.merge.share
+    if not bool(weak.any()):
+        return g
+    share = _mean_shares(g, _cubature(g)[weak], config) * ~weak
+    rest = total(share, 1)
+    enough = rest >= 1 - config.merge.share
+    given = share[enough] / rest[enough, None]
+    goes = weak.nonzero().flatten()[enough]
 
-    def of_weak(value: Tensor) -> Tensor:
-        return torch.gather(value, 1, _as_index(slot, value))
-
-    stays = mixture.valid & ~weak
-    points = of_weak(_cubature(mixture))
-    rows = max(1, _CHUNK // max(1, mixture.streams * mixture.capacity * _POINTS))
-    share = torch.cat([_mean_shares(mixture, x, config) for x in points.split(rows, dim=1)], 1)
-    share = torch.where(stays[:, None], share, 0.0)
-    rest = total(share, 2)
-    goes = of_weak(weak) & (rest >= 1 - config.merge.share)
-    given = torch.where(goes[..., None], share / torch.where(goes, rest, torch.ones_like(rest))[..., None], 0.0)
-
-    values = torch.cat([mixture.disagreement[..., None], mixture.features], -1)
-    w = mixture.weight[..., None]
-    gifts = of_weak(torch.cat([w, w * values, sums], -1))
-    gain = torch.stack([total(given * gift[..., None], 1) for gift in gifts.unbind(-1)], -1)
-    weight, more, learnt = gain.split([1, values.shape[2], sums.shape[2]], -1)
-    received = weight[..., 0] > 0
-    values = torch.where(
-        received[..., None], (w * values + more) / torch.where(received[..., None], w + weight, 1), values
-    )
-    gone = torch.zeros_like(weak).scatter(1, slot, goes)
-    after = mixture.replace(
-        weight=mixture.weight + weight[..., 0], disagreement=values[..., 0], features=values[..., 1:]
-    )
-    left = {name: _where(gone, torch.zeros_like(value), value) for name, value in after.tensors().items()}
-    return GaussianMixture(**left), _where(gone, torch.zeros_like(sums), sums + learnt), received
-
-
-def _as_index(index: Tensor, value: Tensor) -> Tensor:
-    """An index [B, n] for ``gather`` and ``scatter`` on [B, K, ...]."""
-    return index.view(*index.shape, *[1] * (value.dim() - 2)).expand(*index.shape, *value.shape[2:])
-
-
-def _where(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    return torch.where(mask.view(*mask.shape, *[1] * (old.dim() - 2)), new, old)
-
-
-REFERENCE = MergeKernels(partition, own_shares)
+    w, values = g["weight"][:, None], torch.cat([g["disagreement"][:, None], g["features"]], -1)
+    gifts = torch.cat([w, w * values, g["sums"]], -1)[goes]
+    gain = torch.stack([total(given * gift[:, None], 0) for gift in gifts.unbind(-1)], -1)
+    weight, more, learnt = gain.split([1, values.shape[1], g["sums"].shape[1]], -1)
+    values = torch.where(weight > 0, (w * values + more) / (w + weight), values)
+    after = g | {
+        "weight": g["weight"] + weight[:, 0],
+        "disagreement": values[:, 0],
+        "features": values[:, 1:],
+        "sums": g["sums"] + learnt,
+    }
+    left = torch.ones_like(weak).index_fill(0, goes, False)
+    return {name: value[left] for name, value in after.items()}

@@ -14,8 +14,6 @@ from ufmstar_torch.anchors.extension import REFERENCE as ANCHOR_REFERENCE
 from ufmstar_torch.anchors.extension import AnchorKernels
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import CheckKernel, check_values
-from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
-from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.posterior.update import PosteriorUpdate
 from ufmstar_torch.posterior.update import update as update_posterior
@@ -83,15 +81,6 @@ def select_anchors(name: str, device_type: str) -> AnchorKernels:
 
         return AnchorKernels(fast.inliers, fast.learn_in_view)
     return ANCHOR_REFERENCE
-
-
-def select_merge(name: str, device_type: str) -> MergeKernels:
-    """The parts of merging; arguments and errors as :func:`select_step`."""
-    if _compiled(name, device_type):
-        from ufmstar_torch.kernels import merge_cpu
-
-        return MergeKernels(merge_cpu.partition, merge_cpu.own_shares)
-    return MERGE_REFERENCE
 
 
 def select_kernels(name: str, device_type: str) -> Kernels:
