@@ -65,3 +65,22 @@ def test_an_expected_position_extends_the_search_and_a_wrong_one_is_dropped(righ
     assert fine.mean() > 0.75
     assert fine.mean() > without.mean() + gain
     assert np.median(np.abs(found[fine] - went[fine])) < 0.1
+
+
+@pytest.mark.parametrize("gain", [0.6, 0.9, 1.0, 1.4])
+@pytest.mark.parametrize("right", [2, 8])
+def test_corners_are_followed_into_an_image_of_another_exposure(gain, right):
+    before = (textured(240, 320) * 0.6).astype(np.uint8)
+    after = np.clip(np.roll(before, right, axis=1) * gain, 0, 255).astype(np.uint8)
+    start = find(before, 100, 10.0, np.zeros((0, 2)))
+    start = start[(start[:, 0] > 20) & (start[:, 0] < 280)]
+    position, fine = follow(before, after, start, 0.5)
+    assert fine.mean() > 0.9
+    np.testing.assert_allclose(position[fine], start[fine] + [right, 0], atol=0.3)
+
+
+def test_a_black_image_shows_no_corner():
+    image = textured(120, 160)
+    start = find(image, 50, 8.0, np.zeros((0, 2)))
+    for black in ((image, image * 0), (image * 0, image)):
+        assert not follow(*black, start, 0.5)[1].any()

@@ -27,6 +27,11 @@ _HALVED_FROM = 480
 # hundredth of the strongest one's eigenvalue.
 _HARRIS, _WEAKEST = 0.04, 1e-4
 
+# Logarithm of the ratio of brightness from which images are made alike, in at most so many rounds; share of the corners
+# that must be followed for the ratio to be measured at them; windows of which the means count [px], and which means
+# [gray levels].
+_BRIGHTER, _ROUNDS, _SHARE, _AROUND, _COUNTED = 0.03, 3, 0.15, (17, 17), (8, 240)
+
 
 def follow(
     before: NDArray[np.uint8],
@@ -35,7 +40,8 @@ def follow(
     back_tolerance: float,
     expected: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Follow corners of one gray image into the next, and check that following them back returns to the start.
+    """Follow corners of one gray image into the next, and check that following them back returns to the start. Where
+    the second image is brighter or darker, the first one is made alike.
 
     Args:
         before, after: [H, W] gray.
@@ -47,12 +53,53 @@ def follow(
     Returns:
         Positions [N, 2] in ``after`` [px], and which are reliable [N]: found both ways and inside the image.
     """
+    found, fine = _followed(before, after, position, back_tolerance, expected)
+    gain = 1.0
+    for _ in range(_ROUNDS):
+        few = np.count_nonzero(fine) < _SHARE * len(fine)
+        now = _ratio(before, after) if few else _ratio_at(before, after, position[fine], found[fine])
+        if abs(np.log(now / gain)) <= _BRIGHTER:
+            break
+        gain = now
+        alike = np.clip(before * gain, 0, 255).astype(np.uint8)
+        again, better = _followed(alike, after, position, back_tolerance, expected)
+        if np.count_nonzero(better) <= np.count_nonzero(fine):
+            break
+        found, fine = again, better
+    return found, fine
+
+
+def _ratio(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
+    """By how much brighter the second image is, from all of both: a guess where they show different things."""
+    return float(max(np.median(after), 1) / max(np.median(before), 1))
+
+
+def _ratio_at(
+    before: NDArray[np.uint8], after: NDArray[np.uint8], position: NDArray[np.float64], found: NDArray[np.float64]
+) -> float:
+    """The same, the median over corners that were followed."""
+    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
+
+    means = []
+    for image, corners in ((before, position), (after, found)):
+        u, v = np.rint(corners).astype(np.int64).T
+        means.append(cv2.blur(image, _AROUND)[v, u].astype(np.float64))
+    one, other = means
+    counted = (np.minimum(one, other) > _COUNTED[0]) & (np.maximum(one, other) < _COUNTED[1])
+    return float(np.median(other[counted] / one[counted])) if counted.any() else 1.0
+
+
+def _followed(
+    before: NDArray[np.uint8], after: NDArray[np.uint8], position: NDArray[np.float64], back_tolerance: float,
+    expected: NDArray[np.float64] | None,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
+    """As :func:`follow`, of images that are alike bright."""
     if expected is None:
         return _there_and_back(before, after, position, position, _LEVELS, back_tolerance)
     found, fine = _there_and_back(before, after, position, expected, _EXPECTED_LEVELS, back_tolerance)
     if 2 * np.count_nonzero(fine) < len(fine):
         lost = ~fine
-        found[lost], fine[lost] = follow(before, after, position[lost], back_tolerance)
+        found[lost], fine[lost] = _followed(before, after, position[lost], back_tolerance, None)
     return found, fine
 
 
