@@ -111,6 +111,23 @@ def test_poses_that_are_wrong_show_across_the_line(scene):
     assert 0.4 < np.nanmedian(np.abs(result.across[result.agreed > 0])) < 1.0
 
 
+def test_a_view_that_might_show_the_match_outside_of_it_is_no_first_one(scene):
+    """The camera has moved to the right: what lies at the right border had been outside of the view, or at another
+    place than where the best window of the rest is."""
+    image, _, _ = scene
+    moved = pose(-0.5)
+    given = views([plane(0, moved)], [moved], np.eye(4))
+    pixel = np.array([[u, 30.0] for u in range(12, 84, 4)])
+    found = measure(image, pixel, given, SEARCH).agreed > 0
+    far, near = pixel[:, 0], pixel[:, 0] + 90 * 0.5 * dense_cpu.WHOLE * SEARCH.start
+    whole = (np.minimum(far, near) >= 3.5) & (np.maximum(far, near) <= 95 - 3.5)
+    assert 0 < whole.sum() < len(whole)
+    assert not found[~whole].any()
+    assert found[whole].mean() > 0.5
+    also = views([plane(0, MOVED[0]), given.image[0]], [MOVED[0], moved], np.eye(4))
+    assert (measure(image, pixel, also, SEARCH).agreed[~whole] > 1).any(), "a depth that is known is looked up there"
+
+
 def test_no_contrast_no_depth():
     flat = np.full((72, 96), 90, np.uint8)
     pixel = np.array([[40.0, 30.0]])

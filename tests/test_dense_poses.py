@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors.dense_poses import PoseErrors
-from ufmstar_torch.kernels.anchor_check_cpu import check_anchors
+from ufmstar_torch.kernels.anchor_check_cpu import check_anchors, confirmed
 from ufmstar_torch.kernels.dense_cpu import Measured, Views
 from ufmstar_torch.kernels.poses_cpu import Shown, linearised, solved
 
@@ -97,7 +97,7 @@ def known(frames=1, seed=0, noise=0.05, **wrong):
         error[:, :6] = rng.normal(0, 1, (3, 6)) * np.repeat([wrong.get("turned", 0), wrong.get("moved", 0)], 3)
         found = measured(pixel, rho, views, error, noise, rng)
         errors.positions(K, 320, 2.0)
-        fit = errors.corrected(pixel, found, SHARES, views, K, 2.0)
+        fit = errors.corrected(pixel, found, found.agreed > 1, SHARES, views, K, 2.0)
     return errors, found, fit, rho
 
 
@@ -122,7 +122,8 @@ def test_what_remains_of_wrong_poses_is_stated_beyond_first_order():
         errors.positions(K, 320, 2.0)
         errors._variance[:], errors._left[:] = np.square([0.002, 0.008]), 0
         errors._covariance *= 1e-4
-        fit = errors.corrected(pixel, measured(pixel, rho, views, error, 0.02, rng), SHARES, views, K, 2.0)
+        found = measured(pixel, rho, views, error, 0.02, rng)
+        fit = errors.corrected(pixel, found, found.agreed > 1, SHARES, views, K, 2.0)
         sizes.append(np.abs(fit.rho - rho) / np.sqrt(fit.variance))
     assert 0.65 < np.median(sizes) / 0.674 < 1.3
     assert np.quantile(sizes, 0.9) / 1.645 < 1.5
@@ -139,7 +140,7 @@ def test_frames_that_contradict_their_poses_teach_nothing_of_the_camera():
     errors, found, *_ = known(3, camera=np.array([0.004, 1.0, -0.8, 0.0]))
     pixel, _, views = scene(5)
     before = errors.camera(K)
-    errors.corrected(pixel, found, SHARES, views, K, 2.0, trusted=False)
+    errors.corrected(pixel, found, found.agreed > 1, SHARES, views, K, 2.0, trusted=False)
     np.testing.assert_array_equal(errors.camera(K), before)
 
 
@@ -149,7 +150,7 @@ def test_nothing_measured_leaves_what_is_believed_of_the_poses():
     empty = Measured(*(np.full_like(x, np.nan) if x.dtype == float and x.ndim > 1 else np.zeros_like(x)
                        for x in vars(found).values()))  # fmt: skip
     before = errors.positions(K, 320, 2.0)
-    fit = errors.corrected(pixel, empty, SHARES, views, K, 2.0)
+    fit = errors.corrected(pixel, empty, empty.agreed > 1, SHARES, views, K, 2.0)
     assert np.isinf(fit.variance).all()
     np.testing.assert_allclose(errors.positions(K, 320, 2.0), before, rtol=1e-6)
 
@@ -185,3 +186,26 @@ def test_an_anchor_that_differs_from_those_around_it_is_as_uncertain_as_the_orac
     np.testing.assert_allclose(alone, oracle_dense.alone(pixel, rho, variance, 10), rtol=1e-12)
     assert alone[middle] > 0.5
     assert np.delete(alone, middle).max() < 0.1 * alone[middle]
+
+
+def test_matches_of_one_view_hold_where_the_oracle_finds_support():
+    rng, seen = np.random.default_rng(0), []
+    for _ in range(20):
+        _, pixel, _, _ = around(1.0, 1.0)
+        n = len(pixel)
+        surface = np.where(pixel[:, 0] + pixel[:, 1] > rng.uniform(40, 200), 1.0, 0.5)
+        rho = np.where(rng.random(n) < 0.03, rng.uniform(0.2, 2, n), surface * rng.normal(1, 0.02, n))
+        variance = np.square(rho * rng.choice([0.01, 0.05, 0.3], n, p=[0.5, 0.48, 0.02]))
+        agreed, contradicted = rng.choice([0, 1, 1, 2, 3], n), rng.choice([0, 0, 0, 0, 1], n)
+        each = np.full((n, 3), np.nan)
+        result = confirmed(pixel, Measured(rho, variance, agreed, contradicted, *[each] * 7), 10)
+        expected = oracle_dense.confirmed(pixel, rho, variance, agreed, contradicted, 10)
+        np.testing.assert_array_equal(result, expected)
+        seen.append([np.mean(result[agreed == 1]), np.mean(~result[(agreed == 1) & (contradicted == 0)])])
+    assert np.mean(seen, 0).min() > 0.1, "some hold and some do not"
+
+
+def test_nothing_is_confirmed_where_nothing_was_measured():
+    none = np.zeros(0)
+    empty = Measured(none, none, none.astype(int), none.astype(int), *[np.zeros((0, 3))] * 7)
+    assert len(confirmed(np.zeros((0, 2)), empty, 10)) == 0

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 _BASELINES = (0.04, 0.1, 0.22, 0.45)
 # Range of the first search of inverse depth, over 1/median depth.
 _NEAREST, _FARTHEST = 6.0, -0.03
-# Views that must agree; anchors on which running estimates of noise are based.
-_AGREE, _ENOUGH = 2, 10
+# Anchors on which running estimates of noise are based.
+_ENOUGH = 10
 # Frames in a row that contradict their poses, after which keyframes and landmarks are forgotten: the poses have jumped.
 _JUMPED = 3
 # Standard deviation of an inverse depth, as a share, by what no image shows: the scale of the poses.
@@ -63,8 +63,8 @@ class DenseConfig(Checked):
         rival: a match is unique where the best other one has this many times its 1 - ZNCC at least.
         sigmas: standard deviations by which measurements may differ, and half width of the search in them.
         match_noise: variance of a match, over that which its residual would make of independent pixels.
-        min_share: least share of the pixels with a match on which the views agree. Where fewer do, poses and images
-            contradict each other, and none is used.
+        min_share: least share of the pixels with two matches or more on which all of them agree. Where fewer do, poses
+            and images contradict each other, and none is used.
         memory: share of the running estimates that remains after a frame.
 
     Raises:
@@ -171,6 +171,8 @@ class DenseEvidence(SavedState):
         small, scale = _reduced(gray, self.config.width)
         corners = self._tracker.update(small, T, scale @ K)
         T, (number, poses) = self._tracker.pose, self._tracker.refined
+        if self._memory.empty:
+            self._depth = self._tracker.depth
         self._keyframes.correct(number, poses)
         if self._tracker.jumped:
             self._forget()
@@ -191,7 +193,8 @@ class DenseEvidence(SavedState):
     ) -> Landmarks:
         """The depths of a reduced image: landmarks that it shows, measured again where the camera has moved, new ones
         in the cells between them, and corners where none is. The running estimates follow."""
-        from ufmstar_torch.kernels.anchor_check_cpu import check_anchors  # kernels compile when they are first needed
+        # Kernels compile when they are first needed.
+        from ufmstar_torch.kernels.anchor_check_cpu import check_anchors, confirmed
         from ufmstar_torch.kernels.dense_cpu import measure
 
         cell, K = _cell(small.shape[1]), self._errors.camera(K)
@@ -201,17 +204,17 @@ class DenseEvidence(SavedState):
         rho, variance = np.zeros(len(pixel)), np.ones(len(pixel))
         agreed, trusted = np.zeros(len(pixel), dtype=np.bool_), not corners.contradicted
         chosen = self._keyframes.choose(T, K, self._depth, _BASELINES)
-        if len(chosen) >= _AGREE and trusted:
+        if chosen and trusted:
             expected = np.concatenate([np.flatnonzero(sighted.due), np.arange(known, len(pixel))])
             shares = np.array([share for share, _ in chosen])
             noise = self._errors.positions(K, small.shape[1], self._depth)[shares]
             views = self._views([keyframe for _, keyframe in chosen], noise, T, K)
             self._baseline = float(np.linalg.norm(np.linalg.inv(K) @ views.b[-1]))
             actual = measure(small, pixel[expected], views, self._search())
-            agreed[expected] = (actual.agreed >= _AGREE) & (actual.contradicted == 0)
-            matched = int((actual.agreed > 0).sum())
-            trusted &= matched < _ENOUGH or bool(agreed.sum() >= self.config.min_share * matched)
-            fit = self._errors.corrected(pixel[expected], actual, shares, views, K, self._depth, trusted)
+            agreed[expected] = accepted = confirmed(pixel[expected], actual, cell)
+            alike = accepted[actual.agreed + actual.contradicted > 1]
+            trusted &= len(alike) < _ENOUGH or bool(alike.mean() >= self.config.min_share)
+            fit = self._errors.corrected(pixel[expected], actual, accepted, shares, views, K, self._depth, trusted)
             searched = len(expected)
             rho[expected], variance[expected] = fit.rho, fit.variance + np.square(_SCALE * fit.rho)
         self._contradicted = 0 if trusted else self._contradicted + 1
@@ -245,6 +248,7 @@ class DenseEvidence(SavedState):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Pixels [M, 2], inverse depths and variances [M] in the cells without a pixel of ``taken`` [N, 2], by windows
         of twice the width: images and views of half the size."""
+        from ufmstar_torch.kernels.anchor_check_cpu import confirmed
         from ufmstar_torch.kernels.dense_cpu import Views, measure
 
         half = _halved(small)
@@ -256,7 +260,7 @@ class DenseEvidence(SavedState):
         pixel = _pixels(half, cell // 2, taken[inside])
         found = measure(half, pixel, reduced, self._search())
         variance = _COARSE_NOISE * found.variance + np.square(_SCALE * found.rho)
-        fine = (found.agreed >= _AGREE) & (found.contradicted == 0) & (found.rho > np.sqrt(variance))
+        fine = confirmed(pixel, found, cell // 2) & (found.rho > np.sqrt(variance))
         return 2 * pixel[fine] + 0.5, found.rho[fine], variance[fine]
 
     def _apart(self, corners: Landmarks, taken: NDArray[np.float64], width: int) -> NDArray[np.int64]:

@@ -117,6 +117,11 @@ class Memory(SavedState):
         due = moved >= _DUE * depth * np.minimum(1 + self.confirmed[slot], _SELDOM)
         return Sighted(slot, pixel, 1 / depth, np.square(spread / np.square(depth)), due)
 
+    @property
+    def empty(self) -> bool:
+        """True where there is no landmark."""
+        return not self._used.any()
+
     def forget(self) -> None:
         """Forget all landmarks, and keep the running estimate."""
         self._used[:] = False

@@ -110,6 +110,7 @@ class PoseErrors(SavedState):
         self,
         pixel: NDArray[np.float64],
         measured: Measured,
+        accepted: NDArray[np.bool_],
         shares: NDArray[np.int64],
         views: Views,
         K: NDArray[np.float64],
@@ -121,13 +122,14 @@ class PoseErrors(SavedState):
         Args:
             pixel: [N, 2] (u, v).
             measured: N pixels in V views.
+            accepted: [N] which of them hold.
             shares: [V] to which baseline each view belongs.
             views: V keyframes.
             K: [3, 3] of :meth:`camera` [px], which the views have.
             depth: median of the scene [m].
             trusted: False = nothing is learnt of the camera: poses and images contradict each other.
         """
-        used = (measured.agreed >= 2)[:, None] & np.isfinite(measured.value)
+        used = accepted[:, None] & np.isfinite(measured.value)
         shows = used & np.isfinite(measured.across)
         speed, slope = (np.where(used, x, 1.0) for x in (measured.speed, measured.slope))
         along = np.where(used[..., None], measured.along, 0.0)
@@ -147,7 +149,8 @@ class PoseErrors(SavedState):
         self._learn_poses(solution, shares, K, depth)
         if trusted:
             self._learn_camera(solution, views.image.shape[2])
-        self._learn_noise(solution.residual[used], solution.beside, measured.across_noise, shows, shares)
+        compared = used & (measured.agreed > 1)[:, None]
+        self._learn_noise(solution.residual[compared], solution.beside, measured.across_noise, shows, shares)
         apart = (self._disagreement + solution.residual.sum(1)) / np.maximum(measured.agreed, 1)
         variance = _PATCH * apart * own.min(1, initial=np.inf) + solution.common
         return Fit(rho, variance)

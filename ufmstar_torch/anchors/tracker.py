@@ -191,6 +191,7 @@ class LandmarkTracker(SavedState):
         "_off": "off",
         "baseline": "baseline",
         "_depth": "depth",
+        "_judged": "depths_judged",
     }
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
@@ -216,6 +217,7 @@ class LandmarkTracker(SavedState):
         self._noise = self.config.pixel_noise**2
         self._off = -1.0  # standard deviation of corners from their epipolar lines [px]; negative = not measured
         self.baseline, self._depth = 0.0, self.config.start_depth  # of the views, and of the scene [m]
+        self._judged = 0  # images that showed the scene's depth
         self._point = np.full((n, 3), np.nan)  # of the corners in the newest image [m]; the window decides it
 
     def state(self) -> dict[str, Tensor]:
@@ -286,6 +288,11 @@ class LandmarkTracker(SavedState):
         return self._number, self._poses
 
     @property
+    def depth(self) -> float:
+        """Median depth of the scene [m], as the corners show it."""
+        return self._depth
+
+    @property
     def focal(self) -> float:
         """Focal length of the last image [px]."""
         return float(self._K[0, 0])
@@ -338,7 +345,9 @@ class LandmarkTracker(SavedState):
         self.baseline = float(np.median(baseline))
         shows = (rho > 0) & (motion > _MOVES)
         if shows.sum() >= _ENOUGH:
-            self._depth *= (1 / weighted_median(rho[shows], weight[shows]) / self._depth) ** (1 - _MEMORY)
+            self._judged += 1
+            share = max(1 - _MEMORY, 1 / self._judged)
+            self._depth *= (1 / weighted_median(rho[shows], weight[shows]) / self._depth) ** share
 
     def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Positions [N, 2] in the new image and which corners could be followed there and back [N]."""

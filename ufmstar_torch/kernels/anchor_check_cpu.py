@@ -10,12 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.kernels.compile_cpu import reordered
+from ufmstar_torch.kernels.dense_cpu import Measured
 
 # Two anchors are alike within so many standard deviations of their difference, or this share of the inverse depth.
 _SIGMAS, _SHARE = 3.0, 0.05
 # Share of wrong anchors in a frame; they are those that differ from most of the anchors around them: each one's part of
 # that share goes with the eighth power of the share of others around it, counted with one more that is alike.
 _WRONG, _POWER = 0.026, 8
+# Least number of neighbours that support a single match, their least share, and the largest standard deviation of one
+# that does, as a share.
+_LEAST, _MOST, _CERTAIN = 3, 0.9, 0.2
 # A side is that of the surface where the mean directions of those alike and of the others differ by this much along the
 # gradient (2 = opposite); the pixel then moves to it by 1 px, or by 2 px where they differ by _FAR.
 _APART, _FAR = 0.25, 1.0
@@ -47,6 +51,43 @@ def check_anchors(
     moved, alone, lies_in = pixel.copy(), np.zeros(len(pixel)), np.full(shape, -1, np.int64)
     _check_anchors(image, pixel, rho, variance, cell, lies_in, moved, alone)
     return moved, alone
+
+
+def confirmed(pixel: NDArray[np.float64], measured: Measured, cell: int) -> NDArray[np.bool_]:
+    """Which measurements hold: those on which two views agree, and those of one view that nearly all others around
+    them support. A single match may be wrong; but wrong ones beside each other have different depths.
+
+    Args:
+        pixel: [N, 2] (u, v).
+        measured: N pixels.
+        cell: side of a cell [px]; of two in a cell, the second one counts for others.
+    """
+    found = np.flatnonzero((measured.agreed > 0) & (measured.contradicted == 0))
+    fine = (measured.agreed > 1) & (measured.contradicted == 0)
+    lies_in = np.full((pixel.max(0, initial=0) // cell + 1).astype(np.int64)[::-1], -1)
+    _confirm(pixel, measured.rho, measured.variance, found, cell, lies_in, fine)
+    return fine
+
+
+@reordered
+def _confirm(pixel, rho, variance, found, cell, lies_in, fine):
+    for n in found:
+        lies_in[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n
+    for n in found:
+        if fine[n]:
+            continue
+        row, column = int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell
+        alike = count = 0
+        for j in range(max(row - _CELLS, 0), min(row + _CELLS + 1, lies_in.shape[0])):
+            for i in range(max(column - _CELLS, 0), min(column + _CELLS + 1, lies_in.shape[1])):
+                m = lies_in[j, i]
+                if m < 0 or m == n:
+                    continue
+                count += 1
+                limit = max(_SIGMAS**2 * (variance[n] + variance[m]), (_SHARE * rho[n]) ** 2)
+                if (rho[m] - rho[n]) ** 2 < limit and variance[m] < (_CERTAIN * rho[m]) ** 2:
+                    alike += 1
+        fine[n] = alike >= _LEAST and alike >= _MOST * count
 
 
 @reordered

@@ -35,6 +35,9 @@ LONGEST, STEPS, CONVERGED = 192, 5, 0.01
 FARTHEST, APART = 1.5, 2
 # Largest change of scale between the patch and its image in the keyframe.
 LARGEST_SCALE = 2.0
+# The first view that is searched shows all from infinity to so many times the inverse depth at the start: what lies
+# outside of it might match better.
+WHOLE = 2.0
 # [px^2] Variance of a match where the residual is none: what interpolation leaves.
 LEAST_MATCH = 0.03**2
 # [px] Across the line, a match shows errors of the poses where its own noise is less than this.
@@ -168,6 +171,10 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
             x, y = H[k, 0, 0] * u + H[k, 0, 1] * v + H[k, 0, 2], H[k, 1, 0] * u + H[k, 1, 1] * v + H[k, 1, 2]
             z = H[k, 2, 0] * u + H[k, 2, 1] * v + H[k, 2, 2]
             low, high = first_low, first_high
+            if first and not (
+                _within(x, y, z, b[k], 0.0, width, height) and _within(x, y, z, b[k], WHOLE * start, width, height)
+            ):
+                continue
             if not first:
                 speed = _speed(x, y, z, b[k], at)[2]
                 half = max(sigmas * np.sqrt(variance[n] + noise[k] / speed**2), 1 / speed)
@@ -204,6 +211,16 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
             variance[n] = spread if first else min(variance[n], spread)
             rho[n] = (rho[n] * weight + value / spread) / (weight + 1 / spread)
             weight += 1 / spread
+
+
+@reordered_leaf
+def _within(x, y, z, b, rho, width, height):
+    """Whether the view shows a window around the point of an inverse depth."""
+    z += rho * b[2]
+    if z <= 1e-6:
+        return False
+    u, v = (x + rho * b[0]) / z, (y + rho * b[1]) / z
+    return -FIRST <= u <= width - 1 + FIRST and -FIRST <= v <= height - 1 + FIRST
 
 
 @reordered_leaf
