@@ -268,7 +268,8 @@ class DenseEvidence(SavedState):
         over = self._tracker.remaining_error / max(self._tracker.baseline, 1e-9) / self._tracker.focal
         sigma = np.maximum(np.sqrt(corners.variance) / corners.depth, over * np.maximum(corners.depth, self._depth))
         fine = np.flatnonzero(sigma <= self.config.corner_sigma)
-        square = np.square(corners.pixel[fine, None] - taken).sum(-1).min(1, initial=np.inf)
+        (u, v), (taken_u, taken_v) = corners.pixel[fine].T[..., None], taken.T
+        square = (np.square(u - taken_u) + np.square(v - taken_v)).min(1, initial=np.inf)
         return fine[square > (self.config.corner_distance * width) ** 2]
 
     def _search(self) -> Search:
