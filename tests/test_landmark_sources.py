@@ -72,7 +72,7 @@ def test_a_standing_and_a_turning_camera_have_no_anchors(tour, kind):
 
 DEFECTS = {
     "reversed": lambda poses, images: (poses[::-1], images),
-    "frozen": lambda poses, images: (poses, [images[0]] * len(images)),
+    "standing": lambda poses, images: (poses, [np.bitwise_xor(images[0], i % 2 + 1) for i in range(len(images))]),
 }
 
 
@@ -87,6 +87,25 @@ def test_images_that_contradict_the_poses_give_no_depth_and_a_warning(tour, kind
     assert anchors.pose_error > 0.01 * 240
     assert sum("poses contradict the images" in record.message for record in caplog.records) == 1, "once a stream"
     assert streams.last[0].none.startswith("poses contradict the images")
+
+
+def test_an_image_that_is_repeated_changes_nothing(tour, kind, caplog):
+    images = [frame.image for frame in tour]
+    twice, once = landmark_source(kind), landmark_source(kind)
+    for i, frame in enumerate(tour[:6]):
+        for source in (twice, once):
+            last = source.update(frame.image, frame.T_world_cam, frame.intrinsics)
+        again = twice.update(frame.image, tour[i + 1].T_world_cam, frame.intrinsics)
+        assert len(again.depth) == 0
+        assert "again" in again.none
+    assert len(last.depth) > 0
+    for name, value in once.state().items():
+        torch.testing.assert_close(twice.state()[name], value, rtol=0, atol=0)
+    streams, K = StreamLandmarks(kind), torch.from_numpy(tour[0].intrinsics)
+    for frame in tour:
+        image = torch.from_numpy(images[0]).permute(2, 0, 1)[None]
+        assert not streams.update(image, torch.from_numpy(frame.T_world_cam), K).valid.any()
+    assert sum("the image is the one before again" in record.message for record in caplog.records) == 1
 
 
 def test_a_late_trajectory_gives_no_depth_or_one_as_uncertain_as_it_is_wrong(tour, kind):

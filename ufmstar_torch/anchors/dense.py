@@ -24,7 +24,14 @@ from ufmstar_torch.anchors.dense_keyframes import Keyframes
 from ufmstar_torch.anchors.dense_memory import Memory
 from ufmstar_torch.anchors.dense_poses import PoseErrors
 from ufmstar_torch.anchors.saved_state import SavedState
-from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker, OtherCameraError, TrackerConfig, checked
+from ufmstar_torch.anchors.tracker import (
+    REPEATED,
+    Landmarks,
+    LandmarkTracker,
+    OtherCameraError,
+    TrackerConfig,
+    checked,
+)
 from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.optional import optional
 
@@ -167,8 +174,10 @@ class DenseEvidence(SavedState):
         gray, T, K = checked(image, T_world_cam, K)
         if self._size.any() and (gray.shape != tuple(self._size) or not np.array_equal(K, self._K)):
             raise OtherCameraError
-        self._size, self._K = np.array(gray.shape), K
         small, scale = _reduced(gray, self.config.width)
+        if self._tracker.repeats(small, T):
+            return Landmarks.skipped(REPEATED)
+        self._size, self._K = np.array(gray.shape), K
         corners = self._tracker.update(small, T, scale @ K)
         T, (number, poses) = self._tracker.pose, self._tracker.refined
         if self._memory.empty:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.landmarks import LandmarkSource, landmark_source
-from ufmstar_torch.anchors.tracker import Landmarks
+from ufmstar_torch.anchors.tracker import REPEATED, Landmarks
 from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.frame import FRAME_FAULTS, intrinsics_fault, pose_fault
 
@@ -101,7 +101,9 @@ class StreamLandmarks:
         for i, landmarks in enumerate(result):
             if self._contradicted[i] < 0:
                 continue
-            self._contradicted[i] = self._contradicted[i] + 1 if landmarks.contradicted else 0
+            self._contradicted[i] = (
+                self._contradicted[i] + 1 if landmarks.contradicted or landmarks.none == REPEATED else 0
+            )
             if self._contradicted[i] == _IN_A_ROW:
                 self._contradicted[i] = -1
                 _LOG.warning("stream %d: %s; no depth is used. %s", i, landmarks.none, _CAUSES)

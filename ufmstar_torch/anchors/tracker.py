@@ -37,6 +37,9 @@ _DRIFT = 0.6
 _MEMORY, _LONG = 0.8, 4
 # Why an image has no landmark.
 _NO_TRACK, _NO_DEPTH = "no corner followed from the frame before", "no parallax, or no track that fits the poses"
+REPEATED = "the image is the one before again, with another pose"
+# Entries of two poses that differ by no more are of one pose [1, m].
+_SAME = 1e-6
 # Depths of a scene, over the median: where the poses allow a corner's point to be. Half of the corners lie nearer than
 # the median, which says little while it is not known well; of an image without motion, as of one that is frozen, all
 # would be farther.
@@ -256,6 +259,8 @@ class LandmarkTracker(SavedState):
         if self._gray.size:
             if gray.shape != self._gray.shape or not np.array_equal(K, self._K):
                 raise OtherCameraError
+            if self.repeats(gray, T):
+                return Landmarks.skipped(REPEATED)
             position, alive = self._followed(gray, T)
         else:
             position, alive = np.zeros((self.config.max_points, 2)), np.zeros(self.config.max_points, dtype=bool)
@@ -271,6 +276,10 @@ class LandmarkTracker(SavedState):
         self._compare_with_poses()
         self._fill(gray)
         return self._landmarks(tracked)
+
+    def repeats(self, gray: NDArray[np.uint8], T_world_cam: NDArray[np.float64]) -> bool:
+        """True if a gray image is the last one again, pixel by pixel, with another pose: a frozen or doubled image."""
+        return np.array_equal(gray, self._gray) and not np.allclose(T_world_cam, self._given[self._view], atol=_SAME)
 
     @property
     def pose(self) -> NDArray[np.float64]:
