@@ -29,11 +29,11 @@ def matches(fields, n, fields_c, n_c, K, height, width, thresholds):
     count = _project(fields, n, K, height, width, near, widening, index, image)
     count_c = _project(fields_c, n_c, K, height, width, near, widening, index_c, image_c)
     limit, limit_occl = _limit(eta), _limit(eta_occl)
-    close, members, overlap = empty(count, np.uint8), empty(count, np.int64), empty(count, np.float64)
+    members, overlap = empty(count, np.int64), empty(count, np.float64)
     c, k, beta = empty(64, np.int64), empty(64, np.int64), empty(64, np.float64)
     pairs = 0
     for i in range(count_c):
-        m = _overlapping(image_c, i, image, eta, limit, close, members, overlap)
+        m = _overlapping(image_c, i, image, count, eta, limit, members, overlap)
         for a in range(m):
             if _hidden(image, members, m, a, eta_occl, limit_occl):
                 continue
@@ -59,18 +59,12 @@ def _longer(values):
 
 
 @leaf
-def _overlapping(image_c, i, image, eta, limit, close, members, overlap):
-    """Write those whose overlap with projected Gaussian i is at least eta, and it; return how many there are.
-
-    ``close`` has room for every one. Few are close enough for the overlap: the others are left out in vectors.
-    """
-    half, u, v, xx, yy = limit * 0.5, image_c[0, i], image_c[1, i], image_c[2, i], image_c[4, i]
-    for j in range(close.size):
-        dx, dy = u - image[0, j], v - image[1, j]
-        close[j] = (dx * dx <= half * (xx + image[2, j])) & (dy * dy <= half * (yy + image[4, j]))
+def _overlapping(image_c, i, image, count, eta, limit, members, overlap):
+    """Write those of the first ``count`` whose overlap with projected Gaussian i is at least eta, and it; return how
+    many there are."""
     n = 0
-    for j in range(close.size):
-        if close[j]:
+    for j in range(count):
+        if not _far(image_c, i, image, j, limit):
             overlap[n] = _bhattacharyya(image_c, i, image, j)
             members[n] = j
             n += overlap[n] >= eta
@@ -83,7 +77,7 @@ def _hidden(image, members, n, a, eta_occl, limit):
     far = members[a]
     for b in range(n):
         near = members[b]
-        if image[5, near] >= image[5, far] or _far(image, near, far, limit):
+        if image[5, near] >= image[5, far] or _far(image, near, image, far, limit):
             continue
         if _bhattacharyya(image, near, image, far) > eta_occl:
             return True
@@ -120,10 +114,10 @@ def _project(fields, n, K, height, width, near, widening, index, image):
 
 
 @leaf
-def _far(image, i, j, limit):
+def _far(one, i, other, j, limit):
     """True if two projected Gaussians are too far apart: d^T S^-1 d >= d_x^2 / S_xx, S their mean covariance."""
-    dx, dy = image[0, i] - image[0, j], image[1, i] - image[1, j]
-    return dx * dx > limit * 0.5 * (image[2, i] + image[2, j]) or dy * dy > limit * 0.5 * (image[4, i] + image[4, j])
+    dx, dy, half = one[0, i] - other[0, j], one[1, i] - other[1, j], limit * 0.5
+    return dx * dx > half * (one[2, i] + other[2, j]) or dy * dy > half * (one[4, i] + other[4, j])
 
 
 @leaf

@@ -1,15 +1,13 @@
-"""Selects the components that matter in a box of points, on the CPU (numba): culling in three levels, and its error.
+"""Selects the components that matter in a box of points, on the CPU (numba): culling in two levels, and its error.
 
 A component k adds w_k(x) = pi_k N(x; mu_k, Sigma_k) to the denominator D(x) = pi_0 + sum_k w_k(x) of a point x.
 
-1. Image: w_k(x) exceeds a threshold in an ellipsoid only. Its silhouette has a bounding box of pixels.
-   Those that level 2 leaves out in a box around all points of the image go at once, which changes no bit.
-2. Block of 32 x 32 pixels: for the components whose silhouette meets the image, interval arithmetic over the bounding
-   box of the block's points gives l_k <= w_k(x) <= h_k.
-3. Tile of 8 x 8 pixels: the same, for the components that the block keeps.
+1. Block of 32 x 32 pixels: interval arithmetic over the bounding box of the block's points gives l_k <= w_k(x) <= h_k.
+   Components that every block leaves out, by the box around all points of the image, go at once, which changes no bit.
+2. Tile of 8 x 8 pixels: the same, for the components that the block keeps.
 
-Each level leaves out the components with h_k <= (eps / 3n) max(max_j l_j, pi_0 / 1000), with n components at that level
-(level 1: max_j l_j = 0). max_j l_j and pi_0 are parts of the denominator, so that the components left out add up to
+Each level leaves out the components with h_k <= (eps / 2n) max(max_j l_j, pi_0 / 1000), with n components at that
+level. max_j l_j and pi_0 are parts of the denominator, so that the components left out add up to
 d(x) <= eps max(max_j w_j(x), pi_0 / 1000) <= eps D(x). The error is d/D times the difference of two averages of m_k
 and mu_0:
 
@@ -35,8 +33,8 @@ _PRIOR = 1e-3  # share of the prior in a threshold
 FIELDS = 10  # of a component: mean (3), whitening (6), log2 of the peak
 _LOG2_E = math.log2(math.e)
 _SCALE = math.sqrt(0.5 * _LOG2_E)
-# Rows of :func:`whiten`, and the squared radius of the ellipsoid that counts, in standard deviations.
-WHITENED, PEAK, SQUARE = 8, 6, 7
+# Rows of :func:`whiten`, the last of which is the peak.
+WHITENED, PEAK = 7, 6
 
 
 @kernel
@@ -52,24 +50,28 @@ def in_view(components, m, features, K, depth, farthest, prior_weight, prior_mea
     Returns:
         Indices [n], fields [n, 10], the same in the dtype of ``depth`` and by field [10, n and more], the terms of the
         sum [n, TERMS], and the settings: prior weight and mean, epsilon, log2 of the least threshold,
-        and how many components level 1 left.
+        and how many components there are.
     """
     height, width = depth.shape
-    least, limit = math.log2(_PRIOR * prior_weight), _limit(epsilon, m.size) + math.log2(_PRIOR * prior_weight)
+    n = m.size
     whitened = empty((WHITENED, components.shape[1]), np.float64)
-    index, kept = empty(m.size, np.int64), empty(m.size, np.int64)
-    n = _visible(components, m.size, whitened, K, height, width, limit, index)
+    index, every = empty(n, np.int64), empty(n, np.int64)
+    whiten(components, n, whitened)
+    for k in range(n):
+        every[k] = k
+        for i in range(6):
+            whitened[i, k] *= _SCALE
+        whitened[PEAK, k] = (math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED) * _LOG2_E
     packed = empty((FIELDS, padded(n)), depth.dtype)
-    _pack(components, whitened, index, n, packed)
+    _pack(components, whitened, every, n, packed)
     z = farthest
     left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
     right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
     box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
-    settings, work = (prior_weight, prior_mean, epsilon, least, n), empty(8 + packed.shape[1], depth.dtype)
+    settings = prior_weight, prior_mean, epsilon, math.log2(_PRIOR * prior_weight), n
+    work = empty(8 + packed.shape[1], depth.dtype)
     # Blocks take n components; a few more lower the threshold by more than what rounding can make of two boxes.
-    chosen = cull(packed, n, n + n // 64 + 1, box, settings, work, kept)
-    for i in range(chosen):
-        index[i] = index[kept[i]]
+    chosen = cull(packed, n, n + n // 64 + 1, box, settings, work, index)
     fields, constants = empty((chosen, FIELDS), np.float64), empty((chosen, TERMS), depth.dtype)
     _terms(components, whitened, index, m, features, fields, constants)
     packed = empty((FIELDS, padded(chosen)), depth.dtype)
@@ -109,7 +111,7 @@ def _terms(components, whitened, index, m, features, fields, constants):
 @leaf
 def _limit(epsilon, count):
     """log2 of the share of a lower bound that one component may add at one level, a little less for rounding."""
-    return math.log2(epsilon / (3 * max(count, 1))) - 0.01
+    return math.log2(epsilon / (2 * max(count, 1))) - 0.01
 
 
 @leaf
@@ -138,48 +140,6 @@ def whiten(components, n, whitened):
         whitened[0, k], whitened[1, k], whitened[2, k] = a, b, c
         whitened[3, k], whitened[4, k], whitened[5, k] = -(l20 * a + l21 * b) / l22, e, f
         whitened[PEAK, k] = components[WEIGHT, k] / (l00 * l11 * l22)
-
-
-@leaf
-def _visible(components, count, whitened, K, height, width, limit, index):
-    """Write scaled whitening and log2 of the peak of the first ``count`` components, and the indices of those whose
-    density can exceed 2^limit at a pixel of the image; return how many these are."""
-    whiten(components, count, whitened)
-    n = 0
-    for k in range(count):
-        for i in range(6):
-            whitened[i, k] *= _SCALE
-        log_peak = math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED
-        whitened[PEAK, k] = log_peak * _LOG2_E
-        square = 2 * (log_peak - limit / _LOG2_E) * (1 + 1e-6)
-        index[n] = k
-        n += square > 0 and _meets(components, k, square, K, height, width)
-    return n
-
-
-@leaf
-def _meets(components, k, square, K, height, width):
-    """False if the ellipsoid (x - mu)^T S^-1 (x - mu) = square of component k certainly has no point in view.
-
-    Its silhouette lies between the planes x = s z (and y = s z) that touch it, (mu_x - s mu_z)^2 =
-    square (S_xx - 2 s S_xz + s^2 S_zz): a quadratic equation in s. One that reaches z = 0 may be anywhere.
-    """
-    xx, yy, zz = components[COVARIANCE, k], components[COVARIANCE + 4, k], components[COVARIANCE + 8, k]
-    least, z = max(xx, yy, zz) * 1e-14, components[2, k]
-    depth = square * (zz + least)
-    a = z * z - depth
-    if not a > depth * 1e-6:  # it reaches the camera's plane
-        return True
-    for axis in range(2):
-        x, own, mixed = components[axis, k], yy if axis else xx, components[COVARIANCE + 2 + 3 * axis, k]
-        half_b = x * z - square * mixed
-        root = math.sqrt(max(half_b * half_b - a * (x * x - square * (own + least)), 0.0))
-        root += (abs(half_b) + root) * 1e-9
-        p = (half_b - root) / a * K[axis, axis] + K[axis, 2]
-        q = (half_b + root) / a * K[axis, axis] + K[axis, 2]
-        if max(p, q) < -1 or min(p, q) > (height if axis else width):
-            return False
-    return not z < 0
 
 
 @leaf

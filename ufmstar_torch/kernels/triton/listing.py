@@ -80,7 +80,10 @@ def whitened(xx, xy, xz, yy, yz, zz):
 
 @triton.jit
 def _outside(m, z, smm, smz, square, a, focal, centre, size):
-    """True if the ellipsoid's silhouette lies outside the image along one axis; see ``regress_cull_cpu._meets``."""
+    """True if the silhouette of the ellipsoid (x - mu)^T S^-1 (x - mu) = square lies outside the image along one axis.
+
+    It lies between the planes x = s z that touch it, (mu_x - s mu_z)^2 = square (S_xx - 2 s S_xz + s^2 S_zz).
+    """
     half_b = m * z - square * smz
     root = tl.sqrt(tl.maximum(half_b * half_b - a * (m * m - square * smm), 0.0))
     root += 1e-9 * (tl.abs(half_b) + root)
