@@ -54,20 +54,19 @@ def test_every_sequence_is_found_once_by_its_place(root):
         assert open_sequence(one.path, one.layout).layout == one.layout
 
 
-def test_a_sequence_itself_is_found_at_depth_0(root):
-    assert found(root / "a" / "b" / "walk", max_depth=0) == {"walk": ("generic", root / "a" / "b" / "walk")}
-    assert found(root / "office", max_depth=0) == {
+def test_a_sequence_itself_is_found(root):
+    assert found(root / "a" / "b" / "walk") == {"walk": ("generic", root / "a" / "b" / "walk")}
+    assert found(root / "office") == {
         "P000": ("tartanair", root / "office" / "P000"),
         "P001": ("tartanair", root / "office" / "P001"),
     }
-    assert found(root, max_depth=0) == {}
 
 
 def test_links_in_a_circle_end_and_links_do_not_double(root):
     (root / "a" / "again").symlink_to(root)
     (root / "a" / "b" / "walk2").symlink_to(root / "a" / "b" / "walk")
     (root / "0first").symlink_to(root / "scans")
-    assert {name: layout for name, (layout, _) in found(root, max_depth=9).items()} == NAMES
+    assert {name: layout for name, (layout, _) in found(root).items()} == NAMES
 
 
 def test_a_link_to_somewhere_else_counts(root, tmp_path_factory):
@@ -95,8 +94,6 @@ def test_hidden_folders_and_those_of_others_are_left_out(root, monkeypatch):
 def test_what_cannot_be_searched_is_refused(root, tmp_path):
     with pytest.raises(FileNotFoundError, match="root: no such file or folder"):
         find_sequences(tmp_path / "absent")
-    with pytest.raises(ValueError, match="max_depth must be at least 0, got -1"):
-        find_sequences(root, max_depth=-1)
     with pytest.raises(ValueError, match="layout must be one of auto, tum"):
         find_sequences(root, layout="kitti")
     shutil.copytree(root / "tum" / "rgbd_dataset_freiburg2_desk", root / "scans" / "scene0000_00", dirs_exist_ok=True)

@@ -376,19 +376,6 @@ def test_a_sequence_that_cannot_be_used(networks, sequence, trouble):
         evaluate(replace(sequence, entries=entries), [row("Aleatoric")], networks, limit=limit)
 
 
-@pytest.mark.parametrize(
-    ("rows", "told"),
-    [
-        ([], "one or more"),
-        ([row("Aleatoric"), row("Aleatoric", seed=4)], "different ones"),
-        ([row("Ensemble"), row("Evidential")], "ensemble, evidential is missing"),
-    ],
-)
-def test_what_cannot_be_judged_is_refused(networks, sequence, rows, told):
-    with pytest.raises(ValueError, match=told):
-        evaluate(sequence, rows, {"aleatoric": networks["aleatoric"]})
-
-
 def test_sums_hold_all_that_the_figures_are_made_of(networks, sequence):
     result = evaluate(sequence, [row("UfM*-Aleatoric"), row("Aleatoric")], networks)["UfMstar-Aleatoric"]
     again = SequenceMetrics()

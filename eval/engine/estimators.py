@@ -81,7 +81,7 @@ def make_estimator(
     ``own`` are methods of one's own (``sequences.plugins``), by name.
 
     Raises:
-        ValueError: a recalibration that was fitted under other settings, or no method of that name.
+        ValueError: a recalibration that was fitted under other settings.
         FileNotFoundError: the setting's recalibration does not exist.
     """
     method, setting, uses = row.method, row.setting, row.method.uses_aleatoric
@@ -90,8 +90,6 @@ def make_estimator(
     if method.fusion == UFM:
         return Pointwise(method.max_points, uses_variances=uses)
     if method.fusion != UFM_STAR:
-        if method.fusion not in own:
-            raise ValueError(f"row {method.name}: no method is called {method.fusion!r}: --plugin FILE.py adds yours")
         estimator: Estimator = own[method.fusion](row, device)
         return estimator
     fitted = Recalibration.from_json(setting.recalibration) if setting.recalibration else None

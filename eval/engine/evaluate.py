@@ -70,7 +70,7 @@ def evaluate_sequence(
         Stopped: ``stop`` returned True.
     """
     indices = range(len(sequence))[judge.limit]
-    _check(sequence, rows, indices, judge.networks)
+    _check(sequence, rows, indices)
     expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
     sources = {(base, how): judge.networks[base].prepared(how) for base, how in expected}
     anchors = anchor_sources(rows, sequence.folder, sequence.pose_scale)
@@ -106,13 +106,8 @@ def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) 
         raise FrameError(frame.name, FRAME_FAULTS[int(checked.fault[0])])
 
 
-def _check(sequence: FrameSequence, rows: Sequence[Row], indices: range, networks: Mapping[str, DepthSource]) -> None:
-    """Raises ValueError for rows that cannot be judged on any sequence, SequenceError for those on this one."""
-    if not rows or len({row.slug for row in rows}) < len(rows):
-        raise ValueError(f"rows must be one or more different ones, got {[row.label for row in rows]}")
-    missing = sorted({row.method.base for row in rows} - networks.keys())
-    if missing:
-        raise ValueError(f"networks must hold one for each base of the rows, {', '.join(missing)} is missing")
+def _check(sequence: FrameSequence, rows: Sequence[Row], indices: range) -> None:
+    """Raises SequenceError for a sequence on which the rows cannot be judged."""
     if not indices:
         raise SequenceError(f"no frame is selected of {len(sequence)}")
     if all(sequence.entries[index].load_depth is None for index in indices):

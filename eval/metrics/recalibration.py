@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from scipy.special import ndtri
 
 from ufmstar_torch.eval.metrics.base import Array
 from ufmstar_torch.eval.metrics.ranking import HIGH, LOW
@@ -20,6 +21,7 @@ from ufmstar_torch.recalibrate import CONFIDENCE, Recalibration
 # Levels of |z| of a standard normal variable at which errors are compared with it. The outer tenth is left out:
 # gross errors of the depth would set the variance of all other pixels.
 LEVELS = np.arange(0.1, 0.91, 0.1)
+NORMAL = ndtri(0.5 + LEVELS / 2)  # |z| below which these shares lie
 GROUPS, CONFIDENCE_GROUPS = 32, 16
 LARGEST = 25.0  # squared error over the variance that counts, as of anchors (``ConfidenceConfig.largest``)
 
@@ -123,7 +125,7 @@ def _figures(variance: Array, error: Array, weight: Array) -> dict[str, float]:
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(error == 0, 0.0, error / variance)
         nll = 0.5 * (ratio + np.log(2 * math.pi * variance))
-    inside = [weight[ratio <= z**2].sum() for z in _normal(LEVELS)]
+    inside = [weight[ratio <= z**2].sum() for z in NORMAL]
     positive = np.broadcast_to(variance > 0, weight.shape)
     share = weight[positive].sum()
     return {
@@ -152,14 +154,6 @@ def _groups(mass: Array, count: int) -> list[Array]:
     return weights
 
 
-def _normal(levels: Array) -> Array:
-    """|z| below which the share ``levels`` of a standard normal variable lies."""
-    from scipy.stats import norm
-
-    quantiles: Array = norm.ppf(0.5 + levels / 2)
-    return quantiles
-
-
 def _scale(mass: Array, value: Array) -> float:
     """The variance of the normal distribution whose |z| quantiles agree best with those of squared errors.
 
@@ -169,4 +163,4 @@ def _scale(mass: Array, value: Array) -> float:
     """
     at = np.searchsorted(np.cumsum(mass), LEVELS * mass.sum())
     quantiles = np.maximum(value[np.minimum(at, len(value) - 1)], value[value > 0].min())
-    return float(np.exp(np.mean(np.log(quantiles) - 2 * np.log(_normal(LEVELS)))))
+    return float(np.exp(np.mean(np.log(quantiles) - 2 * np.log(NORMAL))))

@@ -15,6 +15,7 @@ _MODULES = (
     *("tum", "seven_scenes", "scannet", "sens", "tartanair", "kitti360", "nyu", "colmap", "transforms", "euroc"),
     *("bag", "stray", "arkitscenes", "generic"),
 )
+_DEEPEST = 4  # levels of folders that are searched
 READERS: dict[str, Any] = {
     "7scenes" if name == "seven_scenes" else name: import_module(f"ufmstar_torch.eval.sequences.{name}")
     for name in _MODULES
@@ -76,10 +77,9 @@ class Found(NamedTuple):
     layout: str
 
 
-def find_sequences(
-    root: str | Path, max_depth: int = 4, layout: str = "auto", plugin: Sequence[str] = ()
-) -> list[Found]:
-    """All sequences at or below ``root``, a folder or the file of one, sorted by name; empty where there is none.
+def find_sequences(root: str | Path, layout: str = "auto", plugin: Sequence[str] = ()) -> list[Found]:
+    """All sequences at most four folders below ``root``, a folder or the file of one, sorted by name; empty where there
+    is none.
 
     A folder that is a sequence is not looked into, so that its own folders of images are none. Each folder on disk
     counts once, whatever links lead to it (a folder before a link to it), so that links in a circle end too. Hidden
@@ -87,23 +87,20 @@ def find_sequences(
 
     Args:
         root: where.
-        max_depth: levels of folders below ``root`` that are looked at, at least 0.
         layout: the only layout to look for; "auto": any.
         plugin: files with readers of one's own.
 
     Raises:
         FileNotFoundError: no such root.
-        ValueError: ``max_depth`` is negative, an unknown layout, or a folder that fits several layouts.
+        ValueError: an unknown layout, or a folder that fits several layouts.
     """
     root = Path(root)
     if not root.exists():
         raise FileNotFoundError(f"root: no such file or folder: {root}")
-    if max_depth < 0:
-        raise ValueError(f"max_depth must be at least 0, got {max_depth}")
     require_layout(layout, plugin)
     found: list[Found] = []
     seen: set[Path] = set()
-    waiting = [(root, max_depth)]
+    waiting = [(root, _DEEPEST)]
     while waiting:
         path, depth = waiting.pop()
         if path.resolve() in seen:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,19 +45,9 @@ def read_records(content: bytes, file: Path) -> list[dict]:
     for number, line in enumerate(content.splitlines(), start=1):
         try:
             record = json.loads(line)
-        except (ValueError, RecursionError):
-            record = None
-        match record:
-            case {"name": str(), "state": "skipped", "reason": str()}:
-                pass
-            case {"name": str(), "state": "done", "intrinsics": [_, _, _, _] as K} if all(map(_is_number, K)):
-                pass
-            case _:
-                shown = line[:60].decode(errors="replace")
-                raise ValueError(f"{file}, line {number} is not the record of a frame: {shown}")
+            _ = record["name"], record["intrinsics" if record["state"] == "done" else "reason"]
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            shown = line[:60].decode(errors="replace")
+            raise ValueError(f"{file}, line {number} is not the record of a frame: {shown}") from error
         records.append(record)
     return records
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float)
