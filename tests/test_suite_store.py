@@ -145,7 +145,7 @@ def test_a_shard_is_evaluated_by_one_process_and_not_overwritten_meanwhile(tmp_p
             pass
         with pytest.raises(FolderError, match="another process is evaluating shard 1/2 there now"):
             enter(out, ABOUT, shard=Shard(1, 2), resume=True)
-        with pytest.raises(FolderError, match="another process is evaluating there now"):
+        with pytest.raises(FolderError, match="another process is working there now"):
             enter(out, ABOUT, overwrite=True)
     enter(out, ABOUT, overwrite=True)
 

@@ -12,11 +12,9 @@ OUT/summary.json          figures, command, versions, hardware, seconds
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.run.folder import FolderKind, output_folder
@@ -44,16 +42,6 @@ def open_folder(job: Job, *, resume: bool = False, overwrite: bool = False) -> I
         yield
 
 
-def _clear(out: Path) -> None:
-    """Remove what an earlier training left, by its names."""
-    for member in out.glob("member_*"):
-        if member.name.removeprefix("member_").isdigit():
-            shutil.rmtree(member)
-    shutil.rmtree(out / "tensorboard", ignore_errors=True)
-    for name in (WEIGHTS, SUMMARY):
-        (out / name).unlink(missing_ok=True)
-
-
 def _fixed(manifest: Mapping[str, Any], _: Mapping[str, Any]) -> Mapping[str, Any]:
     """The identity but for the number of members: a training may go on with more of them."""
     then = manifest["identity"]
@@ -66,7 +54,7 @@ TRAINING = FolderKind(
     manifest="training.json",
     format=1,
     lock="lock",
-    clear=_clear,
+    files=("member_[0-9]", "member_[0-9][0-9]", "member_[0-9][0-9][0-9]", "tensorboard", WEIGHTS, SUMMARY),
     temporary=(".*.tmp", "member_*/.*.tmp"),
     identity=_fixed,
 )

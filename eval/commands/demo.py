@@ -16,7 +16,7 @@ from ufmstar_torch.eval.commands import evaluate
 from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, option, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars
 from ufmstar_torch.eval.run.files import to_json, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder, remover
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
 from ufmstar_torch.eval.run.machine import hardware, share_threads, versions
 
 _WEIGHTS = ("weights", "demo.safetensors")
@@ -91,9 +91,7 @@ def _onboard(options: DemoOptions, weights: Path) -> int:
 
     if options.threads is None:
         share_threads()
-    kind = FolderKind(
-        program="ufmstar demo --onboard", noun="demo", manifest="summary.json", clear=remover(GRAPH, PICTURE)
-    )
+    kind = FolderKind("ufmstar demo --onboard", "demo", "summary.json", (GRAPH, PICTURE))
     with output_folder(options.out, kind, {}, overwrite=options.overwrite), Bars() as bars:
         measured = run_onboard(options.out, weights, options.seconds, options.seed, bars.show)
     settings = {name: value for name, value in as_dict(options).items() if name not in ("frames", "device")}

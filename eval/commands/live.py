@@ -25,7 +25,7 @@ from ufmstar_torch.eval.engine.realtime import RealTime
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.run.export import RunFrame
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderKind, output_folder, remover
+from ufmstar_torch.eval.run.folder import FolderKind, output_folder
 from ufmstar_torch.eval.run.machine import share_threads
 from ufmstar_torch.eval.run.rerun_log import RerunLog, open_viewer
 from ufmstar_torch.eval.sequences import live as sources
@@ -113,7 +113,7 @@ def main(options: LiveOptions) -> int:
 
     if options.threads is None:
         share_threads()
-    kind = FolderKind("ufmstar live", "live run", _SUMMARY, remover("*.npz"), lock=".lock")
+    kind = FolderKind("ufmstar live", "live run", _SUMMARY, ("*.npz",), lock=".lock")
     started = {"state": "started"}  # and not finished, which would allow the next run to replace it
     with ExitStack() as held:
         with usage_errors(ImportError, OSError, ValueError):

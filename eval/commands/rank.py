@@ -15,7 +15,7 @@ from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.progress import ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder, remover
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
 from ufmstar_torch.eval.run.machine import share_threads
 from ufmstar_torch.eval.run.panels import contact_sheet
 from ufmstar_torch.eval.run.pictures import SHEET
@@ -71,7 +71,7 @@ def main(options: RankOptions) -> int:
     """Score the sequences, and write table and pictures; the exit code."""
     if options.threads is None:
         share_threads()
-    kind = FolderKind("ufmstar rank", "ranking", SETTINGS, remover(SCORES, SHEET))
+    kind = FolderKind("ufmstar rank", "ranking", SETTINGS, (SCORES, SHEET))
     with usage_errors(FolderError):
         kind.earlier(Path(options.out), resume=False, overwrite=options.overwrite)
         scores = _scores(options)

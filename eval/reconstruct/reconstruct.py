@@ -35,14 +35,8 @@ _FEATURES, _LARGEST_IMAGE = 4096, 1600  # of an image [1], [px]
 _VIEWS, _ANGLE, _MOST_ERROR, _LEAST_ERROR = 3, np.radians(1.5), 2.0, 0.5
 
 
-def _clear(out: Path) -> None:
-    for name in ("images", "sparse"):
-        shutil.rmtree(out / name, ignore_errors=True)
-    for name in ("rgb.txt", "landmarks.npz", "database.db"):
-        (out / name).unlink(missing_ok=True)
-
-
-POSES = FolderKind(program="ufmstar poses", noun="reconstruction", manifest=SCALE_FILE, clear=_clear)
+_MADE = ("images", "sparse", "rgb.txt", "landmarks.npz", "database.db")
+POSES = FolderKind("ufmstar poses", "reconstruction", SCALE_FILE, _MADE)
 
 
 def require_pycolmap() -> Any:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -41,12 +42,13 @@ class FolderKind:
     program: str  # as "ufmstar run"; the manifest contains it
     noun: str  # for messages: "run", "evaluation", "training", "demo"
     manifest: str  # path of the manifest below the folder
-    clear: Callable[[Path], None]  # removes the files of earlier work, but for the manifest
+    files: tuple[str, ...]  # glob patterns of the files and folders of earlier work, but for the manifest
     # of the manifest and the files beside it; None = such work cannot be continued, and a summary replaces the manifest
     # at the end.
     format: int | None = None
     lock: str | None = None  # path of the lock file below the folder; None = no lock
     wait: float = 0.0  # longest time [s] to wait for the lock
+    parts: tuple[str, ...] = ()  # glob patterns of the locks of processes that work on parts
     allowed: tuple[str, ...] = ()  # entries that may exist in a folder before its manifest does
     # glob patterns below the folder of temporary files of a killed process.
     temporary: tuple[str, ...] = (".*.tmp",)
@@ -89,6 +91,16 @@ class FolderKind:
             choices = "" if self.format is None else "--resume goes on with it, "
             raise FolderError(f"--out {out} holds an earlier {self.noun}: {choices}--overwrite replaces it")
         return True
+
+    def clear(self, out: Path) -> None:
+        """Remove the files of earlier work, by their names. Raises FolderError: a process works on a part of it."""
+        with ExitStack() as held:
+            for path in [path for pattern in self.parts for path in out.glob(pattern)]:
+                if (lock := hold(path)) is None:
+                    raise FolderError(f"--out {out}: another process is working there now ({path.name})")
+                held.callback(lock.release)
+            for path in [path for pattern in self.files for path in out.glob(pattern)]:
+                shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
     def _foreign(self, out: Path) -> list[Path]:
         """Entries beside those of a process that was killed before it wrote the manifest."""
@@ -144,17 +156,6 @@ def output_folder(
         if not resumed or manifest != earlier:
             write_json_atomic(out / kind.manifest, manifest)
         yield resumed
-
-
-def remover(*patterns: str) -> Callable[[Path], None]:
-    """A ``FolderKind.clear`` that removes the files that match glob patterns below the folder."""
-
-    def clear(out: Path) -> None:
-        for pattern in patterns:
-            for path in list(out.glob(pattern)):
-                path.unlink(missing_ok=True)
-
-    return clear
 
 
 def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:

@@ -24,7 +24,7 @@ from ufmstar_torch.eval.engine.judge import UFM
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.run.files import to_json, write_atomic
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, remover
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind
 from ufmstar_torch.eval.run.frame_record import frame_arrays, frame_record
 from ufmstar_torch.eval.run.job import Checkpoint, RunJob
 from ufmstar_torch.eval.run.writers import FRAMES, PNGS, frame_file, write_frame, write_pngs
@@ -40,15 +40,8 @@ RUN = FolderKind(
     manifest="resume/run.json",
     format=4,
     lock="resume/lock",
-    clear=remover(
-        f"{FRAMES}/*.npz",
-        *(f"{folder}/*.png" for folder in PNGS),
-        "summary.json",
-        RECORDS,
-        "resume/state.pt",
-        *_MADE_AT_END,
-    ),
-    temporary=(".*.tmp", "*/.*.tmp", ".preview.*.tmp.mp4"),
+    files=(f"{FRAMES}/*.npz", *(f"{f}/*.png" for f in PNGS), "summary.json", RECORDS, "resume/state.pt", *_MADE_AT_END),
+    temporary=(".*.tmp", "*/.*.tmp"),
 )
 
 

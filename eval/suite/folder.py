@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from typing import Any
 from ufmstar_torch.eval.engine.judge import RowFigures
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.run.files import remove_temporaries, write_json_atomic
-from ufmstar_torch.eval.run.folder import FolderError, FolderKind, hold, output_folder, remover
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, hold, output_folder
 from ufmstar_torch.eval.suite.record import FORMAT, Record, ResultsError
 from ufmstar_torch.eval.suite.work_items import ALL, Shard, WorkItem
 
@@ -143,23 +143,6 @@ def _merged(then: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _clear(out: Path) -> None:
-    """Remove what an earlier evaluation and its report left, by their names; the cache stays. Raises FolderError: a
-    process evaluates a shard there."""
-    with ExitStack() as held:
-        for path in out.glob("eval-*-of-*.lock"):
-            lock = hold(path)
-            if lock is None:
-                raise FolderError(f"--out {out}: another process is evaluating there now ({path.name})")
-            held.callback(lock.release)
-        places = sorted(path for path in out.glob("records/*/*") if path.is_dir())
-        remover(*(f"records/*/*/{pattern}" for pattern in _OF_SEQUENCE), *_REPORT)(out)
-    for place in places:
-        for folder in (place / "examples", place / "room", place, place.parent, out / "records"):
-            if folder.is_dir() and not any(folder.iterdir()):
-                folder.rmdir()
-
-
 EVALUATION = FolderKind(
     program="ufmstar eval",
     noun="evaluation",
@@ -167,7 +150,8 @@ EVALUATION = FolderKind(
     format=FORMAT,
     lock="eval.lock",
     wait=60.0,
-    clear=_clear,
+    parts=("eval-*-of-*.lock",),
+    files=(*(f"records/*/*/{pattern}" for pattern in _OF_SEQUENCE), *_REPORT),
     allowed=(CACHE,),
     temporary=(".eval.json.*.tmp",),
     identity=_identity,
