@@ -88,17 +88,15 @@ def test_register_depth_closed_form():
 
 
 OWN_DEPTH = {
-    "7scenes": (layouts.write_seven_scenes, {"register": False}),
-    "scannet": (layouts.write_scannet, {}),
-    "sens": (lambda root, frames: layouts_more.write_sens(root / "a.sens", frames), {}),
+    "scannet": layouts.write_scannet,
+    "sens": lambda root, frames: layouts_more.write_sens(root / "a.sens", frames),
 }
 
 
 @pytest.mark.parametrize("layout", OWN_DEPTH)
 def test_depth_has_a_camera_of_its_own(tmp_path, layout):
-    write, options = OWN_DEPTH[layout]
-    path, of_color, of_depth = write(tmp_path, frames=11)
-    sequence = open_sequence(path, **options)
+    path, of_color, of_depth = OWN_DEPTH[layout](tmp_path, frames=11)
+    sequence = open_sequence(path)
     assert (sequence.layout, sequence.depth_size) == (layout, layouts.SIZE)
     assert sequence.image_size == of_color.images[0].shape[:2]
     assert [int(name.split("-")[-1]) for name in sequence.names] == list(range(11))  # 10 after 9
@@ -111,7 +109,7 @@ def test_depth_has_a_camera_of_its_own(tmp_path, layout):
         difference = np.abs(frame.image.astype(int) - of_color.images[i]).mean()
         other = np.abs(frame.image.astype(int) - of_color.images[(i + 5) % 11]).mean()
         assert difference < 0.5 * other
-    of_lens = open_sequence(path, distortion=(0.2, -0.3, 0, 0), **options)[5]  # the colour camera's
+    of_lens = open_sequence(path, distortion=(0.2, -0.3, 0, 0))[5]  # the colour camera's
     assert (of_lens.image != sequence[5].image).any()
     np.testing.assert_array_equal(of_lens.depth, sequence[5].depth)
     np.testing.assert_array_equal(of_lens.depth_intrinsics, sequence[5].depth_intrinsics)
@@ -199,7 +197,8 @@ def test_a_seven_scenes_pixel_without_a_measurement_has_no_depth(tmp_path):
     values = np.full(layouts.SIZE, 1500.0)
     values[:, :20], values[:, 20:40] = 65535, 0
     write_depth_png(path / "frame-000000.depth.png", values, 1)
-    frame = open_sequence(path, register=False)[0]
+    same = {"intrinsics": (60, 60, 32, 24), "depth_intrinsics": (60, 60, 32, 24), "T_color_depth": np.eye(4)}
+    frame = open_sequence(path, **same)[0]
     assert (frame.depth > 0).mean(axis=0).tolist() == [0] * 40 + [1] * 24
     assert (open_sequence(path)[0].depth <= 1.501).all()
 

@@ -17,12 +17,11 @@ from tiny_suite import NAMES, TRUTH, Stub, evaluate, go, job_on, kept, rows_of, 
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
-from ufmstar_torch.eval.engine.predictions import CacheError
+from ufmstar_torch.eval.engine.predictions import CacheError, content_digest
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.suite.evaluate import with_references
 from ufmstar_torch.eval.suite.record import Record
-from ufmstar_torch.eval.suite.work_items import content_digest
 
 
 @pytest.fixture(scope="module")

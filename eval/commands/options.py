@@ -151,7 +151,7 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
             super().__call__(parser, cfg, values, option_string)
 
     class Formatter(DefaultHelpFormatter):
-        """Leaves out the default of a flag, which would be the field's (--no-register: True), and None."""
+        """Leaves out the default of a flag, which would be the field's (--no-video: True), and None."""
 
         def _get_help_string(self, action: Action) -> str:
             text: str = action.help or "" if isinstance(action.const, bool) else super()._get_help_string(action)

@@ -175,6 +175,17 @@ def sequence_digest(sequence: FrameSequence) -> str:
     return hashlib.sha256(repr(identity).encode()).hexdigest()
 
 
+def content_digest(sequence: FrameSequence) -> str:
+    """Hex digest of what is known of a sequence before it is decoded: frames, cameras and poses."""
+    K = sequence.depth_intrinsics
+    digest = hashlib.sha256(sequence_digest(sequence).encode())
+    digest.update(repr((None if K is None else K.tolist(), sequence.depth_size)).encode())
+    for entry in sequence.entries:
+        digest.update(entry.T_world_cam.tobytes() + bytes([entry.load_depth is not None]))
+        digest.update(b"" if entry.intrinsics is None else entry.intrinsics.tobytes())
+    return digest.hexdigest()
+
+
 def frame_digest(frame: Frame) -> str:
     """Hex digest of what a network sees of a frame: pixels and intrinsics (and the index, which seeds samples)."""
     digest = hashlib.sha256(repr((frame.index, None if frame.image is None else frame.image.shape)).encode())

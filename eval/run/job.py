@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,7 +18,7 @@ from ufmstar_torch.eval.check.image_fit import FollowedCorners, ImageFit, image_
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
 from ufmstar_torch.eval.engine.estimators import Gaussians
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
-from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.predictions import DepthSource, content_digest
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.setting import CORNERS, Setting
 from ufmstar_torch.eval.run.scale import NetworkScale
@@ -96,18 +96,13 @@ class RunJob:
 
     def identity(self) -> dict[str, Any]:
         """Plain values on which the results depend. A run is only continued with the same ones."""
-        sequence, digest = self.sequence, hashlib.sha256()
-        for index in self.indices:
-            entry = sequence.entries[index]
-            digest.update(entry.name.encode() + entry.T_world_cam.tobytes())
-            if entry.intrinsics is not None:
-                digest.update(entry.intrinsics.tobytes())
+        sequence, part = self.sequence, tuple(self.sequence.entries[index] for index in self.indices)
         return {
             "sequence": {
                 "name": sequence.name,
                 "layout": sequence.layout,
                 "frames": len(self.indices),
-                "names_and_poses": digest.hexdigest(),
+                "names_and_poses": content_digest(replace(sequence, entries=part)),
                 "intrinsics": sequence.intrinsics,
                 "depth_intrinsics": sequence.depth_intrinsics,
                 "first_frame": self._first_frame(),

@@ -37,7 +37,6 @@ class Options:
         max_time_difference: longest time between a colour image and its depth map [s]
         images: folder or video file with the images of a generic sequence
         truth: folder with the ground-truth depth maps of a generic sequence
-        register: leave 7-Scenes' depth in its own camera
         T_color_depth: 7-Scenes: file with the 4x4 transform from the depth to the colour camera [m]
         topics: topics of a ROS bag; write a pose's as TOPIC=FRAME with the frame that it moves
         drive: KITTI-360: name or number of a drive below the root
@@ -64,7 +63,6 @@ class Options:
     max_time_difference: float = 0.02
     images: str | Path | None = field(default=None, metadata=_WORD)
     truth: str | Path | None = field(default=None, metadata=_WORD)
-    register: bool = True
     T_color_depth: np.ndarray | str | Path | None = field(default=None, metadata=_WORD)
     topics: tuple[str, ...] = ()
     drive: str | int | None = field(default=None, metadata=_WORD)

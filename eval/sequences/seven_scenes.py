@@ -46,9 +46,7 @@ def detect(path: Path) -> bool:
 def read(path: Path, options: Options) -> FrameSequence:
     """Opens a 7-Scenes sequence folder (``seq-NN``).
 
-    With ``register`` (the default) depth is warped into the colour camera, and ``T_world_cam`` is the colour camera's.
-    Without it, both are the depth camera's as on disk, with ``depth_intrinsics``, and the 2.5 cm to the colour camera
-    are ignored. A given ``trajectory`` is the colour camera's in any case.
+    Depth is warped into the colour camera, and ``T_world_cam`` is the colour camera's, as is a given ``trajectory``.
     """
     files: dict[str, dict[str, Path]] = {}
     for file in sorted(path.iterdir(), key=natural_key):
@@ -66,17 +64,15 @@ def read(path: Path, options: Options) -> FrameSequence:
     T_color_depth = _T_COLOR_DEPTH if options.T_color_depth is None else options.T_color_depth
     if not isinstance(T_color_depth, np.ndarray):
         T_color_depth = read_pose(resolve(path, T_color_depth))
-    for i, frame in enumerate(frames if options.register else ()):
+    for i, frame in enumerate(frames):
         if isinstance(frame, Entry):
             load = frame.load_depth and partial(
                 _registered, frame.load_depth, K_depth, K_color, T_color_depth, color_size
             )
             T_world_color = frame.T_world_cam @ np.linalg.inv(T_color_depth)
             frames[i] = replace(frame, T_world_cam=T_world_color, load_depth=load)
-    lens = Lens.of(K_color, color_size)
-    if options.register:
-        return assemble("7scenes", path, frames, lens, replace(options, depth_intrinsics=None), depth_size=color_size)
-    return assemble("7scenes", path, frames, lens, options, K_depth=K_depth, depth_size=own_size)
+    options = replace(options, depth_intrinsics=None)
+    return assemble("7scenes", path, frames, Lens.of(K_color, color_size), options, depth_size=color_size)
 
 
 def _read_depth(path: Path, scale: float) -> np.ndarray:

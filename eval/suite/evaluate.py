@@ -12,6 +12,7 @@ import torch
 from ufmstar_torch.eval.engine.anchors import landmark_digests
 from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, evaluate_sequence
 from ufmstar_torch.eval.engine.judge import RowFigures, references
+from ufmstar_torch.eval.engine.predictions import content_digest
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.method import ALONE
@@ -20,7 +21,7 @@ from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.eval.suite.examples import ExampleWriter
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.record import Record
-from ufmstar_torch.eval.suite.work_items import WorkItem, content_digest
+from ufmstar_torch.eval.suite.work_items import WorkItem
 from ufmstar_torch.recalibrate import Recalibration
 
 _NO_POSES = "its images have no poses: the rows of networks alone are finished, {} that compare views cannot be had"

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.engine.predictions import sequence_digest
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 
 TOUR = "tour"
@@ -139,16 +138,6 @@ def read_names(file: Path) -> list[str]:
     if not names:
         raise ValueError(f"--sequence-list {file} names no sequence")
     return names
-
-
-def content_digest(sequence: FrameSequence) -> str:
-    """Hex digest of what is known of a sequence before it is decoded: frames, cameras and poses."""
-    K = sequence.depth_intrinsics
-    digest = hashlib.sha256(sequence_digest(sequence).encode())
-    digest.update(repr((None if K is None else K.tolist(), sequence.depth_size)).encode())
-    for entry in sequence.entries:
-        digest.update(entry.T_world_cam.tobytes() + bytes([entry.load_depth is not None]))
-    return digest.hexdigest()
 
 
 def _below(root: str, layout: str, plugin: Sequence[str]) -> list[WorkItem]:
