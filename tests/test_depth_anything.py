@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from scenes import look, render
 from ufmstar_torch import UncertainDepth, cli
 from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.eval.engine.load import network_source, sha256
+from ufmstar_torch.eval.engine.load import NetworkChoice, sha256
 from ufmstar_torch.models import (
     CheckpointError,
     DepthAnything,
@@ -367,5 +367,5 @@ def test_a_directory_is_identified_by_its_visible_files(broken, metric):
     assert sha256(broken) == sha256(metric)
     (broken / "config.json").rename(broken / "config2.json")
     assert sha256(broken) != sha256(metric)
-    identity = network_source("depth_anything", [metric]).identity
+    identity = NetworkChoice("", "depth_anything", (str(metric),)).load(torch.device("cpu")).identity
     assert identity["files"] == [{"name": "metric", "sha256": sha256(metric), "member": None}]

@@ -18,7 +18,7 @@ from runs import job_of, outputs, read_summary
 from shared_data import require_shared
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.load import NetworkChoice, network_source
+from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.sequences import open_sequence
@@ -62,7 +62,7 @@ def frame(height: int = 60, width: int = 80) -> Frame:
 
 
 def predicted(model: str, file: Path, inference: Inference) -> tuple[Tensor, dict[str, Any]]:
-    source = network_source(model, [file], inference=inference)
+    source = NetworkChoice("", model, (str(file),)).load(CPU, inference=inference)
     return source.one(frame(), 0).depth[0], {**source.runtime, "identity": source.identity}
 
 
@@ -151,13 +151,10 @@ def test_refusals(
 ) -> None:
     spec = tmp_path / "spec.json"
     spec.write_text(json.dumps(METRIC))
+    file = trained if model == "trained" else weights
+    choice = NetworkChoice("", model, (str(file),), str(spec) if model == "onnx" else None)
     with pytest.raises(ValueError, match=message):
-        network_source(
-            model,
-            [trained if model == "trained" else weights],
-            spec=spec if model == "onnx" else None,
-            inference=Inference(**inference),
-        )
+        choice.load(CPU, inference=Inference(**inference))
 
 
 def test_a_resumed_run_is_the_same_and_needs_the_same_runtime(tmp_path: Path, weights: Path) -> None:
@@ -165,7 +162,7 @@ def test_a_resumed_run_is_the_same_and_needs_the_same_runtime(tmp_path: Path, we
     sequence = open_sequence(tmp_path / "seq" / "rgbd_dataset_freiburg2_desk")
 
     def job(inference: Inference) -> Any:
-        return job_of(sequence, network_source("fastdepth", [weights], inference=inference))
+        return job_of(sequence, NetworkChoice("", "fastdepth", (str(weights),)).load(CPU, inference=inference))
 
     run(job(Inference()), tmp_path / "whole")
     stops = iter([False, True])

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.eval.engine.load import network_source
+from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.models import (
     CheckpointError,
     MonodepthResNet,
@@ -158,7 +158,7 @@ def test_published_weights_predict_metric_depth(tmp_path: Path) -> None:
         raw = F.conv2d(features, decoder["decoder.10.conv.weight"], decoder["decoder.10.conv.bias"])[:, 0]
         expected = 5.4 / (0.01 + (10 - 0.01) / (1 + (-raw).exp()))
         torch.testing.assert_close(network(image).depth, expected, rtol=1e-4, atol=1e-5)
-    source = network_source("monodepth2", [tmp_path])
+    source = NetworkChoice("", "monodepth2", (str(tmp_path),)).load(torch.device("cpu"))
     assert source.label == "ResNet18-Monodepth2"
 
 

@@ -13,7 +13,7 @@ from tiny_suite import CPU, base_network, evaluate, row, same, unbatched
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.eval.engine.judge import SequenceError
-from ufmstar_torch.eval.engine.load import network_source
+from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
@@ -159,7 +159,8 @@ def test_samples_depend_on_the_frame_and_their_number_alone(network_files, netwo
     for key in reversed(requested):
         assert torch.equal(other.one(frames[key[0]], key[1]).depth, first[key])
     assert not torch.equal(first[0, 0], first[0, 1])
-    of_run = network_source("trained", [network_files["mc_dropout"].partition(":")[2]], mode="full", samples=3)
+    choice = NetworkChoice("", "trained", (network_files["mc_dropout"].partition(":")[2],))
+    of_run = choice.load(CPU, mode="full", samples=3)
     assert torch.equal(of_run.one(frames[2], 1).depth, first[2, 1]), "ufmstar run draws the same"
     same_image = replace(frames[0], index=1)
     assert not torch.equal(network.one(same_image, 0).depth, first[0, 0]), "each frame has its own draw"

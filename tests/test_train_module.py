@@ -13,7 +13,7 @@ from torch.nn.functional import interpolate
 from trainings import tiny_job
 
 from ufmstar_torch import cli
-from ufmstar_torch.eval.engine.load import network_source
+from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.models import (
     AleatoricHead,
     DepthAnything,
@@ -149,7 +149,8 @@ def test_a_checkpoint_from_the_command_line(frames, tmp_path, kind, capsys):
     x = torch.rand(1, 3, 70, 84, generator=torch.Generator().manual_seed(0))
     prediction = network(x)
     assert prediction.variance.isfinite().all()
-    assert network_source("trained", [tmp_path / "out" / "trained.safetensors"]).label == "checkpoint"
+    choice = NetworkChoice("", "trained", (str(tmp_path / "out" / "trained.safetensors"),))
+    assert choice.load(torch.device("cpu")).label == "checkpoint"
     declared = network.backbone.network
     if kind == "metric":
         expected = load_network("huggingface", tmp_path / "gone", spec={"size": [70, 84], "keep_aspect": False})

@@ -15,7 +15,7 @@ from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.parts import MULTIVIEW
 from ufmstar_torch.eval.bench.timing import most_threads
-from ufmstar_torch.eval.engine.load import load_members
+from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
@@ -149,8 +149,8 @@ def _random(options: BenchSettings, side: int, device: torch.device) -> TimedNet
 def _loaded(options: BenchSettings, threads: int, device: torch.device) -> TimedNetwork:
     """The network of the options, as ``ufmstar run`` runs it."""
     inference = Inference(runtime=options.runtime, threads=threads)
-    loaded = load_members(options.model, [str(options.weights)], spec=options.spec, inference=inference, device=device)
-    members = [member.to(device) for member in loaded]
+    choice = NetworkChoice("", options.model, (str(options.weights),), options.spec and str(options.spec))
+    members = [member.to(device) for member in choice.members(device, inference=inference)]
     return TimedNetwork("ensemble" if len(members) > 1 else "depth_only", members, options.model)
 
 

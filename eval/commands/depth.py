@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.options import MachineOptions, fields_of, option
-from ufmstar_torch.eval.engine.load import network_source
+from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.maps import MapSource, folder_source, own_depth
-from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
@@ -63,18 +64,12 @@ class NetworkOptions:
         if self.samples is not None and self.mode != "full":
             raise ValueError("--samples goes with --mode full only")
 
-    def load(self, machine: MachineOptions) -> NetworkSource:
-        """The networks on a device; errors as ``network_source``."""
-        return network_source(
-            str(self.model),
-            self.weights,
-            spec=self.spec,
-            mode=self.mode,
-            samples=self.samples,
-            offload=self.offload,
-            inference=Inference(self.runtime, self.precision, machine.threads),
-            device=machine.device,
-        )
+    def load(self, machine: MachineOptions) -> DepthSource:
+        """The networks on a device; errors as ``NetworkChoice.load``."""
+        choice = NetworkChoice("", str(self.model), self.weights, self.spec)
+        inference = Inference(self.runtime, self.precision, machine.threads)
+        how: dict[str, Any] = {"mode": self.mode, "samples": self.samples, "offload": self.offload}
+        return choice.load(torch.device(machine.device), **how, inference=inference)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -194,7 +194,7 @@ def _events(options: LiveOptions) -> Iterator[LiveEvent]:
 
 
 def _model(options: LiveOptions) -> UncertainDepth:
-    """The networks with UfM*, compiled, in the state of ``--state``; errors as ``network_source``."""
+    """The networks with UfM*, compiled, in the state of ``--state``; errors as ``NetworkChoice.load``."""
     chosen, source = options.network, options.network.load(options)
     config, anchors = options.uncertainty.config, options.uncertainty.anchors
     model = UncertainDepth(

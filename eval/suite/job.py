@@ -57,11 +57,10 @@ class EvalJob:
     def load(self, device: torch.device, networks: Mapping[str, NetworkChoice] | None = None) -> dict[str, DepthSource]:
         """Load those networks (None: of the evaluated ones) that the rows need. Raises FileNotFoundError, ValueError,
         ImportError, see ``NetworkChoice.load``."""
-        passes = {} if self.samples is None else {"samples": self.samples}
         networks = self.networks if networks is None else networks
         needed = [networks[base] for base in self.suite.bases if base in networks]
         inference = Inference(self.runtime, self.precision)
-        return {choice.base: choice.load(device, inference=inference, **passes) for choice in needed}
+        return {choice.base: choice.load(device, samples=self.samples, inference=inference) for choice in needed}
 
     def judge(self, networks: Mapping[str, DepthSource], device: torch.device) -> Judge:
         """The judge of sequences by the loaded networks. Raises CacheError: the folder of predictions cannot be
