@@ -149,7 +149,9 @@ def _random(options: BenchSettings, side: int, device: torch.device) -> TimedNet
 def _loaded(options: BenchSettings, threads: int, device: torch.device) -> TimedNetwork:
     """The network of the options, as ``ufmstar run`` runs it."""
     inference = Inference(runtime=options.runtime, threads=threads)
-    choice = NetworkChoice("", options.model, (str(options.weights),), options.spec and str(options.spec))
+    choice = NetworkChoice(
+        "", options.model, (str(options.weights),), None if options.spec is None else str(options.spec)
+    )
     members = [member.to(device) for member in choice.members(device, inference=inference)]
     return TimedNetwork("ensemble" if len(members) > 1 else "depth_only", members, options.model)
 
