@@ -45,11 +45,9 @@ class Backend:
     check: CheckKernel
     slow: bool = False
 
-    def spgf(self, depth, intrinsics, config=None, *, variance=None, valid=None, features=None, before_pruning=False):
-        """Step 2 with the arguments of ``ufmstar_torch.segment.spgf``."""
-        given = SegmentInput.checked(depth, intrinsics, config, variance, valid, features)
-        kernel: Any = self.kernels.spgf
-        return kernel(given, before_pruning=before_pruning)
+    def spgf(self, depth, intrinsics, config, *, features=None):
+        """Step 2 of depth maps [B, H, W]."""
+        return self.kernels.spgf(SegmentInput.of(depth, intrinsics, config, features))
 
     def module(self, config: UfMStarConfig, dtype: torch.dtype = torch.float32) -> Callable[..., Any]:
         """A UfM* of this backend that takes and returns CPU tensors; the module itself is its ``ufm``."""

@@ -97,7 +97,6 @@ def segment(
     settings: Settings,
     *,
     valid: NDArray[np.bool_] | None = None,
-    variance: Array | None = None,
 ) -> tuple[list[Piece], NDArray[np.int64]]:
     """All Gaussians in emission order, before pruning, and the label of every pixel (-1 = none)."""
     height, width = depth.shape
@@ -106,10 +105,7 @@ def segment(
         use = np.isfinite(z) & (z > 0) & (z <= settings.max_depth)
     if valid is not None:
         use &= valid
-    if variance is not None:
-        with np.errstate(invalid="ignore"):
-            use &= np.isfinite(variance) & (variance >= 0)
-    frame = _Frame(z, use, variance, camera, settings, *bins(settings, camera, height, width))
+    frame = _Frame(z, use, camera, settings, *bins(settings, camera, height, width))
 
     active: list[Piece] = []
     emitted: list[Piece] = []
@@ -134,7 +130,6 @@ def segment(
 class _Frame:
     z: Array
     use: NDArray[np.bool_]
-    variance: Array | None
     camera: Camera
     settings: Settings
     lengths: list[float]
@@ -153,8 +148,6 @@ class _Frame:
             c = self.camera
             p = np.array([(u - c.cx) * z / c.fx, (v - c.cy) * z / c.fy, z])
             moment = np.outer(p, p)
-            if self.variance is not None:
-                moment = moment + self.variance[v, u] * np.outer(p / z, p / z)
             k = sum(edge < z for edge in self.edges)
             for o in queue:
                 if self._fits(o, u, p, k):

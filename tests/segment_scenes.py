@@ -65,15 +65,13 @@ def upstream_config(p: dict[str, float]) -> SPGFConfig:
     )
 
 
-def run_oracle(
-    depth: Tensor, K: Tensor, config: SPGFConfig, **options: NDArray
-) -> tuple[list[oracle_spgf.Piece], NDArray[np.int64]]:
+def run_oracle(depth: Tensor, K: Tensor, config: SPGFConfig) -> tuple[list[oracle_spgf.Piece], NDArray[np.int64]]:
     """The oracle on depth [H, W] with K [3, 3]."""
     c = config.scaled_to(*depth.shape)
     fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     f = min(fx, fy)
     limits = replace(oracle_settings(c).settings, a=c.slope(f) * f)
-    return oracle_spgf.segment(depth.numpy(), oracle_spgf.Camera(fx, fy, cx, cy), limits, **options)
+    return oracle_spgf.segment(depth.numpy(), oracle_spgf.Camera(fx, fy, cx, cy), limits)
 
 
 def clutter(seed: int, height: int, width: int) -> tuple[Tensor, Tensor]:

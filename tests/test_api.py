@@ -8,7 +8,6 @@ import pytest
 
 import ufmstar_torch
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.segment import spgf
 
 PUBLIC = {
     "DepthPrediction",
@@ -64,8 +63,6 @@ def test_signatures():
     images = ["image", "pose", "intrinsics", "valid", "features", "anchors"]
     assert names(UncertainDepth.forward) == images
     assert names(UncertainDepth.mean_uncertainty) == [*images, "pixels", "fraction", "seed", "average"]
-    assert names(spgf)[:3] == ["depth", "intrinsics", "config"]
-    assert "before_pruning" in names(spgf)
 
 
 def test_the_papers_defaults():

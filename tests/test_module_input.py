@@ -14,7 +14,7 @@ import scenes
 from ufmstar_torch import ConfidenceConfig, PosteriorConfig, SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.gaussian import barycenter
-from ufmstar_torch.segment import spgf
+from ufmstar_torch.segment_input import SegmentInput
 
 pytestmark = pytest.mark.numerics
 
@@ -62,24 +62,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: setattr(UfMStarConfig(), "eta", 0.3), "assign"),
     (lambda: segment({"noise_floor": 0.5}), "noise_floor"),
     (lambda: SPGFConfig.preset("kitti"), "tum, tartanair_indoor, tartanair_outdoor, got 'kitti'"),
-    (lambda: spgf(D.numpy(), K1), "depth must be a torch.Tensor"),  # type: ignore[arg-type]
-    (lambda: spgf(D.long(), K1), "depth must have a floating-point dtype"),
-    (lambda: spgf(D[0], K1), r"depth must be \[B, H, W\]"),
-    (lambda: spgf(D[:0], K1[:0]), r"depth must be \[B, H, W\] with no empty dimension"),
-    (lambda: spgf(D, K1[:1]), r"intrinsics must have shape \(2, 3, 3\)"),
-    (lambda: spgf(D, torch.ones(2, 4, 4)), r"intrinsics must have shape \(2, 3, 3\)"),
-    (lambda: spgf(D, K1.int()), "intrinsics must have a floating-point dtype"),
-    (lambda: spgf(D, K1 * NAN), "intrinsics must be finite with fx, fy > 0"),
-    (lambda: spgf(D, -K1), "intrinsics must be finite with fx, fy > 0"),
-    (lambda: spgf(D, K1.to("meta")), "intrinsics must lie on the depth's device cpu"),
-    (lambda: spgf(D, K1, variance=D[:, :4]), r"variance must have shape \(2, 5, 6\)"),
-    (lambda: spgf(D, K1, variance=D.int()), "variance must have a floating-point"),
-    (lambda: spgf(D, K1, valid=D), "valid must be a torch.bool tensor"),
-    (lambda: spgf(D, K1, valid=D[:1] > 0), r"valid must have shape \(2, 5, 6\)"),
-    (lambda: spgf(D, K1, valid=(D > 0).to("meta")), "valid must lie on the depth's device"),
-    (lambda: spgf(D, K1, features=D), r"features must have shape \(2, -1, 5, 6\)"),
-    (lambda: spgf(D, K1, {}), "config must be an SPGFConfig"),  # type: ignore[arg-type]
-    (lambda: spgf(D, K1, SPGFConfig(min_gaussian_length=1e-6)), "config.min_gaussian_length = 1e-06 m"),
+    (lambda: SegmentInput.of(D, K1, SPGFConfig(min_gaussian_length=1e-6)), "config.min_gaussian_length = 1e-06 m"),
     (lambda: resize_intrinsics(K1, (0, 4), (5, 6)), "positive sizes"),
     (lambda: barycenter(torch.zeros(2, 3), torch.eye(3).expand(2, 3, 3), -torch.ones(2)), "weight must be non-neg"),
 ]

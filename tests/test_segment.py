@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from segment_scenes import REFERENCES, camera, clutter, reference, run_oracle
 
 from ufmstar_torch import segment, segment_fusion
-from ufmstar_torch.config import SPGFConfig, UfMStarConfig
+from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.segment_input import SegmentInput
 
 pytestmark = pytest.mark.numerics
 
@@ -44,6 +45,11 @@ configs = st.builds(
     prune=st.sampled_from(["both", "either", "none"]),
     scale_with_image=st.booleans(),
 )
+
+
+def unpruned(config: SPGFConfig) -> SPGFConfig:
+    """The same thresholds, with every Gaussian kept."""
+    return replace(config, prune="none")
 
 
 def moments(pieces):
@@ -89,13 +95,11 @@ def test_reference_partitions(name, backend):
     if backend.slow or (name, backend.name) == SLOWEST:
         depth = r.depth[:3, 100:120, 80:144].contiguous()
         K = r.intrinsics[:3] - torch.tensor([[0.0, 0, 80], [0, 0, 100], [0, 0, 0]])
-        labels, expected = (
-            b.spgf(depth, K, r.config, before_pruning=True)[1] for b in (backend, make_backend("numba"))
-        )
+        labels, expected = (b.spgf(depth, K, unpruned(r.config))[1] for b in (backend, make_backend("numba")))
         assert torch.equal(labels, expected)
         assert labels.max() > 1
         return
-    mixture, labels = backend.spgf(r.depth, r.intrinsics, r.config, before_pruning=True)
+    mixture, labels = backend.spgf(r.depth, r.intrinsics, unpruned(r.config))
     jittered = 0
     for b, expected in enumerate(r.frames):
         assert np.array_equal(labels[b].numpy(), expected["labels"])
@@ -111,25 +115,19 @@ def test_reference_partitions(name, backend):
     assert jittered == JITTERED[name]
 
 
-@given(st.integers(0, 10**6), configs, st.integers(1, 24), st.integers(1, 30), st.booleans())
-def test_agrees_with_the_oracle(backend, seed, config, height, width, with_options):
+@given(st.integers(0, 10**6), configs, st.integers(1, 24), st.integers(1, 30))
+def test_agrees_with_the_oracle(backend, seed, config, height, width):
     depth, K = clutter(seed, height, width)
-    rng = np.random.default_rng(seed)
-    options = {}
-    if with_options:
-        variance = rng.uniform(0, 0.04, depth.shape)
-        variance[rng.random(depth.shape) < 0.05] = rng.choice([np.nan, -1.0, np.inf])
-        options = {"variance": torch.from_numpy(variance), "valid": torch.from_numpy(rng.random(depth.shape) < 0.9)}
-    pieces, expected = run_oracle(depth[0], K[0], config, **{name: value[0].numpy() for name, value in options.items()})
+    pieces, expected = run_oracle(depth[0], K[0], config)
     scaled = config.scaled_to(height, width)
     large = np.array([scaled.min_pixels <= p.N for p in pieces], dtype=bool)
     tall = np.array([p.n >= scaled.min_rows for p in pieces], dtype=bool)
     keep = {"both": large | tall, "either": large & tall, "none": large | True}[config.prune]
     slot = np.append(np.where(keep, keep.cumsum() - 1, -1), -1)
-    mixture, labels = backend.spgf(depth, K, config, before_pruning=True, **options)
+    mixture, labels = backend.spgf(depth, K, unpruned(config))
     assert np.array_equal(labels[0].numpy(), expected)
     assert_moments(occupied(mixture), moments(pieces))
-    pruned, labels = backend.spgf(depth, K, config, **options)
+    pruned, labels = backend.spgf(depth, K, config)
     assert np.array_equal(labels[0].numpy(), slot[expected])
     assert_moments(occupied(pruned), tuple(value[keep] for value in moments(pieces)))
 
@@ -165,25 +163,19 @@ def test_pruning_at_the_boundary(backend):
         assert actual == expected, prune
 
 
-def test_features_and_variance(backend):
+def test_features_are_means(backend):
     depth, K = clutter(11, 24, 30)
     config = SPGFConfig(sparse=2, min_pixels=10, min_rows=3, scale_with_image=False)
     generator = torch.Generator().manual_seed(1)
     features = torch.randn(1, 3, 24, 30, dtype=torch.float64, generator=generator)
-    variance = 0.1 * torch.rand(1, 24, 30, dtype=torch.float64, generator=generator)
-    plain, labels = backend.spgf(depth, K, config)
+    _, labels = backend.spgf(depth, K, config)
     spoiled = torch.where(labels[:, None] < 0, torch.nan, features)
-    mixture, same = backend.spgf(depth, K, config, features=spoiled, variance=variance)
-    assert torch.equal(labels, same), "the partition does not depend on the variance"
+    mixture, same = backend.spgf(depth, K, config, features=spoiled)
+    assert torch.equal(labels, same)
     assert mixture.components[0] > 3
-    fx, fy, cx, cy = K[0, 0, 0], K[0, 1, 1], K[0, 0, 2], K[0, 1, 2]
     for k in range(int(mixture.components[0])):
         mask = labels[0] == k
         torch.testing.assert_close(mixture.features[0, k], features[0][:, mask].mean(1), rtol=1e-12, atol=1e-12)
-        v, u = mask.nonzero().unbind(1)
-        r = torch.stack([(u - cx) / fx, (v - cy) / fy, torch.ones_like(u, dtype=torch.float64)])
-        added = (variance[0][mask] * r) @ r.T / (len(u) - 1)
-        torch.testing.assert_close(mixture.covariance[0, k], plain.covariance[0, k] + added, rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize(
@@ -208,15 +200,16 @@ def test_static_bounds_change_nothing(monkeypatch):
     """The loops and tables of an accelerator, run on the CPU."""
     depth, K = (torch.cat(parts) for parts in zip(clutter(8, 14, 22), clutter(9, 14, 22), strict=True))
     config = SPGFConfig(sparse=2, min_pixels=12, min_rows=3, scale_with_image=False)
-    expected = [segment.spgf(depth, K, config, before_pruning=b) for b in (False, True)]
+    given = [SegmentInput.of(depth, K, one) for one in (config, unpruned(config))]
+    expected = [segment.segment(one) for one in given]
     monkeypatch.setattr(segment_fusion, "reads_are_free", lambda device: False)
     monkeypatch.setattr(segment, "reads_are_free", lambda device: False)
-    for before_pruning, (mixture, labels) in zip((False, True), expected, strict=True):
-        static, static_labels = segment.spgf(depth, K, config, before_pruning=before_pruning)
+    for one, (mixture, labels) in zip(given, expected, strict=True):
+        static, static_labels = segment.segment(one)
         assert torch.equal(labels, static_labels)
         for name, value in mixture.padded(static.capacity).tensors().items():
             torch.testing.assert_close(static.tensors()[name], value, rtol=1e-13, atol=1e-15, msg=name)
-        assert static.capacity == (14 * 7 if before_pruning else 14 * 22 // 9)
+        assert static.capacity == (14 * 7 if one.config.prune == "none" else 14 * 22 // 9)
 
 
 @pytest.mark.parametrize("prune", ["both", "either", "none"])
@@ -225,14 +218,8 @@ def test_no_value_is_read_on_other_devices(prune):
     b, height, width = 2, 6, 9
     depth = torch.empty(b, height, width, device="meta")
     config = SPGFConfig(sparse=2, min_pixels=7, min_rows=2, prune=prune, scale_with_image=False)
-    mixture, labels = segment.spgf(
-        depth,
-        torch.empty(b, 3, 3, device="meta"),
-        config,
-        variance=torch.empty_like(depth),
-        valid=torch.empty_like(depth, dtype=torch.bool),
-        features=torch.empty(b, 4, height, width, device="meta"),
-    )
+    features = torch.empty(b, 4, height, width, device="meta")
+    mixture, labels = segment.segment(SegmentInput.of(depth, torch.empty(b, 3, 3, device="meta"), config, features))
     assert labels.shape == depth.shape
     assert mixture.capacity == {"both": 54 // 6, "either": 54 // 7, "none": 18}[prune]
     assert mixture.features.shape == (b, mixture.capacity, 4)
@@ -268,7 +255,7 @@ def test_presets_are_upstreams():
 def test_nothing_to_segment(backend):
     for depth in (torch.zeros(1, 1, 1), torch.full((2, 7, 9), torch.nan), torch.full((1, 8, 3), 1e6)):
         K = camera(5.0, 5.0, 3.0, 2.0).expand(len(depth), 3, 3)
-        mixture, labels = backend.spgf(depth, K, features=torch.ones(len(depth), 2, *depth.shape[1:]))
+        mixture, labels = backend.spgf(depth, K, SPGFConfig(), features=torch.ones(len(depth), 2, *depth.shape[1:]))
         assert bool((labels == -1).all())
         assert not any(value.any() for value in mixture.tensors().values())
         assert mixture.features.shape[::2] == (len(depth), 2)
@@ -277,7 +264,7 @@ def test_nothing_to_segment(backend):
 def test_single_pixels_have_no_covariance(backend):
     config = replace(SMALL, sparse=0, prune="none")
     depth, K = torch.full((1, 1, 1), 2.0), camera(5.0, 5.0, 3.0, 2.0)
-    mixture, labels = backend.spgf(depth, K, config, variance=torch.ones_like(depth))
+    mixture, labels = backend.spgf(depth, K, config)
     assert labels.tolist() == [[[0]]]
     assert mixture.weight.tolist() == [[1.0]]
     assert mixture.count.tolist() == [[1]]
@@ -287,37 +274,28 @@ def test_single_pixels_have_no_covariance(backend):
 
 def test_dtypes(backend):
     depth, K = clutter(21, 20, 24)
-    for dtype, expected in (
-        (torch.float64, torch.float64),
-        (torch.float32, torch.float32),
-        (torch.float16, torch.float32),
-        (torch.bfloat16, torch.float32),
-    ):
+    for dtype in (torch.float64, torch.float32):
         given = depth.to(dtype)
-        mixture, labels = backend.spgf(given, K.float(), SMALL, features=given[:, None].nan_to_num(0, 0, 0))
-        assert {v.dtype for n, v in mixture.tensors().items() if n != "count"} == {expected}
+        mixture, labels = backend.spgf(given, K, SMALL, features=given[:, None].nan_to_num(0, 0, 0))
+        assert {v.dtype for n, v in mixture.tensors().items() if n != "count"} == {dtype}
         assert (labels.dtype, mixture.count.dtype) == (torch.int64, torch.int64)
-        exact, same = backend.spgf(given.double(), K.float(), SMALL)
+        exact, same = backend.spgf(given.double(), K, SMALL)
         assert torch.equal(labels, same)
-        torch.testing.assert_close(mixture.covariance, exact.covariance.to(expected))
-        assert torch.equal(mixture.weight, exact.weight.to(expected))
+        torch.testing.assert_close(mixture.covariance, exact.covariance.to(dtype))
+        assert torch.equal(mixture.weight, exact.weight.to(dtype))
         assert torch.equal(mixture.count, (mixture.weight > 0).long())
         assert not mixture.disagreement.any()
 
 
 def test_arguments_are_left_alone_and_may_be_views(backend):
     depth, K = clutter(22, 20, 24)
-    wide = torch.stack([depth, depth + 1], -1).requires_grad_()
-    view = wide[..., 0]
-    options = {"valid": (depth > 0.5), "variance": torch.full_like(depth, 0.01), "features": depth[:, None].clone()}
-    before = {name: value.clone() for name, value in options.items()}
-    mixture, labels = backend.spgf(view, K.expand(1, 3, 3), UfMStarConfig(segment=SMALL), **options)
-    expected, same = backend.spgf(depth, K, SMALL, **options)
+    wide = torch.stack([depth, depth + 1], -1)
+    view, features = wide[..., 0], depth[:, None].clone()
+    mixture, labels = backend.spgf(view, K.expand(1, 3, 3), SMALL, features=features)
+    expected, same = backend.spgf(depth, K, SMALL, features=features)
     assert torch.equal(labels, same)
     torch.testing.assert_close(mixture.mean, expected.mean, rtol=1e-14, atol=1e-15)  # strides may choose the loops
-    assert not mixture.mean.requires_grad
-    assert torch.equal(view.detach().nan_to_num(), depth.nan_to_num())
-    for name, value in options.items():
-        assert torch.equal(value.nan_to_num(), before[name].nan_to_num()), name
+    for value in (view, features[:, 0]):
+        assert torch.equal(value.nan_to_num(), depth.nan_to_num())
     with torch.inference_mode():
-        assert torch.equal(backend.spgf(depth, K, SMALL, **options)[1], labels)
+        assert torch.equal(backend.spgf(depth, K, SMALL)[1], labels)

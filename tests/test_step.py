@@ -105,9 +105,7 @@ CONFIGS = {
     "default": UfMStarConfig(segment=SMALL),
     "paper": UfMStarConfig.paper().replace(segment=SMALL),
     "overlap": UfMStarConfig(segment=SMALL, disagreement="overlap", overlap_weighted=True, unmeasured="relative"),
-    "full": UfMStarConfig(
-        segment=SMALL, features=2, max_components=12, initial_capacity=3, unmeasured="nan", aleatoric_in_moments=True
-    ),
+    "full": UfMStarConfig(segment=SMALL, features=2, max_components=12, initial_capacity=3, unmeasured="nan"),
     "anchored": UfMStarConfig(segment=SMALL, anchors=AnchorConfig(), unmeasured="nan", prior_mean=0.2),
 }
 
@@ -126,7 +124,6 @@ def frames(count: int, config: UfMStarConfig, dtype: torch.dtype, streams: int =
         if config.features:
             more["features"] = torch.rand(streams, 2, *size, generator=generator, dtype=dtype)
             more["features"][:, 1, 20, 20] = torch.inf
-        if config.aleatoric_in_moments:
             more["aleatoric"] = 0.01 * torch.rand(depth.shape, generator=generator, dtype=dtype)
             more["aleatoric"][:, 3, 3], more["epistemic"] = -1.0, torch.full_like(depth, 0.1)
             more["valid"] = torch.rand(depth.shape, generator=generator) > 0.1

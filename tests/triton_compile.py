@@ -102,7 +102,7 @@ def cases() -> dict[str, Callable[[], object]]:
         )  # fmt: skip
 
     values = depth, torch.eye(4).double().expand(2, 4, 4), K, depth, depth, depth[:, None], depth > 0
-    given = SegmentInput.checked(depth, K, None, depth, depth > 0, depth[:, None])
+    given = SegmentInput.of(depth, K, config.segment, depth[:, None])
     return {
         "regress": lambda: regress.regress_image(m, depth, K, depth > 0, config),
         "regress_subset": lambda: regress.regress_image(
@@ -117,7 +117,7 @@ def cases() -> dict[str, Callable[[], object]]:
         "device": device,
         "device_one": lambda: device(1),
         "device_relative": lambda: device(unmeasured="relative"),
-        "fit": lambda: segment.fit(SegmentInput.checked(depth, K), floor=segment.Floor(0.05, 1e-6)),
+        "fit": lambda: segment.fit(SegmentInput.of(depth, K, config.segment), floor=segment.Floor(0.05, 1e-6)),
     }
 
 

@@ -204,7 +204,6 @@ class UfMStarConfig(Checked):
 
     Attributes:
         segment: thresholds of the segmentation
-        aleatoric_in_moments: add the network's variance per pixel to the Gaussians' covariance
         eta: overlap from which on two Gaussians correspond
         eta_occlusion: overlap with a nearer Gaussian from which on a Gaussian counts as hidden
         near_plane: Gaussians nearer to the camera are not in view
@@ -240,7 +239,6 @@ class UfMStarConfig(Checked):
     """
 
     segment: SPGFConfig = section(SPGFConfig)
-    aleatoric_in_moments: bool = False  # SPGF's optional per-pixel variance: A r r^T added to J
 
     # Correspondence (section "Multiview Gaussian Correspondence")
     eta: float = number(0.5, "eta", "1", 0.0, 1.0, open_low=True)

@@ -13,78 +13,41 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ufmstar_torch.config import SPGFConfig, UfMStarConfig
+from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_fusion import GAUSSIAN_WIDTH, Gaussian, append, fuse_segments, parts, reads_are_free
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.segment_scanline import Frame, Segments, scanlines
 
 
-def spgf(
-    depth: Tensor,
-    intrinsics: Tensor,
-    config: SPGFConfig | UfMStarConfig | None = None,
-    *,
-    variance: Tensor | None = None,
-    valid: Tensor | None = None,
-    features: Tensor | None = None,
-    before_pruning: bool = False,
-) -> tuple[GaussianMixture, Tensor]:
-    """Fit Gaussians to the surfaces of B depth maps.
+@torch.no_grad()
+def segment(given: SegmentInput) -> tuple[GaussianMixture, Tensor]:
+    """Fit Gaussians to the surfaces of B depth maps, float64 inside.
 
-    A pixel takes part if its depth is finite, positive and at most ``max_depth``, its variance, where given,
-    finite and not negative, and ``valid`` allows it. Nothing is differentiated. Nothing waits for an
-    accelerator: there, loops and tables have their static bounds.
-
-    Args:
-        depth: [B, H, W] [m].
-        intrinsics: [B, 3, 3] [px], centre of the first pixel at (0, 0).
-        config: thresholds (``.segment`` of a ``UfMStarConfig``); None = defaults.
-        variance: [B, H, W] [m^2] of the depth; adds s^2 r r^T, r the pixel's ray, to the scatter. The
-            partition does not depend on it.
-        valid: [B, H, W] bool, True = use.
-        features: [B, F, H, W] averaged over the pixels of each Gaussian; not read where no Gaussian is.
-        before_pruning: return every Gaussian that was emitted.
+    Nothing is differentiated. Nothing waits for an accelerator: there, loops and tables have their static bounds.
 
     Returns:
         The mixture [B, K] in the camera frame in order of emission: sample covariance (divisor N - 1;
         zeros for N = 1; eigenvalues not floored), weight = N [px], disagreement 0, count 1. Its dtype is
-        depth's, float32 for half and bfloat16. K is the largest number of Gaussians of any stream, at least 1; on an
-        accelerator the bound that the pruning rule implies.
+        depth's. K is the largest number of Gaussians of any stream, at least 1; on an accelerator the bound that the
+        pruning rule implies.
         Labels [B, H, W] int64: each pixel's slot, -1 = none.
-
-    Raises:
-        TypeError: an argument is no tensor or has the wrong kind of dtype, or config is no config.
-        ValueError: an argument has the wrong shape or lies on another device than depth; on the CPU also
-            intrinsics that are not finite with fx, fy > 0 (elsewhere such a stream's result means nothing).
     """
-    given = SegmentInput.checked(depth, intrinsics, config, variance, valid, features)
-    return segment(given, before_pruning=before_pruning)
-
-
-@torch.no_grad()
-def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Tensor]:
-    """:func:`spgf` of checked input, float64 inside."""
     frame = Frame.of(given)
     segments = scanlines(frame)
-    return _output(frame, segments, *fuse_segments(frame, segments), before_pruning)
+    return _output(frame, segments, *fuse_segments(frame, segments))
 
 
 def _output(
-    frame: Frame, segments: Segments, emitted: Tensor, count: Tensor, member: Tensor, before_pruning: bool
+    frame: Frame, segments: Segments, emitted: Tensor, count: Tensor, member: Tensor
 ) -> tuple[GaussianMixture, Tensor]:
     """Prune, and write the mixture and the labels."""
     given = frame.given
     total = emitted.shape[1]
     g = parts(emitted)
     exists = torch.arange(total, device=count.device) < count[:, None]
-    kept = exists
-    if not before_pruning:
-        kept = exists & _keeps(g.n[..., 0], g.merged[..., 0], given.config)
-    if reads_are_free(count.device):
-        capacity = max(1, int(kept.sum(1).max()))
-    else:
-        capacity = total if before_pruning else min(total, most_kept(given))
+    kept = exists & _keeps(g.n[..., 0], g.merged[..., 0], given.config)
+    capacity = max(1, int(kept.sum(1).max())) if reads_are_free(count.device) else min(total, most_kept(given))
     table = emitted.new_zeros(emitted.shape[0], capacity + 1, GAUSSIAN_WIDTH)
     append(table, torch.zeros_like(count), emitted, kept)
 
@@ -124,12 +87,12 @@ def _mixture(g: Gaussian, labels: Tensor, given: SegmentInput) -> GaussianMixtur
     if given.features is not None:
         features = _feature_means(given.features.to(n.dtype), labels, n)
     return GaussianMixture(
-        mean=g.mean.to(given.dtype),
-        covariance=full.to(given.dtype),
-        weight=n.to(given.dtype),
-        disagreement=torch.zeros_like(n, dtype=given.dtype),
+        mean=g.mean.to(given.depth.dtype),
+        covariance=full.to(given.depth.dtype),
+        weight=n.to(given.depth.dtype),
+        disagreement=torch.zeros_like(n, dtype=given.depth.dtype),
         count=(n > 0).to(torch.int64),
-        features=features.to(given.dtype),
+        features=features.to(given.depth.dtype),
     )
 
 

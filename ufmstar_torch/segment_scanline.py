@@ -44,7 +44,6 @@ class Frame:
     given: SegmentInput
     z: Tensor
     use: Tensor
-    s2: Tensor | None
     rx: Tensor  # [R, W] and [R, 1], the rays
     ry: Tensor
     slope: Tensor  # [B, 1] a / f [1/m]
@@ -58,13 +57,6 @@ class Frame:
         limits = given.config
         z = given.depth.to(dtype)
         use = (z > 0) & (z <= limits.depth_limit)
-        s2 = None
-        if given.variance is not None:
-            s2 = given.variance.to(dtype)
-            use = use & s2.isfinite() & (s2 >= 0)
-            s2 = torch.where(use, s2, 0).reshape(-1, width)
-        if given.valid is not None:
-            use = use & given.valid
         z = torch.where(use, z, 0)
         K = given.intrinsics.to(dtype)
         fx, fy, cx, cy = focal_and_centre(K)
@@ -74,7 +66,7 @@ class Frame:
         # An accelerator does not refuse a camera of NaN, since the check would wait: no index beyond the table then.
         bins = torch.searchsorted(edges, z.reshape(b, -1)).clamp_max(given.depth_bins - 1)
         return cls(
-            given, z.reshape(-1, width), use.reshape(-1, width), s2,
+            given, z.reshape(-1, width), use.reshape(-1, width),
             rx.repeat_interleave(height, 0), ry.reshape(-1, 1), limits.slope(torch.minimum(fx, fy))[:, None],
             bins.reshape(-1, width), lengths * lengths,
         )  # fmt: skip
@@ -123,8 +115,6 @@ class _Column:
     length2: Tensor
     tau_z: Tensor
     tau_x: Tensor
-    rx: Tensor
-    s2: Tensor | None
 
 
 def _columns(frame: Frame) -> Iterator[_Column]:
@@ -138,11 +128,10 @@ def _columns(frame: Frame) -> Iterator[_Column]:
         "length2": frame.per_row(frame.lengths2).gather(1, frame.bins),
         "tau_z": (6.0 * t).clamp(limits.noise_floor, limits.noise_thresh),
         "tau_x": t.clamp(limits.noise_floor, limits.line_thresh),
-        "rx": frame.rx,
     }
     for u in range(frame.z.shape[1]):
         here = {name: value[:, u : u + 1] for name, value in maps.items()}
-        yield _Column(u=u, s2=None if frame.s2 is None else frame.s2[:, u : u + 1], **here)
+        yield _Column(u=u, **here)
 
 
 def scanlines(frame: Frame) -> Segments:
@@ -198,16 +187,13 @@ def _fresh(p: _Column, started: Tensor) -> Tensor:
 def _extended(open_: OpenSegment, p: _Column, y_factor: Tensor) -> OpenSegment:
     """Every open segment with the pixel added; the caller picks the one it belongs to."""
     dx, dz = p.x - open_.x_left, p.z - open_.z_left
-    dxx, dxz, dzz = open_.dxx + dx * dx, open_.dxz + dx * dz, open_.dzz + dz * dz
-    if p.s2 is not None:
-        dxx, dxz, dzz = dxx + p.s2 * (p.rx * p.rx), dxz + p.s2 * p.rx, dzz + p.s2
     return open_._replace(
         n=open_.n + 1,
         dx=open_.dx + dx,
         dz=open_.dz + dz,
-        dxx=dxx,
-        dxz=dxz,
-        dzz=dzz,
+        dxx=open_.dxx + dx * dx,
+        dxz=open_.dxz + dx * dz,
+        dzz=open_.dzz + dz * dz,
         x_right=p.x.expand_as(dx),
         z_right=p.z.expand_as(dz),
         w2=dx * dx + y_factor * (dz * dz),

@@ -47,20 +47,17 @@ class _Limits(NamedTuple):
     min_rows: int
 
 
-def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Tensor]:
+def segment(given: SegmentInput) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.segment.segment`, for CPU tensors, float64 inside."""
-    mixture, labels = gaussians(given, before_pruning=before_pruning)
+    mixture, labels = gaussians(given)
     return mixture, labels()
 
 
-def gaussians(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Callable[[], Tensor]]:
+def gaussians(given: SegmentInput) -> tuple[GaussianMixture, Callable[[], Tensor]]:
     """The mixture of :func:`segment`, and a function that writes the labels."""
     z = array(given.depth)
     streams, height, width = z.shape
-    absent = (streams, height, 0)  # rows of no pixels stand for "not given"
-    use = np.empty(absent, np.bool_) if given.valid is None else array(given.valid)
-    spread = np.empty(absent, z.dtype) if given.variance is None else array(given.variance)
-    limits = _limits(given.config, given.depth_bins, before_pruning)
+    limits = _limits(given.config, given.depth_bins)
     room = height * given.segments_per_row
     spans, runs = np.empty((streams, height, 4), np.int64), np.empty((streams, height * width, 2), np.int32)
     table, table_int = np.empty((streams, room, SEGMENT)), np.empty((streams, room, SEGMENT_INT), np.int64)
@@ -73,7 +70,7 @@ def gaussians(given: SegmentInput, *, before_pruning: bool = False) -> tuple[Gau
         bins = _depth_bins(0.5 * min(width / fx, height / fy), limits)
         tables = spans[b], table[b], table_int[b]
         for first, last in itertools.pairwise(rows):
-            scans.append((z[b], use[b], spread[b], fx, fy, cx, cy, slope, *bins, limits, first, last, *tables, runs[b]))
+            scans.append((z[b], fx, fy, cx, cy, slope, *bins, limits, first, last, *tables, runs[b]))
         joins.append((width, fy, cy, slope, bins[0], limits, *tables))
     each(scan_rows, scans)
     joined = each(join_rows, joins)
@@ -84,7 +81,7 @@ def gaussians(given: SegmentInput, *, before_pruning: bool = False) -> tuple[Gau
             write_labels(spans[b], runs[b], slot, out[b])
         return torch.from_numpy(out)
 
-    dtype = np.float32 if given.dtype == torch.float32 else np.float64
+    dtype = z.dtype
     k = max(1, *(kept.size for kept, *_ in joined))
     mean, covariance = np.zeros((streams, k, 3), dtype), np.zeros((streams, k, 3, 3), dtype)
     weight, count = np.zeros((streams, k), dtype), np.zeros((streams, k), np.int64)
@@ -109,7 +106,7 @@ def _feature_means(features: np.ndarray, labels: np.ndarray, weight: np.ndarray)
 
 
 @functools.lru_cache(maxsize=16)
-def _limits(c: SPGFConfig, depth_bins: int, before_pruning: bool) -> _Limits:
+def _limits(c: SPGFConfig, depth_bins: int) -> _Limits:
     return _Limits(
         noise_floor=float(c.noise_floor),
         noise_thresh=float(c.noise_thresh),
@@ -123,7 +120,7 @@ def _limits(c: SPGFConfig, depth_bins: int, before_pruning: bool) -> _Limits:
         n_check=c.n_check,
         max_open=c.max_open,
         sparse=c.sparse,
-        prune=0 if before_pruning else _PRUNE[c.prune],
+        prune=_PRUNE[c.prune],
         min_pixels=c.min_pixels,
         min_rows=c.min_rows,
     )

@@ -43,9 +43,7 @@ class _Open(NamedTuple):
 
 
 @kernel
-def scan_rows(
-    z, use, spread, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, spans, table, table_int, runs
-):
+def scan_rows(z, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, spans, table, table_int, runs):
     """Scanline segmentation of the rows from ``first`` to ``last``, each on its own.
 
     Finished segments go to ``table`` and ``table_int``, from row ``first * most`` on, with at most ``most`` of an image
@@ -54,25 +52,22 @@ def scan_rows(
     its runs.
     """
     width = z.shape[1]
-    depth, x, tau_z, s2 = (
-        empty(width, np.float64),
-        empty(width, np.float64),
-        empty(width, np.float64),
-        empty(width, np.float64),
-    )
-    row, rx = (depth, x, tau_z, s2), empty(width, np.float64)
+    depth, x, tau_z = empty(width, np.float64), empty(width, np.float64), empty(width, np.float64)
+    rx = empty(width, np.float64)
     for u in range(width):
-        rx[u], s2[u] = (u - cx) / fx, 0.0
+        rx[u] = (u - cx) / fx
     place = empty(width + 1, np.int32)  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
     older = empty((limits.max_open, 15), np.float64)
     end, pixels = first * segments_of_row(width, limits), first * width
     for v in range(first, last):
         spans[v, 0], spans[v, 2] = end, pixels
-        _usable(z, use, spread, v, limits.max_depth, depth, s2)
+        for u in range(width):
+            d = np.float64(z[v, u])
+            depth[u] = d if (d > 0) & (d <= limits.max_depth) else 0.0  # NaN fails every comparison
         _thresholds(depth, rx, slope, limits, x, tau_z)
         end, pixels = _scanline(
-            row, rx, (v - cy) / fy, slope, lengths2, edges, limits, spread.size > 0, older, table,
-            table_int, end, place, runs, pixels,
+            (depth, x, tau_z), (v - cy) / fy, slope, lengths2, edges, limits, older, table, table_int, end, place,
+            runs, pixels,
         )  # fmt: skip
         spans[v, 1], spans[v, 3] = end, pixels
 
@@ -81,19 +76,6 @@ def scan_rows(
 def segments_of_row(width, limits):
     """The most segments that one row can have: each has more than ``sparse`` pixels."""
     return max(width // (limits.sparse + 1), 1)
-
-
-@leaf
-def _usable(z, use, spread, v, max_depth, depth, s2):
-    """Depth and variance of the pixels of row v, depth 0 for those that take no part. NaN fails every comparison."""
-    for u in range(z.shape[1]):
-        d = np.float64(z[v, u])
-        depth[u] = d if (d > 0) & (d <= max_depth) else 0.0
-    for u in range(use.shape[1]):
-        depth[u] = depth[u] if use[v, u] else 0.0
-    for u in range(spread.shape[1]):
-        s2[u] = spread[v, u]
-        depth[u] = depth[u] if (s2[u] >= 0) & (s2[u] < np.inf) else 0.0
 
 
 @leaf
@@ -118,17 +100,15 @@ def _near(x, z, last_x, last_z, tau_z, slope, limits):
 
 @leaf
 def _scanline(
-    row, rx, ry, slope, lengths2, edges, limits, spread, older, segments, segments_int, done,
-    place, runs, run,
+    row, ry, slope, lengths2, edges, limits, older, segments, segments_int, done, place, runs, run,
 ):  # fmt: skip
-    """Scanline segmentation of a row, of which ``row`` are depth, x, tau_z and variances.
+    """Scanline segmentation of a row, of which ``row`` are depth, x and tau_z.
 
     Writes the finished segments from ``done`` on and the runs from ``run`` on; returns the end of both. The newest open
     segment lives in registers, the others in a ring of max_open - 1 places, ``front`` being the newest of them.
     ``place`` is scratch.
     """
-    depth, x, tau_z, s2 = row
-    stop = 0 if spread else depth.size
+    depth, x, tau_z = row
     y_factor, room, first_run = 1.0 + ry * ry, limits.max_open - 1, run
     front = waiting = started = u = k = ZERO
     low, high, length2 = 0.0, edges[0], lengths2[0]  # of depth bin k
@@ -149,7 +129,7 @@ def _scanline(
         if not (newest.n > 0 and _fits(newest, x[u], z, u, slope, tau_z[u], length2, limits)):
             q = _waiting_match(older, front, waiting, room, x[u], z, u, slope, tau_z[u], length2, limits)
             if q >= 0:
-                match = _extended(_load(older, q), x[u], z, u, k, y_factor, rx[u], s2[u])
+                match = _extended(_load(older, q), x[u], z, u, k, y_factor)
                 _store(older, q, match)
                 run = _begun(runs, first_run, run, u, match.born)
                 u += 1
@@ -161,14 +141,14 @@ def _scanline(
             started += 1
             newest = _fresh(u, k, started, x[u], z)
         run = _begun(runs, first_run, run, u, started)
-        newest = _extended(newest, x[u], z, u, k, y_factor, rx[u], s2[u])
+        newest = _extended(newest, x[u], z, u, k, y_factor)
         u += 1
         # Pixels that follow in the same depth bin; holes are in none.
-        while 0 <= u < stop:  # the index is not negative: no wrap-around to compile
+        while 0 <= u < depth.size:  # the index is not negative: no wrap-around to compile
             near = _continues(newest, x[u], depth[u], slope, tau_z[u], limits)
             if not (near & (depth[u] > low) & (depth[u] <= high) & (newest.w2 < length2)):
                 break
-            newest = _extended(newest, x[u], depth[u], u, k, y_factor, 0.0, 0.0)
+            newest = _extended(newest, x[u], depth[u], u, k, y_factor)
             u += 1
     if newest.n > 0:
         done = _finish(newest, limits.sparse, segments, segments_int, done, place)
@@ -237,15 +217,12 @@ def _waiting_match(older, front, waiting, room, x, z, u, slope, tau_z, length2, 
 
 
 @leaf
-def _extended(o, x, z, u, k, y_factor, rx, s2):
+def _extended(o, x, z, u, k, y_factor):
     """The open segment with a pixel added."""
     dx, dz = x - o.x_left, z - o.z_left
-    dxx, dxz, dzz = o.dxx + dx * dx, o.dxz + dx * dz, o.dzz + dz * dz
-    if s2 > 0:
-        dxx, dxz, dzz = dxx + s2 * (rx * rx), dxz + s2 * rx, dzz + s2
     return _Open(
         o.n + 1, o.u_left, u, min(o.nearest, k), o.born, o.x_left, o.z_left, x, z,
-        dx * dx + y_factor * (dz * dz), o.dx + dx, o.dz + dz, dxx, dxz, dzz,
+        dx * dx + y_factor * (dz * dz), o.dx + dx, o.dz + dz, o.dxx + dx * dx, o.dxz + dx * dz, o.dzz + dz * dz,
     )  # fmt: skip
 
 

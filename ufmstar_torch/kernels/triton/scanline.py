@@ -52,8 +52,6 @@ def scanlines(given: SegmentInput) -> Rows:
         return torch.empty(*shape, dtype=dtype, device=device)
 
     camera, depth = given.intrinsics.to(torch.float64).contiguous(), given.depth.contiguous()
-    valid = depth if given.valid is None else given.valid.contiguous()
-    spread = depth if given.variance is None else given.variance.contiguous()
     lengths2 = torch.empty(b, given.depth_bins, dtype=torch.float64, device=device)
     bins = torch.empty(b, height, width, dtype=torch.int16, device=device)
     launch(
@@ -69,10 +67,9 @@ def scanlines(given: SegmentInput) -> Rows:
     )  # fmt: skip
     lanes = min(power_of_two(rows), 256) if interpreted() else 32  # the interpreter takes as long for one as for many
     launch(
-        _scanline, (triton.cdiv(rows, lanes),), depth, valid, spread, camera, lengths2, bins,
+        _scanline, (triton.cdiv(rows, lanes),), depth, camera, lengths2, bins,
         found.moments, found.whole, found.count, found.owner, found.place, rows, height, width,
         most,
-        masked=given.valid is not None, spread_out=given.variance is not None,
         scale=float(limits.adaptive_thresh_scale), reference=float(limits.reference_focal),
         scaled=limits.scale_with_image, noise_floor=float(limits.noise_floor), noise_thresh=float(limits.noise_thresh),
         line_thresh=float(limits.line_thresh), max_depth=float(limits.depth_limit), gap=limits.occlusion_gap,
@@ -140,8 +137,7 @@ def _finish(
 
 @triton.jit
 def _scanline(
-    depth, valid, spread, camera, lengths2, bins, moments, whole, counts, owner, place, rows, height, width, most,
-    masked: tl.constexpr, spread_out: tl.constexpr,
+    depth, camera, lengths2, bins, moments, whole, counts, owner, place, rows, height, width, most,
     scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr, noise_floor: tl.constexpr,
     noise_thresh: tl.constexpr, line_thresh: tl.constexpr, max_depth: tl.constexpr, gap: tl.constexpr,
     n_check: tl.constexpr, sparse: tl.constexpr, max_open: tl.constexpr, places: tl.constexpr,
@@ -170,21 +166,14 @@ def _scanline(
         at = r * width + u
         z = tl.load(depth + at, mask=real_row, other=0.0).to(tl.float64)
         use = (z > 0) & (z <= max_depth)
-        if masked:
-            use = use & (tl.load(valid + at, mask=real_row, other=0) != 0)
-        if spread_out:
-            s2 = tl.load(spread + at, mask=real_row, other=0.0).to(tl.float64)
-            use = use & (s2 >= 0) & (s2 < float("inf"))
-            s2 = tl.where(use, s2, 0.0)[:, None]
         z = tl.where(use, z, 0.0)
-        rx = (u - cx) / fx
-        x = rx * z
+        x = (u - cx) / fx * z
         k = tl.load(bins + at, mask=use, other=0).to(tl.int32)
         length2 = tl.load(lengths2 + b * number + k, mask=use, other=0.0)
         t = slope * z * z
         tau_z = tl.minimum(tl.maximum(6.0 * t, noise_floor), noise_thresh)[:, None]
         tau_x = tl.minimum(tl.maximum(t, noise_floor), line_thresh)[:, None]
-        rx, x, z, k, taken = rx[:, None], x[:, None], z[:, None], k[:, None], use[:, None]
+        x, z, k, taken = x[:, None], z[:, None], k[:, None], use[:, None]
 
         near = (n > 0) & (u - u_right <= gap) & (w2 < length2[:, None])
         close = (tl.abs(z - z_right) < tau_z) & (tl.abs(x - x_right) < tau_x)
@@ -213,8 +202,6 @@ def _scanline(
 
         ex, ez = x - x_left, z - z_left
         xx, xz, zz = dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
-        if spread_out:
-            xx, xz, zz = xx + s2 * (rx * rx), xz + s2 * rx, zz + s2
         n, u_right = tl.where(target, n + 1, n), tl.where(target, u, u_right)
         nearest = tl.where(target, tl.minimum(nearest, k), nearest)
         x_right, z_right = tl.where(target, x, x_right), tl.where(target, z, z_right)

@@ -40,21 +40,18 @@ class Floor:
     epsilon: float
 
 
-def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Tensor]:
+def segment(given: SegmentInput) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.segment.segment`, float64 inside, with its capacity on an accelerator."""
-    mixture, read_labels = fit(given, before_pruning=before_pruning)
+    mixture, read_labels = fit(given)
     return mixture, read_labels()
 
 
-def fit(
-    given: SegmentInput, *, before_pruning: bool = False, floor: Floor | None = None
-) -> tuple[GaussianMixture, Callable[[], Tensor]]:
+def fit(given: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMixture, Callable[[], Tensor]]:
     """The Gaussians of B depth maps.
 
     Args:
         given: checked.
-        before_pruning: keep every Gaussian.
-        floor: of the covariances; the mixture is float64 then. None = none, in the dtype that ``given`` states.
+        floor: of the covariances; the mixture is float64 then. None = none, in the depth's dtype.
 
     Returns:
         The mixture [B, C], and a function that writes and returns the labels [B, H, W] int64.
@@ -63,10 +60,10 @@ def fit(
     device = given.depth.device
     most = given.segments_per_row
     total = most * height
-    capacity = total if before_pruning else min(total, most_kept(given))
+    capacity = min(total, most_kept(given))
     channels = 0 if given.features is None else given.features.shape[1]
     rows = scanlines(given)
-    dtype = given.dtype if floor is None else torch.float64
+    dtype = given.depth.dtype if floor is None else torch.float64
     mixture = GaussianMixture.empty(b, capacity, features=channels, dtype=dtype, device=device)
     member = torch.empty(b * height, most, dtype=torch.int32, device=device)
     slot_of = torch.empty(b, total, dtype=torch.int32, device=device)
@@ -76,10 +73,10 @@ def fit(
         _join, (b,),
         rows.camera, rows.lengths2, rows.moments, rows.whole, rows.count,
         mixture.mean, mixture.covariance, mixture.weight, mixture.count, member, slot_of, height, most, capacity, total,
-        rounded=given.dtype == torch.float32, scale=float(limits.adaptive_thresh_scale),
+        rounded=given.depth.dtype == torch.float32, scale=float(limits.adaptive_thresh_scale),
         reference=float(limits.reference_focal), scaled=limits.scale_with_image, noise_floor=float(limits.noise_floor),
         angle2=float(limits.angle_cosine) ** 2, min_pixels=limits.min_pixels, min_rows=limits.min_rows,
-        prune=0 if before_pruning else _PRUNE[limits.prune], number=given.depth_bins, lifted=floor is not None,
+        prune=_PRUNE[limits.prune], number=given.depth_bins, lifted=floor is not None,
         near_plane=floor.near_plane if floor else 0.0, epsilon=floor.epsilon if floor else 0.0,
         pixel_variance=PIXEL_VARIANCE, lanes=lanes, warps=max(1, min(8, lanes // 32)),
     )  # fmt: skip
