@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.dense_keyframes import Keyframes
 from ufmstar_torch.anchors.dense_memory import Memory
-from ufmstar_torch.anchors.dense_poses import PoseErrors
+from ufmstar_torch.anchors.dense_poses import Fit, PoseErrors
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.tracker import (
     REPEATED,
@@ -91,6 +91,20 @@ class DenseConfig(Checked):
     match_noise: float = number(1.0, "", "1", 0, open_low=True)
     min_share: float = number(0.2, "", "1", 0, 1)
     memory: float = number(0.8, "", "1", 0, 1, open_high=True)
+
+
+class Depths(NamedTuple):
+    """Of N pixels.
+
+    Attributes:
+        pixel: [N, 2] (u, v).
+        rho: [N] inverse depth [1/m].
+        variance: [N] of ``rho`` [1/m^2].
+    """
+
+    pixel: NDArray[np.float64]
+    rho: NDArray[np.float64]
+    variance: NDArray[np.float64]
 
 
 class DenseEvidence(SavedState):
@@ -200,33 +214,47 @@ class DenseEvidence(SavedState):
     def _measured(
         self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray, corners: Landmarks
     ) -> Landmarks:
-        """The depths of a reduced image: landmarks that it shows, measured again where the camera has moved, new ones
-        in the cells between them, and corners where none is. The running estimates follow."""
-        # Kernels compile when they are first needed.
-        from ufmstar_torch.kernels.anchor_check_cpu import check_anchors, confirmed
-        from ufmstar_torch.kernels.dense_cpu import measure
+        """The depths of a reduced image, and corners where none is."""
+        from ufmstar_torch.kernels.anchor_check_cpu import check_anchors  # kernels compile when they are first needed
 
         cell, K = _cell(small.shape[1]), self._errors.camera(K)
-        sighted = self._memory.sighted(small, T, K, cell)
-        known, searched = len(sighted.slot), 0
-        pixel = np.concatenate([sighted.pixel, _pixels(small, cell, sighted.pixel)])
-        rho, variance = np.zeros(len(pixel)), np.ones(len(pixel))
-        agreed, trusted = np.zeros(len(pixel), dtype=np.bool_), not corners.contradicted
-        chosen = self._keyframes.choose(T, K, self._depth, _BASELINES)
-        if chosen and trusted:
-            expected = np.concatenate([np.flatnonzero(sighted.due), np.arange(known, len(pixel))])
-            shares = np.array([share for share, _ in chosen])
-            noise = self._errors.positions(K, small.shape[1], self._depth)[shares]
-            views = self._views([keyframe for _, keyframe in chosen], noise, T, K)
-            self._baseline = float(np.linalg.norm(np.linalg.inv(K) @ views.b[-1]))
-            actual = measure(small, pixel[expected], views, self._search())
-            agreed[expected] = accepted = confirmed(pixel[expected], actual, cell)
-            alike = accepted[actual.agreed + actual.contradicted > 1]
-            trusted &= len(alike) < _ENOUGH or bool(alike.mean() >= self.config.min_share)
-            fit = self._errors.corrected(pixel[expected], actual, accepted, shares, views, K, self._depth, trusted)
-            searched = len(expected)
-            rho[expected], variance[expected] = fit.rho, fit.variance + np.square(_SCALE * fit.rho)
+        trusted = not corners.contradicted
+        compared = self._compared(T, K, small.shape[1]) if trusted else None
+        found, searched, trusted = self._in_cells(small, T, K, cell, compared, trusted)
         self._contradicted = 0 if trusted else self._contradicted + 1
+        if compared is not None and trusted:
+            coarse = self._coarse(small, found.pixel, compared[0], cell)
+            found = Depths(*(np.concatenate(pair) for pair in zip(found, coarse, strict=True)))
+        shared = self._tracker.shared(max(self._baseline, self._tracker.baseline))
+        stated = found.variance + self._memory.apart * np.square(found.rho) + shared
+        surface, alone = check_anchors(small, found.pixel, found.rho, stated, cell)
+        far = self._apart(corners, surface, small.shape[1]) if trusted else np.zeros(0, np.int64)
+        depth = np.concatenate([1 / found.rho, corners.depth[far]])
+        variance = np.concatenate([(stated + alone) * depth[: len(stated)] ** 4, corners.variance[far]])
+        position = (np.concatenate([surface, corners.pixel[far]]) - scale[:2, 2]) / scale.diagonal()[:2]
+        none = corners.none if corners.contradicted else Landmarks.none
+        judged = corners.pose_error, shared, corners.contradicted
+        return Landmarks(position, depth, variance, searched, none, *judged)
+
+    def _in_cells(
+        self,
+        small: NDArray[np.uint8],
+        T: NDArray,
+        K: NDArray,
+        cell: int,
+        compared: tuple[Views, NDArray] | None,
+        trusted: bool,
+    ) -> tuple[Depths, int, bool]:
+        """Landmarks that the image shows, measured again where the camera has moved, and new ones in the cells between
+        them; how many pixels were tried; False where the views contradict each other. The running estimates follow."""
+        sighted = self._memory.sighted(small, T, K, cell)
+        known = len(sighted.slot)
+        pixel = np.concatenate([sighted.pixel, _pixels(small, cell, sighted.pixel)])
+        rho, variance, agreed = np.zeros(len(pixel)), np.ones(len(pixel)), np.zeros(len(pixel), np.bool_)
+        expected = np.concatenate([np.flatnonzero(sighted.due), np.arange(known, len(pixel))])
+        if compared is not None:
+            agreed[expected], fit, trusted = self._searched(small, pixel[expected], *compared, K, cell)
+            rho[expected], variance[expected] = fit.rho, fit.variance + np.square(_SCALE * fit.rho)
         agreed &= (rho > np.sqrt(variance)) & trusted
         both, fine = self._memory.compare(sighted, rho[:known], variance[:known], agreed[:known])
         again, new = np.flatnonzero(agreed[:known] & fine), np.flatnonzero(agreed[known:]) + known
@@ -235,27 +263,30 @@ class DenseEvidence(SavedState):
         rho[:known], variance[:known] = both.rho, both.variance
         kept = np.concatenate([np.flatnonzero(fine), new]) if trusted else new
         if len(kept) >= _ENOUGH:
-            step = (1 - self.config.memory) * np.log(np.median(1 / rho[kept]) / self._depth)
-            self._depth *= float(np.exp(step))
-        shared = self._tracker.shared(max(self._baseline, self._tracker.baseline))
-        pixel, rho, variance = pixel[kept], rho[kept], variance[kept]
-        if searched and trusted:
-            coarse = self._coarse(small, pixel, views, cell)
-            pixel, rho, variance = (np.concatenate(pair) for pair in zip((pixel, rho, variance), coarse, strict=True))
-        stated = variance + self._memory.apart * np.square(rho) + shared
-        surface, alone = check_anchors(small, pixel, rho, stated, cell)
-        far = self._apart(corners, surface, small.shape[1]) if trusted else np.zeros(0, np.int64)
-        depth = np.concatenate([1 / rho, corners.depth[far]])
-        spread = np.concatenate([(stated + alone) * depth[: len(rho)] ** 4, corners.variance[far]])
-        position = (np.concatenate([surface, corners.pixel[far]]) - scale[:2, 2]) / scale.diagonal()[:2]
-        none = corners.none if corners.contradicted else Landmarks.none
-        judged = corners.pose_error, shared, corners.contradicted
-        return Landmarks(position, depth, spread, searched + known, none, *judged)
+            self._depth *= float(np.exp((1 - self.config.memory) * np.log(np.median(1 / rho[kept]) / self._depth)))
+        tried = known + (0 if compared is None else len(expected))
+        return Depths(pixel[kept], rho[kept], variance[kept]), tried, trusted
 
-    def _coarse(
-        self, small: NDArray[np.uint8], taken: NDArray[np.float64], views: Views, cell: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Pixels [M, 2], inverse depths and variances [M] in the cells without a pixel of ``taken`` [N, 2], by windows
+    def _searched(
+        self, small: NDArray[np.uint8], pixel: NDArray, views: Views, shares: NDArray, K: NDArray, cell: int
+    ) -> tuple[NDArray[np.bool_], Fit, bool]:
+        """Which pixels [N, 2] were measured, their depths without the errors of the poses, and whether views agree."""
+        from ufmstar_torch.kernels.anchor_check_cpu import confirmed
+        from ufmstar_torch.kernels.dense_cpu import measure
+
+        self._baseline = float(np.linalg.norm(np.linalg.inv(K) @ views.b[-1]))
+        actual = measure(small, pixel, views, self._search())
+        accepted = confirmed(pixel, actual, cell)
+        alike = accepted[actual.agreed + actual.contradicted > 1]
+        trusted = len(alike) < _ENOUGH or bool(alike.mean() >= self.config.min_share)
+        return (
+            accepted,
+            self._errors.corrected(pixel, actual, accepted, shares, views, K, self._depth, trusted),
+            trusted,
+        )
+
+    def _coarse(self, small: NDArray[np.uint8], taken: NDArray[np.float64], views: Views, cell: int) -> Depths:
+        """Depths of M pixels in the cells without a pixel of ``taken`` [N, 2], by windows
         of twice the width: images and views of half the size."""
         from ufmstar_torch.kernels.anchor_check_cpu import confirmed
         from ufmstar_torch.kernels.dense_cpu import Views, measure
@@ -270,7 +301,7 @@ class DenseEvidence(SavedState):
         found = measure(half, pixel, reduced, self._search())
         variance = _COARSE_NOISE * found.variance + np.square(_SCALE * found.rho)
         fine = confirmed(pixel, found, cell // 2) & (found.rho > np.sqrt(variance))
-        return 2 * pixel[fine] + 0.5, found.rho[fine], variance[fine]
+        return Depths(2 * pixel[fine] + 0.5, found.rho[fine], variance[fine])
 
     def _apart(self, corners: Landmarks, taken: NDArray[np.float64], width: int) -> NDArray[np.int64]:
         """Indices of the corners that become anchors: certain ones, away from the ``taken`` positions [N, 2]."""
@@ -288,15 +319,21 @@ class DenseEvidence(SavedState):
         accepted = config.sigmas, config.least_score, config.rival, config.match_noise
         return Search(over, _FARTHEST * over, _NEAREST * over, *accepted)
 
-    def _views(self, keyframes: list[int], noise: NDArray, T: NDArray, K: NDArray) -> Views:
-        """The chosen keyframes, and how pixels of the camera T [4, 4] get into them."""
+    def _compared(self, T: NDArray, K: NDArray, width: int) -> tuple[Views, NDArray[np.int64]] | None:
+        """The keyframes to compare a camera T [4, 4] with, how its pixels get into them, and [V] to which baseline each
+        belongs; None where there is none."""
         from ufmstar_torch.kernels.dense_cpu import Views
 
+        chosen = self._keyframes.choose(T, K, self._depth, _BASELINES)
+        if not chosen:
+            return None
+        shares, keyframes = (np.array(column) for column in zip(*chosen, strict=True))
         image, pose = self._keyframes.images(keyframes), self._keyframes.poses(keyframes)
         into = pose[:, :3, :3].transpose(0, 2, 1)
         H = K @ into @ T[:3, :3] @ np.linalg.inv(K)
         b = ((T[:3, 3] - pose[:, :3, 3])[:, None] @ pose[:, :3, :3])[:, 0] @ K.T
-        return Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), noise)
+        noise = self._errors.positions(K, width, self._depth)[shares]
+        return Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), noise), shares
 
 
 def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:

@@ -111,11 +111,11 @@ class Keyframes(SavedState):
         inside = (z > 0.2 * depth) & (x > 0) & (y > 0) & (x < (width - 1) * z) & (y < (height - 1) * z)
         return np.asarray(inside.mean(1))
 
-    def images(self, keyframes: list[int]) -> NDArray[np.uint8]:
+    def images(self, keyframes: NDArray[np.int64]) -> NDArray[np.uint8]:
         """[V, H, W] of some."""
         return np.stack([self._image[keyframe] for keyframe in keyframes])
 
-    def poses(self, keyframes: list[int]) -> NDArray[np.float64]:
+    def poses(self, keyframes: NDArray[np.int64]) -> NDArray[np.float64]:
         """[V, 4, 4] camera-to-world of some [m]."""
         return self._pose[keyframes]
 
