@@ -186,6 +186,8 @@ class Preprocess(Checked):
     def resampled(self, image: Tensor) -> Tensor:
         """[B, 3, h, w] in [0, 1], resized, cropped and resized: the reference for every device, type and filter."""
         x = image.to(torch.get_default_dtype()) / 255 if image.dtype == torch.uint8 else image
+        if image.dtype in (torch.float16, torch.bfloat16):  # torch resamples none of these on the CPU
+            return self.resampled(image.float()).to(image.dtype)
         g = self.geometry(*x.shape[-2:])
         x = self._resize(x, g.resized)
         x = x[..., g.top : g.top + g.cropped[0], g.left : g.left + g.cropped[1]]

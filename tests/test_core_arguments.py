@@ -168,8 +168,64 @@ REFUSED = {
         ),
         TypeError, "confidence must have a floating-point",
     ),
+    "an empty batch": (lambda: model(IMAGE[:0]), ValueError, r"image must be \[B, 3, H, W\] RGB"),
+    "a network twice": (lambda: UncertainDepth([Brightness()] * 2), ValueError, "networks must differ"),
+    "a config of plain values": (
+        lambda: UncertainDepth(Brightness(), {"eta": 0.4}), TypeError, "config must be a UfMStarConfig .*got dict"
+    ),
+    "a recalibration's file": (
+        lambda: model(IMAGE, recalibration="a.json"), TypeError, "recalibration must be a Recal.*got str"
+    ),
+    "a size as preprocess": (
+        lambda: model(IMAGE, network=nn.Conv2d(3, 1, 1), preprocess=(8, 8)), TypeError, r"preprocess must .*\(8, 8\)"
+    ),
+    "one side to compile for": (lambda: UfMStar().warm_up(224), ValueError, r"\(H, W\) and B, got 224"),  # type: ignore
+    "a pose of coarse numbers": (
+        lambda: ufm(DEPTH, far(torch.float32), K), ValueError, "pose .* its dtype is exact to 1 cm .*expected float64"
+    ),
+    "a pose of half precision": (
+        lambda: ufm(DEPTH, far(torch.float16, 20.0), K), ValueError, "its dtype is exact to 1 cm .*expected float64"
+    ),
     "a map without knots": (lambda: Recalibration((), ()), ValueError, "Recalibration needs knots"),
 }  # fmt: skip
+
+
+def far(dtype, metres=5e6):
+    """A pose so far from the origin."""
+    T = torch.eye(4, dtype=torch.float64)
+    T[1, 3] = metres
+    return T.to(dtype)
+
+
+def test_numbers_of_numpy_are_numbers():
+    config = UfMStarConfig(max_components=np.int64(100), eta=np.float32(0.5), add_aleatoric=np.bool_(True))
+    assert config == UfMStarConfig(max_components=100, eta=0.5)
+    assert type(config.max_components) is int
+    assert seen().query(np.zeros((1, 5, 3))).disagreement.shape == (1, 5)
+    sample = UfMStar(CONFIG).mean_uncertainty(DEPTH, POSE, K, pixels=np.int64(7))
+    assert sample.total.pixels.tolist() == [7]
+
+
+def test_poses_far_from_the_origin_need_double_precision_alone():
+    assert int(ufm(DEPTH, far(torch.float64), K).statistics.fault[0]) == 0
+    assert int(ufm(DEPTH, far(torch.float32, 5e4), K).statistics.fault[0]) == 0
+    assert int(ufm(DEPTH, far(torch.float16, 5.0), K).statistics.fault[0]) == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_a_first_image_that_is_black_is_named(caplog, dtype):
+    black = torch.zeros(1, 3, H, W, dtype=dtype)
+    uncertain = UncertainDepth(Brightness(), CONFIG)
+    uncertain(black, POSE, K)
+    uncertain(black, POSE, K)
+    assert len([text for text in caplog.messages if "the first image is black" in text]) == 1
+
+
+def test_images_of_half_precision_are_resampled():
+    half = torch.rand(1, 3, 20, 30).half()
+    resampled = Preprocess(size=(8, 12)).apply_image(half)
+    assert resampled.dtype == torch.float16
+    torch.testing.assert_close(resampled.float(), Preprocess(size=(8, 12)).apply_image(half.float()), rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize(("call", "error", "message"), REFUSED.values(), ids=REFUSED)

@@ -290,6 +290,12 @@ def test_many_threads(model):
     [
         (lambda live: live.push_image(float("nan"), PICTURE), ValueError, "stamp must be finite"),
         (lambda live: live.push_pose(10**400, np.eye(4)), ValueError, "stamp must be finite"),
+        (
+            lambda live: live.push_pose(np.float32(1.3e9), np.eye(4)),
+            ValueError,
+            "in seconds and exact to 1 ms, .* 128 s",
+        ),
+        (lambda live: live.push_image(13 * 10**17, PICTURE), ValueError, "in seconds and exact to 1 ms, .* 256 s"),
         (lambda live: live.push_image("1.0", PICTURE), TypeError, "stamp must be a number of seconds, got str"),
         (lambda live: live.push_image(0, PICTURE[..., 0]), ValueError, r"\[H, W, 3\] RGB"),
         (lambda live: live.push_image(0, np.stack([PICTURE] * 2)), ValueError, "must be one image"),
@@ -313,6 +319,10 @@ def test_impossible_settings_are_refused(model, tmp_path):
         LiveDepth(model, print, max_wait=-1)
     with pytest.raises(TypeError, match="on_result must be callable, got NoneType"):
         LiveDepth(model, None)
+    with pytest.raises(TypeError, match="model must be an UncertainDepth, got UfMStar"):
+        LiveDepth(model.ufm, print)
+    with pytest.raises(IsADirectoryError, match="state must be a file"):
+        LiveDepth(model, print, state=tmp_path)
     with pytest.raises(FileNotFoundError, match="state: no such folder"):
         LiveDepth(model, print, state=tmp_path / "nowhere" / "state.pt")
     refused = []
@@ -346,8 +356,8 @@ def test_the_state_goes_on_where_it_ended(model, network, tmp_path):
 
 
 def test_a_state_that_cannot_be_written_is_an_error(model, tmp_path):
-    (tmp_path / "state.pt").mkdir()
     live = LiveDepth(model, lambda _: None, K, state=tmp_path / "state.pt")
+    (tmp_path / "state.pt").mkdir()
     show(live, 0)
     with pytest.raises(OSError, match=r"state\.pt"):
         live.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from functools import cache
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -13,11 +14,12 @@ from scipy.spatial.transform import Rotation
 from shared_data import require_shared
 
 import scenes
-from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.eval.check.image_fit import depth_fit, image_fit, track_corners
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import check_intrinsics
+from ufmstar_torch.models import load_network
 
 H, W = 48, 64
 K = scenes.intrinsics(H, W)
@@ -71,6 +73,64 @@ def test_moving_frames_without_anchors_are_named(caplog):
     pixel = torch.tensor(np.stack([rng.uniform(0, W - 1, (2, n)), rng.uniform(0, H - 1, (2, n))], -1))
     far = Anchors(pixel, torch.full((2, n), 2.0).double(), torch.full((2, n), 1e-2).double())
     assert said(caplog, config=config, anchors=far)[0] == []
+
+
+def turned_K(factor):
+    """K as if for an image ``factor`` times as large."""
+    return K * [[factor], [factor], [1]]
+
+
+SWAPPED = np.array([[K[0, 0], 0, K[1, 2]], [0, K[1, 1], K[0, 2]], [0, 0, 1]])
+STEPS = 18
+# By name: depth [H, W], pose, K and further arguments of frame i, made of right ones; and how it is named.
+SPOILT = {
+    "cx and cy swapped": (lambda i, d, T: (d, T, SWAPPED, {}), "0.38 of the width and 0.67 .* are cx and cy swapped"),
+    "K of a smaller image": (lambda i, d, T: (d, T, turned_K(0.35), {}), "or are these the intrinsics of an image of"),
+    "no principal point": (lambda i, d, T: (d, T, np.diag([K[0, 0], K[1, 1], 1.0]), {}), "point lies at 0.01"),
+    "negative depth": (lambda i, d, T: (-d, T, K, {}), "none of 8 frames has a pixel with a positive and finite depth"),
+    "nothing valid": (lambda i, d, T: (d, T, K, {"valid": d < 0}), "none of 8 frames .* where valid is True"),
+    "logarithm of a variance": (
+        lambda i, d, T: (d, T, K, {"aleatoric": np.log(d / np.median(d))}),
+        r"pixels are left out: of 3072 pixels 0 lie beyond .* and \d+ outside .*logarithms",
+    ),
+    "pixels beyond an unstated range": (lambda i, d, T: (np.where(d > 2, 25.0, d), T, K, {}), "does the network state"),
+    "variance in square millimetres": (
+        lambda i, d, T: (d, T, K, {"epistemic": 1e6 * (0.1 * d) ** 2}), "that epistemic states is over 10 times the de"
+    ),
+    "a pose that is not updated": (
+        lambda i, d, T: (d, WALK[0], K, {}), r"the pose was the same in \d+ frames, in which the depth changed by"
+    ),
+    "a depth map that is not updated": (
+        lambda i, d, T: (np.full_like(d, 2.0), T, K, {}), "depth map was the same in 9 frames of a moving camera"
+    ),
+    "another recording": (
+        lambda i, d, T: (d, rigid(T[:3, :3], T[:3, 3] + [30.0 * (i > 10), 0, 0]), K, {}), "the camera jumped by 30.1 m"
+    ),
+    "another camera": (
+        lambda i, d, T: (d, T, K @ np.diag([1 + 0.5 * (i % 2), 1, 1]), {}),
+        "the focal length changed from frame to frame .*every camera is a stream of its own",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", SPOILT)
+def test_what_frames_show_is_named_once(caplog, mistake):
+    change, words = SPOILT[mistake]
+    walk = [scenes.look([0.1 * i, 0.02 * i, -0.04 * i], 0.05 * i) for i in range(STEPS)]
+    ufm = UfMStar(CONFIG)
+    for i, T in enumerate(walk):
+        depth, pose, camera, given = change(i, scenes.render(T, K, H, W), T)
+        ufm(depth[None], pose, camera, **{name: value[None] for name, value in given.items()})
+    assert len([text for text in caplog.messages if re.search(words, text)]) == 1, caplog.messages
+
+
+def test_a_stream_that_is_reset_may_begin_elsewhere(caplog):
+    ufm, far = UfMStar(CONFIG), [rigid(T[:3, :3], T[:3, 3] + 50) for T in WALK]
+    for poses in (WALK, far):
+        for T in poses:
+            ufm(scenes.render(WALK[0], K, H, W)[None] + 0.01 * T[0, 3], T, K)
+        ufm.reset([0])
+    assert not [text for text in caplog.messages if "jumped" in text]
 
 
 # ---- what tracked corners show: each mistake on recordings and rendered tours ----
@@ -150,6 +210,15 @@ def problems(name, change=same, spoil=same):
     return "" if depths is None else depths.problem
 
 
+@pytest.mark.parametrize("name", [*RECORDINGS, "tour:7?size=120x160", "tour:9?style=hall&size=120x160"])
+def test_a_network_on_right_input_is_not_warned_of(caplog, name):
+    path = name if name.startswith("tour:") else require_shared(f"data/{name}")
+    model = UncertainDepth(load_network("fastdepth", require_shared("weights/fastdepth_nyu.onnx")))
+    for frame in islice(open_sequence(path), 20):
+        model(frame.image, frame.T_world_cam, frame.intrinsics)
+    assert not caplog.messages
+
+
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_right_input_raises_no_alarm(name):
     assert problems(name) == ""
@@ -198,7 +267,10 @@ def test_corrupted_poses_are_named(kind, seed):
         return replace(sequence, entries=tuple(spoilt))
 
     for name in RECORDINGS:
-        assert "poses disagree with the images" in problems(name, change), name
+        problem = problems(name, change)
+        assert "poses disagree with the images" in problem, name
+        for still in re.findall(r"corners fit to ([\d.]+) px then", problem):
+            assert float(still) <= max(1, 0.005 * followed(name)[0].image_size[1]), "what does not fit is no remedy"
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.choose import UncertaintySampler, choose
 from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.tour import export_tour
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
 
 SPEC = NetworkSpec(widths=0.1, positive="softplus", size=(64, 96), preprocess="resize")
@@ -112,6 +113,19 @@ def test_a_pool_of_two_sequences(ufmstar, tmp_path, weights):
     assert json.loads((tmp_path / "out" / "rank.json").read_text())["settings"]["by"] == "total"
     assert np.isfinite([float(row["aleatoric_median_m2"]) for row in rows]).all()
     assert ufmstar(*words)[0] == 2, "an earlier ranking is not overwritten"
+
+
+def test_a_sequence_twice_is_refused_and_wrong_poses_are_named(ufmstar, tmp_path, caplog):
+    words = ("--depth", "self", "--measured", "0", "--out", tmp_path / "out")
+    code, _, err = ufmstar("rank", TOURS[0], TOURS[0], *words)
+    assert code == 2
+    assert "the sequences must differ" in err
+    tour = open_sequence("tour:41?frames=12&size=120x160")
+    path = export_tour(tour, tmp_path / "walk")
+    assert ufmstar("rank", path, *words)[0] == 0
+    assert not caplog.messages
+    assert ufmstar("rank", path, *words, "--overwrite", "--poses", "opengl")[0] == 0
+    assert any(text.startswith(f"{path}: poses disagree with the images") for text in caplog.messages)
 
 
 def test_a_ranking_that_fails_is_no_earlier_one(ufmstar, tmp_path, weights, monkeypatch):

@@ -172,12 +172,16 @@ def test_run_uses_the_map_beside_the_weights(evaluated, tmp_path, capsys):
     try:
         assert cli.main([*words, "--out", str(tmp_path / "mapped")]) == 0
         assert cli.main([*words, "--out", str(tmp_path / "none"), "--recalibration", "none"]) == 0
+        assert cli.main(["run", str(rooms / "ash"), *words[2:], "--out", str(tmp_path / "fitted")]) == 0
         capsys.readouterr()
         assert cli.main([*words, "--out", str(tmp_path / "other"), "--ufm.ema_alpha", "0.7"]) == 2
         assert "ema_alpha = " in capsys.readouterr().err
         assert cli.main([*words, "--out", str(tmp_path / "plain"), "--resume"]) == 2
     finally:
         file.unlink()
+    fitted, other = (json.loads((tmp_path / n / "summary.json").read_text())["warnings"] for n in ("fitted", "mapped"))
+    assert any("was fitted to this sequence" in text for text in fitted)
+    assert not any("was fitted to this sequence" in text for text in other)
     plain, mapped, none = (
         np.stack([np.load(path)["variance"] for path in sorted((tmp_path / name / "frames").glob("*.npz"))])
         for name in ("plain", "mapped", "none")

@@ -47,6 +47,18 @@ def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
     assert ("rooms", job.suite.rows[3]) in results.merged
 
 
+def test_what_does_not_fit_together_is_named_before_it_is_judged(tmp_path, caplog):
+    rooms = write_rooms(tmp_path / "rooms", NAMES[:2])
+    poses = np.loadtxt(rooms / NAMES[1] / "poses.txt").reshape(-1, 4, 4)
+    poses[:, :3, 3] *= 100
+    np.savetxt(rooms / NAMES[1] / "poses.txt", poses.reshape(-1, 16))
+    outcome, _ = go(job_on(rooms, tmp_path / "out"))
+    assert outcome.finished
+    said = [text for text in caplog.messages if "ufmstar data check" in text]
+    assert [text.split(":")[0] for text in said] == [f"rooms/{NAMES[1]}"], said
+    assert "depth looks too small: times 1" in said[0]
+
+
 def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
     job = replace(job_on(rooms, tmp_path / "out"), frames=slice(1, None, 2), examples=1)
     go(job, evaluate_sequence)

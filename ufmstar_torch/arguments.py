@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Shapes = Sequence[tuple[int, ...]]
+_RESOLUTION, _TOO_FAR = 0.01, 1e10  # [m] of the coordinates of a pose, and what coarser ones become
 Array: TypeAlias = Tensor | NDArray[Any]
 # An image may also be Pillow's, and intrinsics four numbers.
 ImageLike: TypeAlias = Any
@@ -55,7 +56,7 @@ def as_image(image: ImageLike) -> Tensor:
     """
     if isinstance(image, Tensor):
         pixels = image[None] if image.dim() == 3 and image.shape[0] == 3 else image
-        if pixels.dim() == 4 and pixels.shape[1] == 3:
+        if pixels.dim() == 4 and pixels.shape[1] == 3 and pixels.numel():
             return pixels
         last = "; its channels come last: image.permute(0, 3, 1, 2)" if pixels.shape[-1:] == (3,) else ""
         raise ValueError(f"image must be [B, 3, H, W] RGB, got a tensor {tuple(image.shape)}{last}")
@@ -64,7 +65,7 @@ def as_image(image: ImageLike) -> Tensor:
     if not isinstance(image, np.ndarray):
         expected = "a torch.Tensor [B, 3, H, W], a NumPy array [H, W, 3] or a Pillow image"
         raise TypeError(f"image must be {expected}, got {type(image).__name__}")
-    if image.ndim not in (3, 4) or image.shape[-1] != 3:
+    if image.ndim not in (3, 4) or image.shape[-1] != 3 or not image.size:
         raise ValueError(f"image as a NumPy array must be [B, H, W, 3] or [H, W, 3] RGB, got {image.shape}")
     pixels = as_tensor("image", image).view(-1, *image.shape[-3:]).permute(0, 3, 1, 2)
     return pixels.to(torch.get_default_dtype()) if pixels.is_floating_point() else pixels
@@ -72,7 +73,8 @@ def as_image(image: ImageLike) -> Tensor:
 
 def as_pose(pose: CameraLike) -> Tensor:
     """[B, 4, 4] or [4, 4] camera-to-world of such a matrix, of one without its last row [..., 3, 4], or of a
-    :class:`PinholeCamera`, whose world-to-camera matrix is inverted.
+    :class:`PinholeCamera`, whose world-to-camera matrix is inverted. Coordinates that its dtype resolves by less than
+    1 cm, as single precision does beyond 84 km, become farther than any that is accepted.
 
     Raises:
         TypeError: something else.
@@ -84,6 +86,10 @@ def as_pose(pose: CameraLike) -> Tensor:
             raise ValueError(f"pose.extrinsics must be [B, 4, 4] world-to-camera, got {tuple(T_cam_world.shape)}")
         return torch.linalg.inv_ex(T_cam_world.double()).inverse  # a singular one becomes infinite: not rigid
     T = _numbers("pose", pose)
+    if T.dtype != torch.float64 and T.shape[-1:] == (4,):
+        coarse = T.abs() > _RESOLUTION / torch.finfo(T.dtype).eps
+        coarse[..., :3] = False
+        T = torch.where(coarse, _TOO_FAR, T.double())
     if T.dim() in (2, 3) and T.shape[-2:] == (3, 4):
         return torch.cat([T, T.new_tensor([[0.0, 0.0, 0.0, 1.0]]).expand(*T.shape[:-2], 1, 4)], dim=-2)
     if T.dim() not in (2, 3) or T.shape[-2:] != (4, 4):

@@ -14,6 +14,8 @@ from dataclasses import MISSING, Field, asdict, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self, get_args, get_type_hints
 
+import numpy as np
+
 
 def number(
     default: float | None,
@@ -51,6 +53,8 @@ class Checked:
         owner = type(self).__name__
         for f in fields(self):
             value = getattr(self, f.name)
+            if isinstance(value, np.generic):
+                object.__setattr__(self, f.name, value := value.item())
             if "range" in f.metadata and not (value is None and f.metadata["optional"]):
                 _check_number(f"{owner}.{f.name}", value, f.metadata)
                 if isinstance(f.default, int) and not isinstance(value, int):

@@ -7,7 +7,7 @@ raises or skips. What is wrong with single pixels becomes ``valid = False`` and 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -25,7 +25,8 @@ FRAME_FAULTS = (
     "pose has a reflection (negative determinant); expected a rotation",
     "intrinsics hold NaN or infinity; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
     "intrinsics are not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0",
-    "pose lies farther from the origin than 1e9 m",
+    "pose lies farther from the origin than 1e9 m, or than its dtype is exact to 1 cm (float32: 84 km, float16: 10 m); "
+    "expected float64, or positions from which an origin was subtracted",
     "intrinsics have a focal length outside [0.01, 1e7] px",
     "intrinsics have their principal point outside the depth map; expected the intrinsics of the depth map, not those "
     "of an image of another size (ufmstar_torch.camera.resize_intrinsics)",
@@ -35,6 +36,9 @@ DEPTH_RANGE = (1e-6, 1e6)  # [m]
 LARGEST = 1e12  # A and E [m^2], and entries of features
 FOCAL_RANGE = (1e-2, 1e7)  # [px]
 FARTHEST = 1e9  # [m] any coordinate of a camera
+# Shares of the image within which the principal point of real cameras and the usual crops lies, and that of a K for
+# twice or half the size does not.
+CENTRE_RANGE = (0.2, 0.8)
 
 
 @dataclass(frozen=True)
@@ -264,6 +268,18 @@ def intrinsics_fault(K: Tensor, size: tuple[float, ...]) -> Tensor:
     focal = (torch.minimum(fx, fy) < low) | (torch.maximum(fx, fy) > high)
     outside = (torch.minimum(cx, cy) < -0.5) | (cx > size[1] - 0.5) | (cy > size[0] - 0.5)
     return _code({5: ~K.isfinite().all((-2, -1)), 6: shape, 8: focal, 9: outside})
+
+
+def doubtful_centre(K: Sequence[Sequence[float]], size: tuple[int, int]) -> str:
+    """Why the principal point of K [px] can hardly be that of a map of ``size`` (H, W): it lies near the border, or as
+    if cx and cy were swapped, which makes the product of their shares 1/4. "" = it can."""
+    x, y = (K[0][2] + 0.5) / size[1], (K[1][2] + 0.5) / size[0]
+    low, high = CENTRE_RANGE
+    swapped = min(abs(x - 0.5), abs(y - 0.5)) > 0.08 and abs(4 * x * y - 1) < 0.15
+    if low < min(x, y) and max(x, y) < high and not swapped:
+        return ""
+    where = f"the principal point lies at {x:.2f} of the width and {y:.2f} of the height, far from the middle"
+    return f"{where}: are cx and cy swapped, or are these the intrinsics of an image of another size?"
 
 
 def _code(checks: dict[int, Tensor]) -> Tensor:

@@ -124,14 +124,17 @@ class LiveDepth:
         for name, value in (("max_wait", max_wait), ("max_gap", max_gap), ("save_every", save_every)):
             if not 0 <= value < math.inf:
                 raise ValueError(f"{name} must be a number of seconds of at least 0, got {value}")
-        for name, function in (("model", model), ("on_result", on_result)):
-            if not callable(function):
-                raise TypeError(f"{name} must be callable, got {type(function).__name__}")
+        if not hasattr(model, "ufm"):
+            raise TypeError(f"model must be an UncertainDepth, got {type(model).__name__}: UncertainDepth(network)")
+        if not callable(on_result):
+            raise TypeError(f"on_result must be callable, got {type(on_result).__name__}")
         if at_sigterm and current_thread() is not main_thread():
             raise ValueError("at_sigterm needs the main thread, where Python handles signals: leave it out here")
         self._state = None if state is None else Path(state)
         if self._state is not None and not self._state.parent.is_dir():
             raise FileNotFoundError(f"state: no such folder: {self._state.parent}")
+        if self._state is not None and self._state.is_dir():
+            raise IsADirectoryError(f"state must be a file, got the folder {self._state}")
         self.model, self._on_result = model, on_result
         self._intrinsics = None if intrinsics is None else as_intrinsics(intrinsics)
         self._max_wait, self._max_gap, self._save_every = max_wait, max_gap, save_every
@@ -383,8 +386,12 @@ def _seconds(stamp: float) -> float:
     """A finite stamp. Raises TypeError, ValueError: it is none."""
     if isinstance(stamp, bool) or not isinstance(stamp, float | int | np.floating | np.integer):
         raise TypeError(f"stamp must be a number of seconds, got {type(stamp).__name__}")
-    if not abs(stamp) < sys.float_info.max:
+    exact = stamp.item() if isinstance(stamp, np.generic) else stamp
+    if not abs(exact) < sys.float_info.max:
         raise ValueError(f"stamp must be finite [s], got {stamp}")
+    step = float(np.spacing(abs(stamp))) if isinstance(stamp, np.floating) else math.ulp(exact)
+    if step > SAME_TIME:
+        raise ValueError(f"stamp must be in seconds and exact to 1 ms, got {stamp}, which is exact to {step:g} s")
     return float(stamp)
 
 

@@ -47,6 +47,8 @@ class NetworksInTurn(nn.Module):
         members = [] if networks is None else modules_of(networks)
         if samples is not None and (samples < 1 or len(members) > 1):
             raise ValueError(f"samples must be at least 1 and goes with one network, got {samples} of {len(members)}")
+        if preprocess is not None and not callable(preprocess):
+            raise TypeError(f"preprocess must be a Preprocess, a function or None, got {preprocess!r}")
         self.networks = nn.ModuleList(members).eval()
         self.samples = samples
         self.preprocess = preprocess

@@ -19,7 +19,10 @@ from ufmstar_torch.output import FrameStatistics, MeanUncertainty, UfMStarOutput
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.stateful import outliving
+from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.ufmstar import UfMStar
+
+_BLACK = {torch.uint8: 1, torch.float32: 1 / 255, torch.float64: 1 / 255}  # largest value of a black image
 
 
 @dataclass(frozen=True)
@@ -150,8 +153,13 @@ class UncertainDepth(NetworksInTurn):
             raise ValueError("samples must be at least 2 and goes with one network in mode 'full'")
         if mode == "full" and single and samples is None:
             raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
+        if len({id(member) for member in members}) < len(members):
+            raise ValueError("networks must differ, got one of them twice: the passes of a stochastic one are samples")
         super().__init__(members or None, samples=samples, preprocess=preprocess)
-        config = config or UfMStarConfig()
+        config = UfMStarConfig() if config is None else config
+        for name, value, kind in (("config", config, UfMStarConfig), ("recalibration", recalibration, Recalibration)):
+            if value is not None and not isinstance(value, kind):
+                raise TypeError(f"{name} must be a {kind.__name__} or None, got {type(value).__name__}")
         if posterior:
             sections = config.anchors or AnchorConfig(), config.posterior or PosteriorConfig()
             config = config.replace(anchors=sections[0], posterior=sections[1])
@@ -344,6 +352,9 @@ class UncertainDepth(NetworksInTurn):
         if not self.networks:
             raise ValueError("UncertainDepth(None) has no networks: give the predictions to update")
         picture, T, K_image = as_image(image), as_pose(pose), as_intrinsics(intrinsics)
+        first = self._next == 0 and not ahead and picture.is_cpu and picture.dtype in _BLACK
+        if first and float(picture.max()) <= _BLACK[picture.dtype]:
+            LOGGER.warning("the first image is black: was it divided by 255 twice, or cast to whole numbers?")
         if not isinstance(image, Tensor):  # a tensor's device is the caller's choice
             picture = picture.to(next((p.device for p in self.networks.parameters()), picture.device))
         member = None if self.mode == "full" else self.turn(self._next + ahead)

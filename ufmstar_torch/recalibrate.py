@@ -133,6 +133,7 @@ class Recalibration(Checked, Extension):
 
     def save(self, path: str | Path) -> None:
         """Write it as JSON, which :meth:`from_json` reads."""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
         Path(path).write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
 
     def _knots(self) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -56,9 +57,9 @@ def sample_size(size: tuple[int, int], pixels: int | None, fraction: float | Non
         return max(1, round(fraction * every))
     if pixels is None:
         return min(1000, every)
-    if isinstance(pixels, bool) or not isinstance(pixels, int) or not 1 <= pixels <= every:
+    if isinstance(pixels, bool) or not isinstance(pixels, int | np.integer) or not 1 <= pixels <= every:
         raise ValueError(f"pixels must be a whole number from 1 to H*W = {every}, got {pixels!r}")
-    return pixels
+    return int(pixels)
 
 
 def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:

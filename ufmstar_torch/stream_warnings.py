@@ -1,15 +1,16 @@
-"""Warnings about a stream in which hardly anything can be compared: each once, to the logger ``ufmstar_torch``."""
+"""Warnings about a stream whose input looks mistaken: each once, to the logger ``ufmstar_torch``."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.frame import FrameInput, doubtful_centre
 from ufmstar_torch.output import FrameStatistics
 
 # Frames and components before anything is said of views, and the share of components seen in one view alone from which
@@ -17,6 +18,12 @@ from ufmstar_torch.output import FrameStatistics
 _FRAMES, _COMPONENTS, _ALONE = 8, 20, 0.9
 # Frames, each moved by a share of the depth, in which less than one anchor a frame was used.
 _MOVED_FRAMES, _MOVED = 10, 0.01
+# Share of the pixels outside the accepted ranges, and the standard deviation of most pixels in their depths.
+_OUTSIDE, _WIDE = 0.1, 10.0
+# A focal length per image size, over that of the frame before. A step over the largest one of the ``_FRAMES`` or more
+# before it, which also leads so many depths away. Relative change of most depths while the pose stays: .07 to .5 within
+# 8 frames of the moving cameras of recordings.
+_ZOOM, _JUMP, _AWAY, _CHANGE = 1.2, 10.0, 2.0, 0.1
 # On an accelerator reading the counts waits: every so many frames.
 _EVERY = 64
 LOGGER = logging.getLogger("ufmstar_torch")
@@ -27,68 +34,157 @@ _CAUSES = (
 )
 
 
+@dataclass
+class _Track:
+    """The frames of a stream without a fault so far."""
+
+    T: Tensor  # [4, 4] the last pose
+    focal: tuple[float, float]  # last fx / W and fy / H
+    total: float  # sum of the last depth map
+    place: Tensor  # [3] of the last frame with anchors that moved, and how many did,
+    moving: int = 0
+    used: int = 0  # with how many anchors
+    steps: int = 0  # poses that differ from the one before,
+    largest: float = 0.0  # by at most [m]
+    same: int = 0  # the last of them, with one depth map
+    still: int = 0  # last frames with one pose,
+    depth: Tensor | None = None  # and the depth map of the first of them
+
+    def follow(self, T: Tensor, focal: tuple[float, float], depth: Tensor, total: float) -> Iterator[tuple[str, str]]:
+        """Take in a frame; kinds and texts of warnings."""
+        step = float((T[:3, 3] - self.T[:3, 3]).norm())
+        if max(max(new / old, old / new) for new, old in zip(focal, self.focal, strict=True)) > _ZOOM:
+            each = " and ".join(f"{fx:.2f} of the width, {fy:.2f} of the height" for fx, fy in (self.focal, focal))
+            text = f"the focal length changed from frame to frame ({each}): every camera is a stream of its own, and "
+            yield "camera", text + "another recording begins with reset()"
+        if torch.equal(T, self.T):
+            yield from self._stay(depth)
+        else:
+            self.still, self.same = 0, self.same + 1 if total == self.total else 0
+            if self.same == _FRAMES:
+                yield "depth", f"the depth map was the same in {_FRAMES + 1} frames of a moving camera: is it updated?"
+            far = _AWAY * total / max(int((depth > 0).sum()), 1) if step > _JUMP * self.largest else step
+            if self.steps >= _FRAMES and step > far:
+                text = f"the camera jumped by {step:.3g} m, after steps of at most {self.largest:.3g} m. Another "
+                yield "jump", text + "recording, or a map that was moved, begins with reset()"
+            self.steps, self.largest = self.steps + 1, max(self.largest, step)
+        self.T, self.focal, self.total = T, focal, total
+
+    def _stay(self, depth: Tensor) -> Iterator[tuple[str, str]]:
+        self.still += 1
+        if self.still == 1 or self.depth is None or self.depth.shape != depth.shape:
+            self.depth = depth.clone()
+        elif self.still % _FRAMES == 0:
+            both = (depth > 0) & (self.depth > 0)
+            change = (depth[both] / self.depth[both] - 1).abs()
+            if change.numel() and (median := float(change.median())) > _CHANGE:
+                text = f"the pose was the same in {self.still + 1} frames, in which the depth changed by {median:.0%}"
+                yield "pose", text + " in the median: is it updated?"
+
+    def anchored(self, used: int, depth: float) -> str:
+        """Count the anchors used in a frame of this mean depth [m]; a warning where moving frames have hardly any."""
+        if float((self.T[:3, 3] - self.place).norm()) < _MOVED * depth:
+            return ""
+        self.place, self.moving, self.used = self.T[:3, 3], self.moving + 1, self.used + used
+        if self.moving < _MOVED_FRAMES or self.used >= self.moving:
+            return ""
+        return (
+            f"{self.used} anchors were used in {self.moving} frames of a moving camera, so the error on which all "
+            "views agree is not measured. An anchor has a pixel (u, v) of the image, a depth [m] and a variance [m^2]. "
+            + _CAUSES
+        )
+
+
 class StreamWarnings:
-    """Looks at the counts of every frame, and warns of a stream in which nothing is compared."""
+    """Looks at every frame and its counts, and warns of input that looks mistaken."""
+
+    _tracks: dict[int, _Track]
 
     def __init__(self) -> None:
         self.reset()
 
-    def reset(self) -> None:
-        """Forget what was said."""
+    def reset(self, streams: Sequence[int] | None = None) -> None:
+        """Forget what was said; of some ``streams`` only what was seen."""
+        if streams is not None:
+            self._tracks = {b: track for b, track in self._tracks.items() if b not in streams}
+            return
         self._calls = 0
         self._said = set[tuple[int, str]]()
-        self._moved = dict[int, tuple[Tensor, int, int]]()  # last camera, moving frames and anchors used, by stream
+        self._tracks = {}
 
     def after_frame(
         self, frame: FrameInput, statistics: FrameStatistics, frames: Tensor, config: UfMStarConfig
     ) -> None:
-        """Warn of a frame without a segment, of components that no second view sees, and of moving frames without
-        anchors; ``frames`` [B] counts those used."""
+        """Warn of pixels that are not used, of components that no second view sees, and of cameras, poses, depth and
+        anchors that do not go together; ``frames`` [B] counts those used."""
         device = frame.depth.device.type
         self._calls += 1
         if device == "meta" or (device != "cpu" and self._calls % _EVERY):
             return
         for b, kind, text in (
-            *_without_segments(frame, statistics, config),
+            *_left_out(frame, statistics, frames, config),
+            *(_wide(frame) if self._calls % _EVERY in (0, 1) else ()),
             *_alone(statistics, frames),
-            *self._without_anchors(frame, statistics),
+            *self._tracked(frame, statistics),
         ):
             if (b, kind) not in self._said:
                 self._said.add((b, kind))
                 LOGGER.warning("stream %d: %s (said once)", b, text)
 
-    def _without_anchors(self, frame: FrameInput, statistics: FrameStatistics) -> Iterator[tuple[int, str, str]]:
-        if statistics.anchors_used is None:
-            return
+    def _tracked(self, frame: FrameInput, statistics: FrameStatistics) -> Iterator[tuple[int, str, str]]:
         pixels, sums = statistics.valid_pixels.tolist(), frame.depth.sum((1, 2)).tolist()
-        counts = torch.stack([statistics.anchors_used, statistics.fault]).T.tolist()
-        for b, (used, fault) in enumerate(counts):
-            place = frame.T_world_cam[b, :3, 3].cpu()
-            before, moving, total = self._moved.get(b, (place, 0, 0))
+        poses, cameras = frame.T_world_cam.cpu(), frame.intrinsics.tolist()
+        used = None if statistics.anchors_used is None else statistics.anchors_used.tolist()
+        height, width = frame.size
+        for b, fault in enumerate(statistics.fault.tolist()):
             if fault or not pixels[b]:
                 continue
-            if float((place - before).norm()) < _MOVED * sums[b] / pixels[b]:
-                self._moved[b] = before, moving, total
-                continue
-            moving, total = moving + 1, total + used
-            if moving >= _MOVED_FRAMES and total < moving:
-                text = f"{total} anchors were used in {moving} frames of a moving camera, so the error on which all "
-                yield b, "anchors", text + f"views agree is not measured. {_CAUSES}"
-            self._moved[b] = place, moving, total
+            T, focal = poses[b], (cameras[b][0][0] / width, cameras[b][1][1] / height)
+            if text := doubtful_centre(cameras[b], frame.size):
+                yield b, "centre", text
+            if (track := self._tracks.get(b)) is None:
+                self._tracks[b] = track = _Track(T, focal, sums[b], T[:3, 3])
+            else:
+                yield from ((b, *said) for said in track.follow(T, focal, frame.depth[b], sums[b]))
+            if used is not None and (text := track.anchored(used[b], sums[b] / pixels[b])):
+                yield b, "anchors", text
 
 
-def _without_segments(
-    frame: FrameInput, statistics: FrameStatistics, config: UfMStarConfig
+def _left_out(
+    frame: FrameInput, statistics: FrameStatistics, frames: Tensor, config: UfMStarConfig
 ) -> Iterator[tuple[int, str, str]]:
-    segments = statistics.segments.tolist()
-    if all(segments):
-        return
-    given = (statistics.valid_pixels + frame.beyond + frame.out_of_range).tolist()
-    for b in (b for b, count in enumerate(segments) if not count and given[b]):
-        text = f"a frame has no segment, so nothing is compared between views: of {given[b]} pixels "
-        text += f"{int(frame.beyond[b])} lie beyond segment.max_depth = {config.segment.depth_limit} m and "
-        text += f"{int(frame.out_of_range[b])} outside the accepted ranges. Is the depth in metres, smooth, and the "
-        yield b, "segments", text + "intrinsics the depth map's?"
+    parts = (statistics.segments, statistics.valid_pixels, frame.beyond, frame.out_of_range)
+    counts = (*parts, statistics.components, statistics.fault, frames)
+    for b, each in enumerate(zip(*(count.tolist() for count in counts), strict=True)):
+        segments, valid, beyond, outside, components, fault, seen = each
+        positive = valid + beyond + outside
+        unstated = 0 if config.segment.max_depth is not None else beyond
+        parted = f"of {positive} pixels {beyond} lie beyond segment.max_depth = {config.segment.depth_limit} m and "
+        parted += f"{outside} outside the accepted ranges. "
+        if positive and not segments and not fault:
+            text = f"a frame has no segment, so nothing is compared between views: {parted}"
+            yield b, "segments", text + "Is the depth in metres, smooth, and the intrinsics the depth map's?"
+        elif max(outside, unstated) > _OUTSIDE * positive:
+            text = (
+                f"pixels are left out: {parted}Are A and E variances [m^2], not logarithms, which may be negative, and "
+            )
+            yield b, "range", text + "does the network state its largest depth (segment.max_depth)?"
+        elif not positive and not components and seen >= _FRAMES:
+            text = f"none of {seen} frames has a pixel with a positive and finite depth where valid is True"
+            yield b, "empty", text + ": nothing is compared between views"
+
+
+def _wide(frame: FrameInput) -> Iterator[tuple[int, str, str]]:
+    for name, variance in (("aleatoric", frame.aleatoric), ("epistemic", frame.epistemic)):
+        if variance is None:
+            continue
+        wide = frame.valid & (variance.detach() > (_WIDE * frame.depth).square())
+        shares = wide.sum((1, 2)) / frame.valid.sum((1, 2)).clamp_min(1)
+        for b in (b for b, share in enumerate(shares.tolist()) if share > 0.5):
+            text = (
+                f"the standard deviation that {name} states is over {_WIDE:g} times the depth at most pixels: is it a "
+            )
+            yield b, name, text + "variance in m^2?"
 
 
 def hardly_compared(alone: int, components: int, frames: int) -> str:

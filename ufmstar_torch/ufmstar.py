@@ -192,7 +192,7 @@ class UfMStar(StatefulModule):
         twin = UfMStar(self.config, dtype=self.mean.dtype, device=self.mean.device)
         warm_up(twin, size, streams, progress)
 
-    def query(self, points: Tensor, frame: str = "world") -> Regression:
+    def query(self, points: Array, frame: str = "world") -> Regression:
         """The disagreement at any 3D point, from the present mixture, without touching the state.
 
         Args:
@@ -208,7 +208,7 @@ class UfMStar(StatefulModule):
         """
         if frame not in ("world", "first"):
             raise ValueError(f"frame must be 'world' or 'first', got {frame!r}")
-        streams = self.mean.shape[0]
+        points, streams = as_tensor("points", points), self.mean.shape[0]
         if streams == 0:
             raise ValueError("query needs a mixture: call the module on a frame first")
         if points.dim() != 3 or points.shape[0] != streams or points.shape[2] != 3:
@@ -219,8 +219,7 @@ class UfMStar(StatefulModule):
                 T = invert_rigid(self.T_world_first)
                 local = apply(T[:, None, :3, :3], local.double()) + T[:, None, :3, 3]
             dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
-            mixture = unmeasured.before_regression(self.mixture)
-            result = regress(mixture, local.to(dtype), self.config)
+            result = regress(unmeasured.before_regression(self.mixture), local.to(dtype), self.config)
             result = unmeasured.after_regression(result, None, self.config)[0]
             return replace(result, features=result.features[..., : self.config.features])
 
@@ -255,7 +254,8 @@ class UfMStar(StatefulModule):
                 self._warnings.reset()
                 new = self._extensions.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
             else:
-                new = old.restarted(self._chosen(streams, b))
+                self._warnings.reset((chosen := self._chosen(streams, b)).nonzero().flatten().tolist())
+                new = old.restarted(chosen)
             self._store(new.tensors() | (dict(old.by_stream) if keep_evidence else {}))
 
     def takes(self, name: str) -> bool:

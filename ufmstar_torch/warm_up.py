@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import torch
 
 from ufmstar_torch.anchors.anchors import Anchors
@@ -49,9 +50,9 @@ def warm_up(
     Raises:
         ValueError: a size or number of streams that is not positive.
     """
+    if np.shape(size) != (2,) or min(*size, streams) < 1:
+        raise ValueError(f"size and streams must be positive, (H, W) and B, got {size!r} and {streams}")
     height, width = size
-    if min(height, width, streams) < 1:
-        raise ValueError(f"size and streams must be positive, got {size} and {streams}")
     config, device = module.config, module.mean.device
     distance = min(_DISTANCE, config.segment.depth_limit)
     depth = torch.full((streams, height, width), distance, device=device)

@@ -18,6 +18,7 @@ from ufmstar_torch.eval.check.depth_image_fit import DepthImageFit, depth_image_
 from ufmstar_torch.eval.check.image_fit import GIVEN, ImageFit, image_fit, track_corners
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
+from ufmstar_torch.frame import doubtful_centre
 
 _SCALES = 10.0 ** np.arange(-4, 4.01, 0.125)
 _POINTS = 2000
@@ -141,6 +142,9 @@ class _Check:
     def images(self) -> ImageFit | None:
         """Check poses and intrinsics with tracked corners; what they name explains why no depth fits."""
         fit = image_fit(self.sequence, track_corners(self.sequence))
+        size = self.sequence.image_size
+        if size is not None and (centre := doubtful_centre(self.sequence.intrinsics.tolist(), size)):
+            self.problems.append(centre)
         if fit is not None and fit.problem and not any(_READING in problem for problem in self.problems):
             if fit.reading != GIVEN:
                 self.problems = [p for p in self.problems if _DISAGREE not in p and _APART not in p]

@@ -150,6 +150,8 @@ def image_fit(sequence: FrameSequence, corners: Sequence[FollowedCorners]) -> Im
         return None
     others = [Reading(poses=name) for name in CONVENTIONS if name != OURS] + [Reading(late=n) for n in _LATE]
     others += [Reading(factor=float(factor)) for factor in _FACTORS]
+    width = 2 * sequence.intrinsics[0, 2] if sequence.image_size is None else sequence.image_size[1]
+    limit = max(_FINE, _LARGEST * width)
     near = list({one.first: one for one in reversed(corners)}.values())
     far = list({one.first: one for one in corners}.values())
     reading = GIVEN
@@ -158,14 +160,13 @@ def image_fit(sequence: FrameSequence, corners: Sequence[FollowedCorners]) -> Im
         given = _error(sequence, pairs, GIVEN)
         errors = [_error(sequence, pairs, other) for other in others]
         least = min(errors)
-        if reading == GIVEN and given > _HALVES * least and given - least > _APART:
+        if reading == GIVEN and given > _HALVES * least and given - least > _APART and least <= limit:
             reading, error, best = others[errors.index(least)], given, least
     motion = float(np.median([one.motion for one in near]))
-    width = 2 * sequence.intrinsics[0, 2] if sequence.image_size is None else sequence.image_size[1]
     fit = ImageFit(len(near), motion, error, reading, best, "")
     if reading != GIVEN:
         return replace(fit, problem=f"{fit.words}: {reading}: corners fit to {best:.1f} px then")
-    if error > max(_FINE, _LARGEST * width):
+    if error > limit:
         text = "poses, intrinsics and images belong together under no reading tried"
         return replace(fit, problem=f"{fit.words}: {text}")
     return fit

@@ -22,6 +22,7 @@ from ufmstar_torch.eval.run.pictures import SHEET
 from ufmstar_torch.eval.run.rank import ImageScores, require_part
 from ufmstar_torch.eval.run.run import warm_up_job
 from ufmstar_torch.eval.run.run_folder import Checkpoint
+from ufmstar_torch.stream_warnings import LOGGER
 
 SCORES, SETTINGS = "scores.csv", "rank.json"
 _SHOWN = 10  # lines of the printed table
@@ -62,6 +63,8 @@ class RankOptions(StreamOptions):
             raise ValueError(f"--measured must be a share from 0 to 1, got {self.measured}")
         if self.maps.depth not in (None, *OWN_DEPTH) and len(self.sequences) > 1:
             raise ValueError("--depth DIR goes with one sequence: rank each by itself")
+        if len(set(self.sequences)) < len(self.sequences):
+            raise ValueError(f"the sequences must differ, got one twice: {' '.join(self.sequences)}")
 
 
 read = reader(RankOptions, "ufmstar rank")
@@ -91,6 +94,8 @@ def _scores(options: RankOptions) -> ImageScores:
             if source is None:
                 warm_up_job(job, bars.show)
             source, scores.sequence = job.source, path
+            if job.image_fit is not None and job.image_fit.problem:
+                LOGGER.warning("%s: %s", path, job.image_fit.problem)
             stream = FrameStream(job.sequence, job.indices, [job.row(Checkpoint())], device=job.device)
             try:
                 stream.drive([scores, ProgressSink(bars.show)], stop=stop)

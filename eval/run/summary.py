@@ -90,11 +90,14 @@ def _depth_fit(folder: RunFolder, done: Records) -> DepthFit | None:
 def _warnings(job: RunJob, depth: DepthFit | None, done: Records) -> list[str]:
     """Likely mistakes in what the run was given, each in a line."""
     fits = [fit.problem for fit in (job.image_fit, depth) if fit is not None]
+    without_depth = len(job.sequence.without_depth) == len(job.sequence)
     if done:
         fits.append(hardly_compared(done[-1]["single_view"], done[-1]["components"], len(done)))
-        without_depth = len(job.sequence.without_depth) == len(job.sequence)
         if without_depth and job.sequence.layout == "generic" and (depth is None or depth.problem):
             fits.append("nothing ties the poses to metres: sigma and disagreement are in the poses' unit")
+    fitted = () if job.recalibration is None else job.recalibration.sequences
+    if not without_depth and job.sequence.name in [label.partition("/")[2] for label in fitted]:
+        fits.append("the recalibration was fitted to this sequence: metrics on it are too good")
     return [text for text in fits if text]
 
 

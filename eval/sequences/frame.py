@@ -14,12 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ufmstar_torch.frame import CENTRE_RANGE
+
 Loader = Callable[[], np.ndarray]
 Size = tuple[int, int]
 
-# A principal point outside this share of the image, on either axis, belongs to another image size: real
-# cameras and the usual crops stay within it, a K given for twice or half the size does not.
-_CENTRE_RANGE = (0.2, 0.8)
 # A map of so many pixels takes 1 GiB in double precision: more is a slip of the keyboard.
 _MAX_PIXELS = 2**27
 
@@ -237,7 +236,7 @@ def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:
 
 def fits(K: np.ndarray, size: Size) -> bool:
     """True if K's principal point lies where a camera with images of ``size`` (H, W) can have it."""
-    low, high = _CENTRE_RANGE
+    low, high = CENTRE_RANGE
     return bool(low < K[0, 2] / size[1] < high and low < K[1, 2] / size[0] < high)
 
 

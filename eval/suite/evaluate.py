@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.engine.anchors import landmark_digests
 from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, evaluate_sequence
 from ufmstar_torch.eval.engine.judge import RowFigures, references
@@ -21,8 +22,9 @@ from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.eval.suite.examples import ExampleWriter
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.record import Record
-from ufmstar_torch.eval.suite.work_items import WorkItem
+from ufmstar_torch.eval.suite.work_items import TOUR, WorkItem
 from ufmstar_torch.recalibrate import Recalibration
+from ufmstar_torch.stream_warnings import LOGGER
 
 _NO_POSES = "its images have no poses: the rows of networks alone are finished, {} that compare views cannot be had"
 _FITTED = "{} recalibrated rows were fitted to this sequence and are not judged on it"
@@ -78,6 +80,8 @@ def evaluate_item(
             progress(replace(now, stage=item.label))
 
         try:
+            for problem in check_sequence(sequence).problems if sequence.layout != TOUR else ():
+                LOGGER.warning("%s: %s (ufmstar data check)", item.label, problem)
             results = evaluate_sequence(sequence, needed, judge, sinks=sinks, stop=stop, progress=shown)
         except BROKEN as error:
             return folder.fail(item, error, missing)
