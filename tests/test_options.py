@@ -54,7 +54,7 @@ class _Options:
     kind: str = option("numba", choices=("numba", "torch"))
     long: int | None = option(None, const=1000, least=2)
     truth_scale: float | None = None
-    ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
+    ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", unset=True, shown=True)
     changes: dict[str, Any] = fields_of(UfMStarConfig, "change.", without=("segment", "backend"), unset=True)
 
 
@@ -67,8 +67,7 @@ def test_defaults_and_required_ones():
     assert options.sequence == "seq"
     assert options.output == _Output(Path("o"))
     assert (options.fps, options.names, options.sizes, options.long) == (None, (), (224, 518), None)
-    assert UfMStarConfig.from_dict(options.ufm) == UfMStarConfig(on_bad_frame="skip")
-    assert options.changes == {}
+    assert (options.ufm, options.changes) == ({}, {})
 
 
 def test_every_form():
@@ -86,10 +85,10 @@ def test_every_form():
 
 
 def test_plain_values_are_flat():
-    plain = as_dict(_parse("seq --out o --names a"))
+    plain = as_dict(_parse("seq --out o --names a --ufm.eta .5"))
     assert plain["out"] == "o"
     assert plain["names"] == ["a"]
-    assert plain["ufm"]["eta"] == 0.5
+    assert plain["ufm"] == {"eta": 0.5}
     assert "output" not in plain
 
 

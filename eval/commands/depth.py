@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.config import SPGFConfig, UfMStarConfig
+from ufmstar_torch.config import AnchorConfig, PosteriorConfig, SPGFConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.options import MachineOptions, fields_of, option
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.maps import MapSource, folder_source, own_depth
@@ -138,33 +138,30 @@ class UfMOptions:
     posterior: bool = False
     scale_from: str | None = option(None, choices=("network",))
     recalibration: str | None = None
-    ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
+    ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", unset=True, shown=True)
 
     def __post_init__(self) -> None:
-        _ = self.config  # checks the settings
+        self.config()  # checks the settings
 
-    @property
-    def config(self) -> UfMStarConfig:
-        """The configuration. Raises ValueError: settings of anchors or posterior without them."""
-        sections: dict[str, Any] = {}
-        for name, used in (("anchors", self.anchors or self.posterior), ("posterior", self.posterior)):
-            if self.ufm[name] is not None and not used:
+    def config(self, **first: Any) -> UfMStarConfig:
+        """The configuration; ``first`` are values instead of the presets'. Raises ValueError: an impossible value, or
+        settings of anchors or posterior without them."""
+        used = {"anchors": self.anchors or self.posterior, "posterior": self.posterior}
+        for name in used:
+            if name in self.ufm and not used[name]:
                 raise ValueError(f"--ufm.{name}.* needs --{name}")
-            sections[name] = (self.ufm[name] or {}) if used else None
-        return UfMStarConfig.from_dict(self.ufm | sections)
+        start = UfMStarConfig.paper() if self.ufm_preset == "paper" else UfMStarConfig()
+        start = start.replace(
+            on_bad_frame="skip",
+            segment=start.segment if self.preset is None else SPGFConfig.preset(self.preset),
+            anchors=AnchorConfig() if used["anchors"] else None,
+            posterior=PosteriorConfig() if used["posterior"] else None,
+        )
+        return start.with_values(first | flat(self.ufm))
 
-    def presets(self) -> dict[str, Any]:
-        """The settings of ``ufm_preset`` and ``preset``, by the names of the options."""
-        defaults: dict[str, Any] = {}
-        if self.ufm_preset == "paper":
-            changed = flat(UfMStarConfig.paper().to_dict()) | {"on_bad_frame": "skip"}
-            defaults = {f"ufm.{name}": value for name, value in changed.items() if name not in SECTIONS}
-        if self.preset is not None:
-            preset = SPGFConfig.preset(self.preset).to_dict()
-            defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
-        return defaults
-
-    def load_recalibration(self, weights: tuple[str, ...], source: DepthSource) -> Recalibration | None:
+    def load_recalibration(
+        self, config: UfMStarConfig, weights: tuple[str, ...], source: DepthSource
+    ) -> Recalibration | None:
         """Read the recalibration that the option names, or else the one beside the weights, if there is one.
 
         Raises:
@@ -177,7 +174,7 @@ class UfMOptions:
         file = beside(weights[0]) if name is None else Path(name)
         try:
             recalibration = Recalibration.from_json(file)
-            recalibration.require(self.config, ", ".join(one["name"] for one in source.identity.get("files", ())))
+            recalibration.require(config, ", ".join(one["name"] for one in source.identity.get("files", ())))
         except ValueError as error:
             raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
         return recalibration

@@ -196,7 +196,7 @@ def _events(options: LiveOptions) -> Iterator[LiveEvent]:
 def _model(options: LiveOptions) -> UncertainDepth:
     """The networks with UfM*, compiled, in the state of ``--state``; errors as ``NetworkChoice.load``."""
     chosen, source = options.network, options.network.load(options)
-    config, anchors = options.uncertainty.config, options.uncertainty.anchors
+    config, anchors = options.uncertainty.config(), options.uncertainty.anchors
     model = UncertainDepth(
         source.networks,
         config,
@@ -204,7 +204,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
         posterior=options.uncertainty.posterior,
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
         anchors=None if anchors is False else landmarks_of(anchors, None),
-        recalibration=options.uncertainty.load_recalibration(chosen.weights, source),
+        recalibration=options.uncertainty.load_recalibration(config, chosen.weights, source),
     ).to(options.device)
     with Bars() as bars:
         dense = config.anchors is not None and anchors in (False, "dense")

@@ -14,11 +14,12 @@ values are refused.
 
 from __future__ import annotations
 
+import re
 import types
 from argparse import SUPPRESS, Action
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache, reduce
 from operator import or_
 from os.path import isfile
@@ -82,16 +83,15 @@ class _Fields:
     prefix: str = ""
     without: Sequence[str] = ()
     unset: bool = False
-    defaults: Mapping[str, Any] = field(default_factory=dict)
+    shown: bool = False
 
 
 def fields_of(config: type, prefix: str = "", **how: Any) -> Any:
     """A field of type ``dict[str, Any]``: an option for every field of a settings class, nested ones included, but
     those ``without``. With a dot in the ``prefix`` (``ufm.``) their names keep their underscores, and a configuration
-    file has the values below that key. ``unset`` leaves out what is not given, instead of the class's own default;
-    ``defaults`` are other ones. A section that is None by default is None unless one of its options is given. The value
-    of a bool is written out: ``--ufm.add_aleatoric false``. ``choices``, ``symbol``, ``unit`` and ``range`` in the
-    fields' metadata are used."""
+    file has the values below that key. ``unset`` leaves out what is not given, instead of the class's own default,
+    which the help has where it is ``shown``. The value of a bool is written out: ``--ufm.add_aleatoric false``.
+    ``choices``, ``symbol``, ``unit`` and ``range`` in the fields' metadata are used."""
     return field(default_factory=dict, metadata={"fields_of": _Fields(config, prefix, **how)})
 
 
@@ -99,30 +99,18 @@ def parse(options: type[T], words: Sequence[str], prog: str) -> T:
     """The options that a command line means.
 
     Args:
-        options: a dataclass. ``USAGE``, if it has that attribute, replaces the generated usage line; ``DEFAULTS`` are
-            other defaults than those of :func:`fields_of`, by name (``ufm.segment.sparse``). A group may have a method
-            ``presets``: further defaults, by name, that its values ask for.
+        options: a dataclass. ``USAGE``, if it has that attribute, replaces the generated usage line.
         words: without the program's name.
         prog: name of the command, for messages.
 
     Raises:
         ValueError: an unknown option, a value of the wrong kind, or what ``options`` itself refuses; one line.
     """
-    defaults: Mapping[str, Any] = getattr(options, "DEFAULTS", {})
-    parsed = _parse(options, words, prog, defaults)
-    presets: dict[str, Any] = {}
-    for group in vars(parsed).values():
-        presets |= group.presets() if hasattr(group, "presets") else {}
-    return _parse(options, words, prog, {**presets, **defaults}) if presets else parsed
-
-
-def _parse(options: type[T], words: Sequence[str], prog: str, defaults: Mapping[str, Any]) -> T:
     from jsonargparse import ArgumentError
 
     full = _HELP_ALL in words
     parser = parser_of(options, prog, full=full)
     words = ["--help"] if full else words
-    parser.set_defaults(dict(defaults))
     try:
         values = parser.parse_args(list(words)).as_dict()
     except (ArgumentError, TypeError) as error:  # TypeError: a list where a configuration file should have a mapping
@@ -155,7 +143,8 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
 
         def _get_help_string(self, action: Action) -> str:
             text: str = action.help or "" if isinstance(action.const, bool) else super()._get_help_string(action)
-            return text.replace(", default: %(default)s", "") if action.default in (None, []) else text
+            unknown = action.default in (None, [])
+            return re.sub(r", default: %\(default\)s| \(default: %\(default\)s\)", "", text) if unknown else text
 
     description, _ = _documentation(options)
     usage = getattr(options, "USAGE", None)
@@ -259,19 +248,20 @@ def _add_fields(group: Any, wanted: _Fields, full: bool) -> None:
         if f.name in wanted.without:
             continue
         if (section := _section(hints[f.name])) is not None:
-            absent = wanted.unset or _default(f) is None
-            _add_fields(group, _Fields(section, f"{wanted.prefix}{f.name}.", unset=absent), full)
+            nested = replace(wanted, config=section, prefix=f"{wanted.prefix}{f.name}.", without=())
+            _add_fields(group, nested, full)
             continue
         parts = get_args(hints[f.name]) if get_origin(hints[f.name]) in (Union, types.UnionType) else (hints[f.name],)
-        parts += (types.NoneType,) if wanted.unset else ()
         # Every word is a valid text, so that text is tried last.
         kind = reduce(or_, sorted(dict.fromkeys(parts), key=lambda part: part is str))
-        how = {"choices": f.metadata["choices"]} if "choices" in f.metadata and not wanted.unset else {"type": kind}
+        how = {"choices": f.metadata["choices"]} if "choices" in f.metadata else {"type": kind}
         name = wanted.prefix + f.name
-        text = " ".join(text for text in (help_.get(f.name), _range(f)) if text)
+        default = _default(f)
+        shown = f"(default: {default})" if wanted.shown and default is not None else ""
+        text = " ".join(text for text in (help_.get(f.name), _range(f), shown) if text)
         group.add_argument(
             f"--{name if '.' in name else name.replace('_', '-')}",
-            default=None if wanted.unset else wanted.defaults.get(f.name, _default(f)),
+            default=None if wanted.unset else default,
             help=text if full or "." not in name else SUPPRESS,
             **how,
         )
@@ -326,7 +316,7 @@ def _settings(wanted: _Fields, values: Mapping[str, Any]) -> dict[str, Any]:
     settings = {f.name: values.get(f.name) for f in fields(wanted.config) if f.name not in wanted.without}
     for f in fields(wanted.config):
         section = settings.get(f.name)
-        if _default(f) is None and isinstance(section, Mapping):  # off unless one of its values is given
+        if wanted.unset and isinstance(section, Mapping):
             settings[f.name] = {name: value for name, value in section.items() if value is not None} or None
     return {name: value for name, value in settings.items() if not (wanted.unset and value is None)}
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import ClassVar
 
+from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import OWN_DEPTH
-from ufmstar_torch.eval.commands.options import as_dict, option, positional, reader, usage_errors
+from ufmstar_torch.eval.commands.options import option, positional, reader, usage_errors
 from ufmstar_torch.eval.commands.run import StreamOptions, job_from
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.progress import ProgressSink
@@ -47,8 +46,6 @@ class RankOptions(StreamOptions):
 
     USAGE: ClassVar[str] = "ufmstar rank SEQUENCE... (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
 
-    DEFAULTS: ClassVar[Mapping[str, Any]] = MappingProxyType({"ufm.unmeasured": "nan", "ufm.ema_alpha": 1.0})
-
     sequences: tuple[str, ...] = positional()
     out: str
     by: str = option("total", choices=("total", "disagreement", "aleatoric", "epistemic", "anchored"))
@@ -65,6 +62,11 @@ class RankOptions(StreamOptions):
             raise ValueError("--depth DIR goes with one sequence: rank each by itself")
         if len(set(self.sequences)) < len(self.sequences):
             raise ValueError(f"the sequences must differ, got one twice: {' '.join(self.sequences)}")
+
+    @property
+    def config(self) -> UfMStarConfig:
+        """The configuration of UfM*, by default of M of the frame alone at measured pixels."""
+        return self.uncertainty.config(unmeasured="nan", ema_alpha=1.0)
 
 
 read = reader(RankOptions, "ufmstar rank")
@@ -121,7 +123,7 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     if panels := scores.panels():
         contact_sheet(panels, out / SHEET, title=f"the least and the most certain of {len(lines)} images")
         files.append(SHEET)
-    write_json_atomic(out / SETTINGS, {"program": "ufmstar rank", "settings": as_dict(options), "images": len(lines)})
+    write_json_atomic(out / SETTINGS, {"program": "ufmstar rank", "settings": options.settings(), "images": len(lines)})
     shown = [["rank", "sequence", "frame", f"{options.by} [m²]", "measured"]]
     mean, names = f"{options.by}_mean_m2", [Path(path).name for path in options.sequences]
     for line in lines[: min(len(chosen), _SHOWN)]:

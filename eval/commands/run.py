@@ -54,7 +54,7 @@ class StreamOptions(MachineOptions):
     @property
     def config(self) -> UfMStarConfig:
         """The configuration of UfM*."""
-        return self.uncertainty.config
+        return self.uncertainty.config()
 
     def settings(self) -> dict[str, Any]:
         """Return the options that define the result, as plain values of a configuration file."""
@@ -139,7 +139,7 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
         indices=indices,
         source=source,
         config=options.config.within(source.max_depth, source.states_confidence),
-        recalibration=ufm.load_recalibration(options.network.weights, source),
+        recalibration=ufm.load_recalibration(options.config, options.network.weights, source),
         device=torch.device(options.device),
         settings=options.settings(),
         every=options.network.mode == "full",
