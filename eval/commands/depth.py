@@ -8,11 +8,12 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.config import AnchorConfig, PosteriorConfig, SPGFConfig, UfMStarConfig
+from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.options import MachineOptions, fields_of, option
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.maps import MapSource, folder_source, own_depth
 from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.methods.setting import DEFAULTS, PAPER, started
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.models.inference import Inference
@@ -133,7 +134,7 @@ class UfMOptions:
     """
 
     preset: str | None = option(None, choices=PRESETS)
-    ufm_preset: str | None = option(None, choices=("paper", "default"))
+    ufm_preset: str | None = option(None, choices=(PAPER, DEFAULTS))
     anchors: bool | str = option(False, const=True)
     posterior: bool = False
     scale_from: str | None = option(None, choices=("network",))
@@ -146,17 +147,12 @@ class UfMOptions:
     def config(self, **first: Any) -> UfMStarConfig:
         """The configuration; ``first`` are values instead of the presets'. Raises ValueError: an impossible value, or
         settings of anchors or posterior without them."""
-        used = {"anchors": self.anchors or self.posterior, "posterior": self.posterior}
+        used = {"anchors": bool(self.anchors or self.posterior), "posterior": self.posterior}
         for name in used:
             if name in self.ufm and not used[name]:
                 raise ValueError(f"--ufm.{name}.* needs --{name}")
-        start = UfMStarConfig.paper() if self.ufm_preset == "paper" else UfMStarConfig()
-        start = start.replace(
-            on_bad_frame="skip",
-            segment=start.segment if self.preset is None else SPGFConfig.preset(self.preset),
-            anchors=AnchorConfig() if used["anchors"] else None,
-            posterior=PosteriorConfig() if used["posterior"] else None,
-        )
+        start = started(self.ufm_preset or DEFAULTS, **used).replace(on_bad_frame="skip")
+        start = start if self.preset is None else start.replace(segment=SPGFConfig.preset(self.preset))
         return start.with_values(first | flat(self.ufm))
 
     def load_recalibration(

@@ -10,13 +10,13 @@ from typing import Any, ClassVar
 import torch
 
 from ufmstar_torch.anchors.landmarks import DENSE
-from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
 from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, option, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.methods.method import UFM_STAR
+from ufmstar_torch.eval.methods.setting import DEFAULTS, PAPER, started
 from ufmstar_torch.eval.methods.suite import listing, suite_named
 from ufmstar_torch.eval.sequences.frame import parse_slice
 from ufmstar_torch.eval.sequences.options import Options
@@ -51,7 +51,7 @@ class SuiteOptions:
 
     suite: str | None = None
     base: str | None = None
-    ufm_preset: str | None = option(None, choices=("paper", "default"))
+    ufm_preset: str | None = option(None, choices=(PAPER, DEFAULTS))
     network: tuple[str, ...] = option((), repeat=True)
     spec: str | None = None
     samples: int | None = option(None, least=2)
@@ -205,10 +205,8 @@ def _evaluate(options: EvalOptions) -> int:
             bars.say(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
         if rows := [row for row in job.suite.rows if row.method.fusion == UFM_STAR]:
             anchors = {row.setting.anchors for row in rows}
-            config = UfMStarConfig(
-                anchors=AnchorConfig() if anchors != {""} else None,
-                posterior=PosteriorConfig() if any(row.setting.posterior for row in rows) else None,
-            )
+            posterior = any(row.setting.posterior for row in rows)
+            config = started(DEFAULTS, anchors=anchors != {""}, posterior=posterior)
             warm_up_command(config, torch.device("cpu"), bars.show, dense=DENSE in anchors)
         if sys.stderr.isatty():
             how["progress"] = bars.show

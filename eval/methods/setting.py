@@ -169,9 +169,8 @@ def default_of(name: str, preset: str = DEFAULTS) -> Any:
     """
     if name in _OWN:
         return getattr(DEFAULT, name)
-    start = _start(preset)
     # Sections that the row's own ``anchors`` and ``posterior`` switch on; merging is off where nothing is changed.
-    on = start.replace(anchors=AnchorConfig(), confidence=ConfidenceConfig(), posterior=PosteriorConfig())
+    on = started(preset, anchors=True, posterior=True).replace(confidence=ConfidenceConfig())
     off = dict.fromkeys(flat(MergeConfig().to_dict(), "merge."))
     values = flat(on.to_dict()) | off
     if inner := [other for other in values if other.startswith(f"{name}.")]:
@@ -188,17 +187,16 @@ def default_of(name: str, preset: str = DEFAULTS) -> Any:
 
 def configured(setting: Setting) -> UfMStarConfig:
     """UfM*'s configuration under a setting. Raises ValueError: an unknown name, or a value that it does not take."""
-    config = _start(setting.ufm_preset).replace(
-        anchors=AnchorConfig() if setting.anchors else None,
-        posterior=PosteriorConfig() if setting.posterior else None,
-    )
+    config = started(setting.ufm_preset, anchors=bool(setting.anchors), posterior=setting.posterior)
     for name in setting.overrides:
         default_of(name)
     return config.with_values(setting.overrides)
 
 
-def _start(preset: str) -> UfMStarConfig:
-    """UfM*'s settings of a preset; another name raises ValueError."""
+def started(preset: str, *, anchors: bool, posterior: bool) -> UfMStarConfig:
+    """UfM*'s settings of a preset, with these extensions; another preset raises ValueError."""
     if preset not in (DEFAULTS, PAPER):
         raise ValueError(f"ufm_preset must be {DEFAULTS} or {PAPER}, got {preset!r}")
-    return UfMStarConfig.paper() if preset == PAPER else UfMStarConfig()
+    start = UfMStarConfig.paper() if preset == PAPER else UfMStarConfig()
+    sections = {"anchors": AnchorConfig() if anchors else None, "posterior": PosteriorConfig() if posterior else None}
+    return start.replace(**sections)
