@@ -42,7 +42,7 @@ SHAPE = (12, 16)
 
 
 def folder_of(out: Path, dataset: str, sequence: str) -> Path:
-    return out / "records" / WorkItem(dataset, sequence, path="", layout="").folder
+    return out / "records" / WorkItem(dataset, sequence, path="").folder
 
 
 def write_examples(out: Path, dataset: str, sequence: str, rows: Sequence[Row]) -> None:

@@ -22,6 +22,7 @@ from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.colmap import read_landmarks
 from ufmstar_torch.eval.sequences.intrinsics import scale_intrinsics
 from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
+from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.suite.work_items import WorkItem
 
 RADIAL, FISHEYE = (-0.28, 0.07, 0.0002, 1.8e-05), (-0.05, 0.01, -0.002, 0.0005)
@@ -210,7 +211,7 @@ def test_a_scale_that_is_not_known_is_refused_or_the_network_s_own(tmp_path):
     ):
         require_metric(sequence)
     with pytest.raises(ValueError, match="the unit of its poses is not known"):
-        WorkItem("d", "walk", str(path), "colmap").open()
+        WorkItem("d", "walk", str(path), Options(layout="colmap")).open()
     scale = network_scale(sequence, source, range(6))
     assert scale.metres == pytest.approx(2.5, rel=2e-3)  # depth in whole millimetres, at the nearest pixel
     assert scale.spread < 2e-3

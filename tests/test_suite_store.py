@@ -27,7 +27,7 @@ from ufmstar_torch.eval.suite.work_items import Shard, WorkItem, find_work, read
 
 @given(st.integers(0, 60), st.integers(1, 12))
 def test_shards_take_every_sequence_exactly_once_and_equally_many(count, parts):
-    items = [WorkItem("d", f"s{n:03}", "p", "auto") for n in range(count)]
+    items = [WorkItem("d", f"s{n:03}", "p") for n in range(count)]
     shares = [Shard(index, parts).of(items) for index in range(1, parts + 1)]
     assert sorted(item for share in shares for item in share) == items
     assert max(map(len, shares)) - min(map(len, shares)) <= 1
@@ -35,7 +35,7 @@ def test_shards_take_every_sequence_exactly_once_and_equally_many(count, parts):
 
 @given(st.lists(st.text(min_size=1, max_size=30), min_size=1, unique=True))
 def test_sequences_of_any_name_have_folders_of_their_own(sequence_names):
-    items = [WorkItem("d", name, "p", "auto") for name in sequence_names]
+    items = [WorkItem("d", name, "p") for name in sequence_names]
     folders = [item.folder.parts for item in items]
     assert len(set(folders)) == len(items)
     for _, folder in folders:
@@ -48,7 +48,7 @@ def test_work_is_found_by_layout_or_named_data_set(tmp_path):
     write_rooms(tmp_path / "a")
     write_seven_scenes(tmp_path / "b")
     result = find_work([str(tmp_path / "a"), f"mine={tmp_path / 'b'}", "tour:3?frames=2"])
-    assert [(item.dataset, item.layout) for item in result] == [("generic", "generic")] * 3 + [
+    assert [(item.dataset, item.opening.layout) for item in result] == [("generic", "generic")] * 3 + [
         ("mine", "7scenes"),
         ("tour", "auto"),
     ]

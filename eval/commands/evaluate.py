@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -178,15 +178,13 @@ def job_from(options: EvalOptions) -> EvalJob:
     if further and not suite.efficiency:
         given = ", ".join(text.partition("=")[0] for text in what.network)
         raise ValueError(f"--network: every base once, but in a suite that measures time and energy, got {given}")
-    opening = {name: value for name, value in options.opening.changed().items() if name != "layout"}
     only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
-    where: dict[str, Any] = {"layout": options.opening.layout, "plugin": options.opening.plugin}
-    items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, **where)
+    items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, opening=options.opening)
     return EvalJob(
         suite=suite.with_bases(networks),
         networks=networks,
         further=tuple(further),
-        items=tuple(replace(item, opening=tuple(opening.items())) for item in items),
+        items=tuple(items),
         out=Path(str(output.out)),
         missing_bases=tuple(base for base in suite.bases if base not in networks),
         frames=parse_slice(data.frames),

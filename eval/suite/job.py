@@ -72,7 +72,7 @@ class EvalJob:
         """The content of eval.json."""
         suite, f = self.suite, self.frames
         bins = {} if self.bins == "ours" else {"bins": self.bins}
-        opening = {name: value for item in self.items for name, value in item.opening}
+        opening = {n: v for item in self.items for n, v in item.opening.changed().items() if n != "layout"}
         return {
             "suite": suite.name,
             "title": suite.title,

@@ -7,14 +7,15 @@ import random
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from ufmstar_torch.eval.sequences.frame import FrameSequence
+from ufmstar_torch.eval.sequences.options import Options
 
 TOUR = "tour"
 _ROOT = re.compile(r"(?P<dataset>[A-Za-z0-9][A-Za-z0-9._-]*)=(?P<path>.+)")
+_AS_THEY_ARE = Options()
 _UNSAFE = re.compile(r"[^A-Za-z0-9._+-]+")
 
 
@@ -25,9 +26,7 @@ class WorkItem:
     dataset: str  # as "scannet"
     sequence: str  # its name, unique within the data set
     path: str  # what ``open_sequence`` takes, ``tour:SEED`` included
-    layout: str  # likewise
-    # further options of ``open_sequence``, by name.
-    opening: tuple[tuple[str, Any], ...] = field(default=(), compare=False)
+    opening: Options = field(default=_AS_THEY_ARE, compare=False)  # likewise
 
     @property
     def folder(self) -> Path:
@@ -44,7 +43,7 @@ class WorkItem:
         from ufmstar_torch.eval.run.scale import require_metric
         from ufmstar_torch.eval.sequences.open import open_sequence
 
-        sequence = open_sequence(self.path, self.layout, **dict(self.opening))
+        sequence = open_sequence(self.path, **self.opening.changed())
         require_metric(sequence)
         return sequence
 
@@ -88,8 +87,7 @@ def find_work(
     sample: int | None = None,
     seed: int = 0,
     only: Iterable[str] | None = None,
-    layout: str = "auto",
-    plugin: Sequence[str] = (),
+    opening: Options = _AS_THEY_ARE,
 ) -> list[WorkItem]:
     """All sequences below the roots, sorted.
 
@@ -99,15 +97,14 @@ def find_work(
         sample: of each data set, take as many at random (all where it has fewer).
         seed: of the sample: the same names give the same sample, wherever they lie.
         only: names of sequences (or DATASET/NAME) to take, instead of all; the sample is drawn from them.
-        layout: the only one to look for; "auto": any.
-        plugin: files with readers of one's own.
+        opening: of all of them; its layout is the only one to look for ("auto": any).
 
     Raises:
         FileNotFoundError: no such root.
         ValueError: no sequence below a root, a name in ``only`` that is not there, one name twice in a data set, a
             sample below 1.
     """
-    items = sorted({item for root in roots for item in _below(root, layout, plugin)})
+    items = sorted({item for root in roots for item in _below(root, opening)})
     twice = [key for key, n in Counter(item.folder for item in items).items() if n > 1]
     if twice:
         paths = ", ".join(item.path for item in items if item.folder == twice[0])
@@ -140,18 +137,19 @@ def read_names(file: Path) -> list[str]:
     return names
 
 
-def _below(root: str, layout: str, plugin: Sequence[str]) -> list[WorkItem]:
+def _below(root: str, opening: Options) -> list[WorkItem]:
     """The sequences of one root."""
     match = _ROOT.fullmatch(root)
     dataset, path = (match["dataset"], match["path"]) if match else (None, root)
     if path.startswith(f"{TOUR}:"):
-        return [WorkItem(dataset or TOUR, path, path, "auto")]
+        return [WorkItem(dataset or TOUR, path, path, replace(opening, layout="auto"))]
     from ufmstar_torch.eval.sequences.layout import find_sequences
 
-    sequences = find_sequences(path, layout=layout, plugin=plugin)
-    if not sequences:
+    found = find_sequences(path, layout=opening.layout, plugin=opening.plugin)
+    if not found:
         raise ValueError(f"--root {root}: no sequence of a known layout is there or below")
-    return [WorkItem(dataset or f.layout, f.name, str(f.path.absolute()), f.layout) for f in sequences]
+    each = ((one, replace(opening, layout=one.layout)) for one in found)
+    return [WorkItem(dataset or one.layout, one.name, str(one.path.absolute()), how) for one, how in each]
 
 
 def _chosen(items: list[WorkItem], only: list[str]) -> list[WorkItem]:
