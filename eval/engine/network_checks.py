@@ -7,12 +7,20 @@ from collections.abc import Sequence
 import torch
 
 from ufmstar_torch.eval.engine.networks import stochastic
-from ufmstar_torch.models.batch_ensemble import BatchEnsemble, BatchEnsembleMember
+from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.dropout import DecoderDropout, MonteCarloDropout, set_sampling
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.prediction import DepthPrediction, infer
 
 _PROBE = (480, 640)  # (h, w) [px] of the grey image that the networks are tried on
+_NEEDED = {
+    "ensemble": "two networks or more (not batch_ensemble=), each with an aleatoric variance",
+    "mc_dropout": "one network that samples, by its decoder's dropout",
+    "batch_ensemble": "a file with one BatchEnsemble (as it was trained), with an aleatoric variance",
+    "evidential": "one network (FILE#0 is the first of a file), with an aleatoric and an epistemic variance",
+    "aleatoric": "one network (FILE#0 is the first of a file), with an aleatoric variance and no epistemic one",
+    "depth_only": "one network (FILE#0 is the first of a file)",
+}
 
 
 def without_sampling(network: DepthNetwork) -> DepthNetwork:
@@ -24,55 +32,26 @@ def without_sampling(network: DepthNetwork) -> DepthNetwork:
 
 
 def check_members(base: str, members: Sequence[DepthNetwork], device: torch.device) -> None:
-    """Try the networks of a base. Raises ValueError: they do not deliver what it needs; the message names both.
-
-    ============== =====================================================================
-    ensemble       two members or more, each with an aleatoric variance
-    mc_dropout     one network that samples by its decoder's dropout
-    batch_ensemble the members of one BatchEnsemble, with an aleatoric variance
-    evidential     one network, with an aleatoric and an epistemic variance
-    aleatoric      one network, with an aleatoric variance and no epistemic one
-    depth_only     one network; a variance is ignored
-    ============== =====================================================================
-    """
-    shared = [member for member in members if isinstance(member, BatchEnsembleMember)]
-    if base == "batch_ensemble":
-        kinds = ", ".join(sorted({type(member).__name__ for member in members}))
-        note = " (as one network; give the trained file itself)" if BatchEnsemble.__name__ in kinds.split(", ") else ""
-        several = f"{len(members)} of the kind {kinds}{note}"
-        _require(len(shared) == len(members) > 1, base, "a file with a BatchEnsemble", several)
-        one = len({id(member.ensemble) for member in shared}) == 1
-        _require(one, base, "one BatchEnsemble", "several of them")
-    elif base == "ensemble":
-        several = f"{len(members)} network" + ("s" if len(members) > 1 else "")
-        _require(len(members) > 1, base, "two members or more", several)
-        _require(
-            not shared, base, "networks of their own", "the members of a BatchEnsemble (give it as batch_ensemble=)"
-        )
-    else:
-        picked = "(FILE#0 is the first member of a file)"
-        _require(len(members) == 1, base, f"one network {picked}", f"{len(members)} members")
-    if base == "mc_dropout":
-        samples = stochastic(members) and any(isinstance(m, DecoderDropout) and m.p > 0 for m in members[0].modules())
-        _require(bool(samples), base, "a network trained as mc_dropout, which samples", "one that does not")
-    if base in ("depth_only", "mc_dropout"):
-        return
+    """Try the networks of a base. Raises ValueError: they are not what it needs (``_NEEDED``); the message has both."""
+    ensembles = [member.ensemble for member in members if isinstance(member, BatchEnsembleMember)]
+    of_one = len(ensembles) == len(members) > 1 and len({id(ensemble) for ensemble in ensembles}) == 1
+    fitting = {"batch_ensemble": of_one, "ensemble": len(members) > 1 and not ensembles}.get(base, len(members) == 1)
+    kinds = ", ".join(sorted({type(member).__name__ for member in members}))
+    got = f"{len(members)} of the kind {kinds}"
+    if fitting and base == "mc_dropout":
+        drawn = stochastic(members) and any(isinstance(m, DecoderDropout) and m.p > 0 for m in members[0].modules())
+        fitting, got = bool(drawn), "one that does not sample"
     height, width = _PROBE
     K = torch.tensor([[[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]]], dtype=torch.float64)
-    for member in members:
+    for member in members if fitting and base not in ("depth_only", "mc_dropout") else ():
         with torch.no_grad():
             grey = torch.full((1, 3, height, width), 128, dtype=torch.uint8, device=device)
             x, K_member = member.preprocess(grey, K)
             prediction: DepthPrediction = infer(member.to(device).eval(), x, K_member)
-        has = prediction.aleatoric_variance is not None, prediction.epistemic_variance is not None
-        got = {(True, True): "both variances", (True, False): "an aleatoric one", (False, True): "an epistemic one"}
-        if base == "evidential":
-            _require(all(has), base, "an aleatoric and an epistemic variance", got.get(has, "none"))
-        else:
-            _require(has[0], base, "an aleatoric variance", got.get(has, "none"))
-            _require(base != "aleatoric" or not has[1], base, "an aleatoric variance alone", "an epistemic one as well")
-
-
-def _require(fulfilled: bool, base: str, wanted: str, got: str) -> None:
-    if not fulfilled:
-        raise ValueError(f"{base} needs {wanted}, got {got}")
+        aleatoric, epistemic = prediction.aleatoric_variance is not None, prediction.epistemic_variance is not None
+        fitting &= aleatoric and {"evidential": epistemic, "aleatoric": not epistemic}.get(base, True)
+        got = {(True, True): "both", (True, False): "an aleatoric one", (False, True): "an epistemic one"}.get(
+            (aleatoric, epistemic), "none"
+        )
+    if not fitting:
+        raise ValueError(f"{base} needs {_NEEDED[base]}, got {got}")
