@@ -65,7 +65,10 @@ def test_a_second_demo_computes_nothing(done, monkeypatch, capsys):
 REFUSED = {
     "no weights": (("--weights", "none.safetensors"), "no such file: none.safetensors"),
     "no networks": (("--weights", "{tmp}/bad.safetensors"), "bad.safetensors"),
-    "no variance": (("--weights", "{tmp}/plain.safetensors"), "with an aleatoric variance and no epistemic one, got none"),
+    "no variance": (
+        ("--weights", "{tmp}/plain.safetensors"),
+        "with an aleatoric variance and no epistemic one, got none",
+    ),
     "a file": (("--out", "{tmp}/bad.safetensors"), "is a file"),
     "other files": (("--out", "{tmp}/other", "--overwrite"), "holds files of someone else"),
 }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from typing import Any, ClassVar
 
 import torch
@@ -149,15 +148,13 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
 
 
 def _landmarks(value: str | bool, sequence: FrameSequence) -> str | LandmarkSource:
-    """The source of anchors of ``--anchors``. Raises ValueError, ModuleNotFoundError: images to track in, or OpenCV,
-    are missing; others as ``landmarks_of``."""
+    """The source of anchors of ``--anchors``. Raises ValueError: images to track in are missing; others as
+    ``landmarks_of``."""
     source = landmarks_of(value, sequence.folder, sequence.pose_scale)
     if not source.needs_image:
         return source
     if all(entry.load_image is None for entry in sequence.entries):
         raise ValueError(f"--anchors tracks corners of images, of which the sequence {sequence.name!r} has none")
-    if find_spec("cv2") is None:
-        raise ModuleNotFoundError("--anchors needs OpenCV: pip install 'ufmstar-torch[eval]'")
     return CORNERS if value is True else str(value)
 
 
