@@ -86,7 +86,7 @@ class ImageFit:
     @property
     def words(self) -> str:
         """The outcome in a line."""
-        return f"poses disagree with the images by {self.error:.1f} px (fine: below {_FINE:.0f})"
+        return f"poses disagree with the images by {self.error:.1f} px (good poses: below {_FINE:.0f})"
 
 
 @dataclass(frozen=True)
