@@ -97,8 +97,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: network("depth_only=ground-truth:48"), "HxW"),
     # shards
     *[(partial(Shard.parse, text), "--shard must be") for text in ("0/2", "3/2", "1", "1/0", "a/b", "1/2/3", "-1/2")],
-    (lambda: rank_of({**TORCHRUN, "RANK": "first"}), "must be numbers"),
-    (lambda: rank_of({**TORCHRUN, "RANK": "4"}), "RANK 4 must be in"),
+    (lambda: rank_of({**TORCHRUN, "RANK": "4"}), "1/n to n/n, got 5/4"),
     # recalibration
     *[
         (partial(Recalibration, *knots), "Recalibration")

@@ -68,8 +68,6 @@ def test_sample_and_list(tmp_path):
     assert [item.sequence for item in find_work([root], only=read_names(tmp_path / "list.txt"))] == ["r2", "r5"]
     with pytest.raises(ValueError, match="names sequences that are not there: r9"):
         find_work([root], only=["r9", "r1"])
-    with pytest.raises(ValueError, match="--sequences must be at least 1"):
-        find_work([root], sample=0)
 
 
 def test_mistaken_roots(tmp_path):

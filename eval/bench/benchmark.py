@@ -63,17 +63,13 @@ class BenchSettings:
     runtime: str = field(default="auto", metadata={"choices": ("auto", "torch", "onnx")})
     sizes: tuple[int, ...] = (224, 512)
     backends: tuple[str, ...] = field(default=("auto",), metadata={"choices": ("auto", "numba", "triton", "torch")})
-    frames: int = 40
-    history: int = 60
+    frames: int = field(default=40, metadata={"least": 1})
+    history: int = field(default=60, metadata={"least": 1})
     threads: int | None = None
     device: str = "cpu"
     json: Path | None = None
 
     def __post_init__(self) -> None:
-        for name in ("frames", "history", "threads"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"--{name} must be at least 1, got {value}")
         if self.weights is None and self.model not in ARCHITECTURES:
             raise ValueError(f"--model {self.model} needs --weights; without, it is one of {', '.join(ARCHITECTURES)}")
         if not self.sizes or any(size < 64 or size % 32 for size in self.sizes):

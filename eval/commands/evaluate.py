@@ -74,7 +74,7 @@ class DataOptions:
     """
 
     root: tuple[str, ...] = option((), repeat=True)
-    sequences: int | None = None
+    sequences: int | None = option(None, least=1)
     seed: int = option(0, least=0)
     sequence_list: str | None = None
     frames: str | None = None

@@ -106,12 +106,7 @@ def rank_of(environment: Mapping[str, str]) -> tuple[Shard, int]:
     where it has not started the process. Raises ValueError: the variables are not such numbers."""
     if any(name not in environment for name in _TORCHRUN):
         return Shard(), 0
-    try:
-        rank, world, local = (int(environment[name]) for name in _TORCHRUN)
-    except ValueError as error:
-        raise ValueError(f"{', '.join(_TORCHRUN)} in the environment must be numbers: {error}") from error
-    if not (0 <= rank < world and local >= 0):
-        raise ValueError(f"RANK {rank} must be in [0, WORLD_SIZE {world}) and LOCAL_RANK {local} at least 0")
+    rank, world, local = (int(environment[name]) for name in _TORCHRUN)
     return Shard(rank + 1, world), local
 
 

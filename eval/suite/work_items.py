@@ -101,8 +101,7 @@ def find_work(
 
     Raises:
         FileNotFoundError: no such root.
-        ValueError: no sequence below a root, a name in ``only`` that is not there, one name twice in a data set, a
-            sample below 1.
+        ValueError: no sequence below a root, a name in ``only`` that is not there, one name twice in a data set.
     """
     items = sorted({item for root in roots for item in _below(root, opening)})
     twice = [key for key, n in Counter(item.folder for item in items).items() if n > 1]
@@ -113,8 +112,6 @@ def find_work(
         items = _chosen(items, list(only))
     if sample is None:
         return items
-    if sample < 1:
-        raise ValueError(f"--sequences must be at least 1, got {sample}")
     taken: list[WorkItem] = []
     for dataset in dict.fromkeys(item.dataset for item in items):
         of_dataset = [item for item in items if item.dataset == dataset]
