@@ -26,9 +26,9 @@ def unproject(depth: Tensor, intrinsics: Tensor) -> Tensor:
     Returns:
         [B, H, W, 3] points in the camera frame [m].
     """
-    from kornia.geometry.depth import depth_to_3d_v2  # a second of import time, at the first call only
-
-    return depth_to_3d_v2(depth, intrinsics.to(depth.dtype))
+    b, height, width = depth.shape
+    index = torch.arange(height * width, device=depth.device).expand(b, -1)
+    return unproject_at(depth.flatten(1), index, width, intrinsics).unflatten(1, (height, width))
 
 
 def unproject_at(depth: Tensor, index: Tensor, width: int, intrinsics: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ EXTRAS = {
     "ai_edge_litert": "litert",
     "matplotlib": "viz",
     "lightning": "train",
+    "kornia": "train",
     "tensorboard": "train",
     "zeus": "energy",
 }
