@@ -8,13 +8,12 @@ import os
 import random
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from contextlib import suppress
 
 import pytest
 import torch
+from forked import start_program
 from tiny_suite import TRUTH, kept, write_rooms
 from trainings import write_frames
 
@@ -34,33 +33,24 @@ TRAINING = (
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
-def start(words):
-    """The program in a process of its own, one thread."""
-    command = [sys.executable, "-P", "-m", "ufmstar_torch.cli", *map(str, words)]
-    alone = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        command, env=os.environ | alone, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
-    )
-
-
 def finish(words):
     """An undisturbed process."""
-    process = start(words)
-    _, text = process.communicate(timeout=300)
-    assert process.returncode == 0, text.decode()
+    process = start_program(words)
+    process.join(300)
+    assert process.exitcode == 0
 
 
 def kill_at(words, out, files, delay):
     """SIGKILL to the process and its children, ``delay`` [s] after it has written so many files to ``out``; whether it
     was still at it."""
-    began, process = time.time(), start(words)
-    while process.poll() is None and written_since(out, began) < files:
+    began, process = time.time(), start_program(words)
+    while process.is_alive() and written_since(out, began) < files:
         time.sleep(0.02)
     time.sleep(delay)
-    if process.poll() is None:
+    if process.is_alive():
         os.killpg(process.pid, signal.SIGKILL)
-    process.communicate()
-    return process.returncode == -signal.SIGKILL
+    process.join()
+    return process.exitcode == -signal.SIGKILL
 
 
 def written_since(out, began):
@@ -100,15 +90,6 @@ def content(folder, *patterns):
     """The bytes of files by name."""
     files = sorted(path for pattern in patterns for path in folder.glob(pattern) if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
-
-
-def without_clock(value):
-    """Plain values without what a clock says or the user chose, at any depth."""
-    if isinstance(value, dict):
-        dropped = ("out", "time", "seconds", "settings", "versions", "machine")
-        kept = {key: item for key, item in value.items() if key not in dropped and not key.endswith("ms")}
-        return {key: without_clock(item) for key, item in kept.items()}
-    return [without_clock(item) for item in value] if isinstance(value, list) else value
 
 
 @pytest.fixture(scope="module")

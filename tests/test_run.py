@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import errno
 import json
-import subprocess
-import sys
+import os
+import signal
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from forked import start
 from layouts import truncate, write_depth_png, write_generic
 from runs import CONFIG, Brightness, job_of, network_job, networks, outputs, own_depth_job, read_summary, records
 
@@ -25,8 +25,6 @@ from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
-
-TESTS = Path(__file__).parent
 
 
 class Crash(BaseException):
@@ -378,25 +376,18 @@ def test_a_full_disk_leaves_finished_frames_and_resume_continues(path, tmp_path,
     assert outputs(out) == uninterrupted
 
 
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-from runs import Brightness, network_job
-from ufmstar_torch.eval.run.run import run
-
-def kill():
-    os.kill(os.getpid(), signal.SIGKILL)
-
-networks = Brightness(1.0, spread=0.02), Brightness(1.1, spread=0.02, at=1, then=kill)
-run(network_job(Path(sys.argv[1]), *networks), sys.argv[2])
-"""
+def _killed(path, out):
+    """Run; killed in the second call of the second network."""
+    kill = partial(os.kill, os.getpid(), signal.SIGKILL)
+    run(network_job(path, *pair(at=1, then=kill)), out)
 
 
 @pytest.mark.slow
 def test_sigkill_loses_the_last_seconds_only(path, tmp_path, uninterrupted):
     out = tmp_path / "out"
-    ended = subprocess.run([sys.executable, "-c", KILLED, str(path), str(out)], cwd=TESTS, check=False)
-    assert ended.returncode == -9
+    process = start(_killed, path, out)
+    process.join(200)
+    assert process.exitcode == -signal.SIGKILL
     summary = read_summary(out)
     assert summary["state"] == "interrupted"
     assert "killed" in summary["reason"]

@@ -10,6 +10,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import forked
 import process_parts
 import pytest
 import torch
@@ -94,7 +95,8 @@ def in_two(words, stop=lambda: False):
 
 
 @pytest.mark.slow
-def test_processes_end_in_good_order_by_a_stop_by_an_error_and_by_a_kill(tmp_path):
+def test_processes_end_in_good_order_by_a_stop_by_an_error_and_by_a_kill(tmp_path, monkeypatch):
+    monkeypatch.setattr(multiprocessing, "get_context", lambda _: forked.CONTEXT)  # spawned ones: the tests beside
     with pytest.raises(RuntimeError, match=r"d/c: TypeError: a mistake"):
         in_two(acting(tmp_path / "a", "go", "wait", "fail"))
     assert len(list(tmp_path.glob("a/out/records/*/*/DepthOnly.json"))) == 1, "finished records stay"

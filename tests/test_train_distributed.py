@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import subprocess
 import sys
-import textwrap
-from contextlib import suppress
+import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from forked import start
 from trainings import RECIPE, logged, tiny_job, with_network
 
 from ufmstar_torch.models.checkpoints import read_safetensors
@@ -70,33 +68,30 @@ def test_two_processes_give_the_losses_of_one(frames, alone, tmp_path):
         assert logged(tmp_path / "two", name) == pytest.approx(logged(alone, name), abs=2e-4), name
 
 
+def _train(job):
+    fit(job, overwrite=True)
+
+
 def free_port():
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         return s.getsockname()[1]
 
 
-def start(frames, out, here, settings, environment, after=()):
-    """A process that trains as PLAIN says, over what is in ``out``; a second after the files ``after`` are there it
-    leaves the file ``here`` and begins."""
-    code = f"""
-        import sys, time
-        from pathlib import Path
-        sys.path.insert(0, {str(Path(__file__).parent)!r})
-        from trainings import tiny_job
-        from ufmstar_torch.train.fit import fit
-        from test_train_distributed import PLAIN
-        job = tiny_job({str(frames)!r}, Path({str(out)!r}), PLAIN, strategy="ddp", **{settings!r})
-        while not all(Path(file).exists() for file in {[str(file) for file in after]}):
-            time.sleep(0.1)
-        time.sleep({len(after)})
-        Path({str(here)!r}).touch()
-        fit(job, overwrite=True)
-    """
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", **environment}
-    return subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code)], stderr=subprocess.PIPE, text=True, env=environment
-    )
+def train_as_two(job, launch):
+    """Train over what is in the job's folder, as two processes that somebody else has started; the second comes first,
+    by two seconds."""
+    environment = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
+    processes = [start(_train, job, **launch(1), **environment)]
+    try:
+        time.sleep(2)
+        processes.append(start(_train, job, **launch(0), **environment))
+        for process in reversed(processes):
+            process.join(250)
+        assert [process.exitcode for process in processes] == [0, 0]
+    finally:
+        for process in processes:
+            process.kill()
 
 
 def as_torchrun(rank):
@@ -115,34 +110,16 @@ def test_the_second_process_may_come_first(frames, alone, tmp_path, launch, sett
     """It must not see what an earlier training left."""
     out = tmp_path / "out"
     fit(tiny_job(frames, out, replace(PLAIN, max_steps=2, learning_rate=0.1)))
-    port, here = {"MASTER_PORT": str(free_port())}, tmp_path / "here"
-    processes = [start(frames, out, here, settings, launch(1) | port)]
-    try:
-        processes.append(start(frames, out, tmp_path / "there", settings, launch(0) | port, after=[here]))
-        message = [process.communicate(timeout=250)[1] for process in reversed(processes)]
-    finally:
-        for process in processes:
-            process.kill()
-    assert [process.returncode for process in processes] == [0, 0], message
+    train_as_two(tiny_job(frames, out, PLAIN, strategy="ddp", **settings), launch)
     assert losses(out) == pytest.approx(losses(alone), abs=1e-6)
 
 
 @pytest.mark.slow
 def test_one_validation_frame_for_two_processes(frames, tmp_path):
     """With batch norm, whose statistics DistributedDataParallel sends around in the first validation batch."""
-    job = tiny_job(frames, tmp_path / "out", replace(PLAIN, max_steps=2))
-    job = replace(job, data=replace(job.data, validation_part="12:13"))
-    words = [*command(job), "--max-steps", "2", "--network.norm", "true", "--debug"]
-    process = subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=tmp_path, start_new_session=True
-    )
-    try:
-        message = process.communicate(timeout=250)[0]
-    finally:
-        # Its process group, where one waits for the other.
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-    assert process.returncode == 0, message
+    recipe = replace(with_network(PLAIN, norm=True), max_steps=2)
+    job = tiny_job(frames, tmp_path / "out", recipe, strategy="ddp", devices=2)
+    train_as_two(replace(job, data=replace(job.data, validation_part="12:13")), as_torchrun)
     assert logged(tmp_path / "out", "val_rmse")[-1] > 0
 
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
-import textwrap
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from forked import CONTEXT, start
 from trainings import RECIPE, logged, tiny_job, with_network
 
 from ufmstar_torch.eval.run.folder import FolderError
@@ -67,27 +64,17 @@ def stop_after(steps):
 # ---- killed ----
 
 
+def _killed(job):
+    """Train; killed after step 5 of 9, the last checkpoint being that of step 3."""
+    ask = stop_after(5)
+    fit(job, asked=lambda: ask() and os.kill(os.getpid(), signal.SIGKILL))
+
+
 @pytest.mark.slow
 def test_killed_in_the_middle_of_an_epoch_it_repeats_the_epoch_bit_for_bit(frames, uninterrupted, tmp_path):
-    code = f"""
-        import os, signal, sys
-        from pathlib import Path
-        import torch
-        torch.set_num_threads(1)
-        sys.path.insert(0, {str(Path(__file__).parent)!r})
-        from trainings import tiny_job
-        from ufmstar_torch.train import fit as fit_module
-        from test_train_resume import DROPOUT
-        steps = iter(range(100))
-        def asked():
-            # Asked once before the first step; after step 5 of 9, the last checkpoint being that of step 3.
-            if next(steps) == 5:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return False
-        fit_module.fit(tiny_job({str(frames)!r}, Path({str(tmp_path / "out")!r}), DROPOUT), asked=asked)
-    """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=200)
-    assert done.returncode == -signal.SIGKILL, done.stderr
+    process = start(_killed, tiny_job(frames, tmp_path / "out", DROPOUT))
+    process.join(200)
+    assert process.exitcode == -signal.SIGKILL
     assert stored(tmp_path / "out")["global_step"] == 3
     assert not (tmp_path / "out" / "member_0" / RESULT).exists()
     summary = fit(tiny_job(frames, tmp_path / "out", DROPOUT), resume=True)
@@ -96,8 +83,9 @@ def test_killed_in_the_middle_of_an_epoch_it_repeats_the_epoch_bit_for_bit(frame
 
 
 @pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_stopped_again_and_again_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path, workers):
+def test_stopped_again_and_again_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path, workers, monkeypatch):
     """Two steps into the second and the third of three epochs of three steps; weights are there after each session."""
+    monkeypatch.setattr(torch.multiprocessing, "get_context", lambda _: CONTEXT)  # spawned ones: test_train_data.py
     job = tiny_job(frames, tmp_path / "out", DROPOUT)
     job = replace(job, data=replace(job.data, workers=workers))
     for reached, kept in ((5, 3), (8, 6), (9, 9)):

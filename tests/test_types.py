@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -103,11 +103,19 @@ def test_what_is_missing_without_extras_is_named():
 
 
 @pytest.mark.slow
-def test_a_type_checker_knows_what_a_call_returns(tmp_path):
+def test_a_type_checker_knows_what_a_call_returns_and_accepts_the_short_examples(tmp_path):
+    """Strictly, against the package as a wheel has it."""
+    package = tmp_path / "ufmstar_torch"
+    package.mkdir()
+    for part in [*(ROOT / "ufmstar_torch").iterdir(), *(ROOT / name for name in ("models", "eval", "train"))]:
+        (package / part.name).symlink_to(part)
     (tmp_path / "own.py").write_text(SCRIPT)
-    mypy = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "--cache-dir", str(tmp_path), "own.py"]
-    environment = os.environ | {"MYPYPATH": str(ROOT)}
-    said = subprocess.run(mypy, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False).stdout
+    names = [f"{name}.py" for name in ("active_learning", "online_training", "train_own_head", "wrap_network")]
+    for name in names:
+        example = Path(shutil.copy(ROOT / "examples" / name, tmp_path))
+        assert len([line for line in example.read_text().splitlines() if line]) < 60, name
+    mypy = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "own.py", *names]
+    said = subprocess.run(mypy, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
     assert 'own.py:7: note: Revealed type is "ufmstar_torch.pipeline.UncertainPrediction"' in said, said
     assert 'own.py:8: note: Revealed type is "torch._tensor.Tensor"' in said, said
     assert "own.py:9: error: Too few arguments" in said, said

@@ -1,0 +1,40 @@
+"""Processes of their own that import nothing again: forked from one process that has imported the package."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+
+from ufmstar_torch import cli
+
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload(
+    ["lightning", "matplotlib.pyplot", "ufmstar_torch.train.fit"]
+    + [f"ufmstar_torch.{name}" for name in ("train.command", "eval.commands.evaluate", "eval.commands.report")]
+)
+
+
+def _call(begun, environment, function, arguments):
+    os.setsid()
+    os.environ.update(environment)
+    begun.set()
+    function(*arguments)
+
+
+def _program(words):
+    sys.exit(cli.main(words))
+
+
+def start(function, *arguments, **environment):
+    """A process, of a process group of its own, that calls a function; it has begun when this returns."""
+    begun = CONTEXT.Event()
+    process = CONTEXT.Process(target=_call, args=(begun, environment, function, arguments))
+    process.start()
+    assert begun.wait(120)
+    return process
+
+
+def start_program(words):
+    """``ufmstar`` in a process of its own."""
+    return start(_program, [str(word) for word in words])
