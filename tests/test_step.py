@@ -57,7 +57,7 @@ def oracle_walk(variant: str, count: int):
 def test_a_walk_agrees_with_the_oracle(backend, variant):
     if backend.slow and variant != "default":
         pytest.skip("the reference is compared with in every variant")
-    count = 2 if backend.slow else 20 if variant == "default" else 4
+    count, streams = (2, 1) if backend.slow else (20 if variant == "default" else 4, 2)
     depths, poses, camera, aleatoric, maps, matches, expected = oracle_walk(variant, count)
     config = VARIANTS[variant][0]
     if backend.name == "triton":  # what finds no slot is in the next frame's map (test_triton.py)
@@ -65,22 +65,22 @@ def test_a_walk_agrees_with_the_oracle(backend, variant):
     ufm = backend.module(config, torch.float64)
 
     def batch(x):
-        return torch.tensor(np.asarray(x)).expand(2, *np.shape(x)).contiguous()
+        return torch.tensor(np.asarray(x)).expand(streams, *np.shape(x)).contiguous()
 
     for i, (depth, T, a) in enumerate(zip(depths, poses, aleatoric, strict=True)):
         features = {"features": batch(np.stack([a, np.nan_to_num(depth)]))} if variant == "default" else {}
         out = ufm(batch(depth), batch(T), batch(camera), aleatoric=batch(a), **features)
-        assert out.statistics.components.tolist() == [len(maps[i].weights)] * 2
-        assert out.statistics.pairs.tolist() == [sum(map(len, matches[i]))] * 2
-        assert out.statistics.unmeasured.tolist() == [int((maps[i].share < 0.5).sum())] * 2
-        for b in range(2):
+        assert out.statistics.components.tolist() == [len(maps[i].weights)] * streams
+        assert out.statistics.pairs.tolist() == [sum(map(len, matches[i]))] * streams
+        assert out.statistics.unmeasured.tolist() == [int((maps[i].share < 0.5).sum())] * streams
+        for b in range(streams):
             np.testing.assert_allclose(out.disagreement[b].numpy(), maps[i].M, rtol=1e-8, atol=1e-10)
             np.testing.assert_allclose(out.variance[b].numpy(), maps[i].V, rtol=1e-8, atol=1e-10)
             np.testing.assert_allclose(out.measured[b].numpy(), maps[i].share, rtol=1e-7, atol=1e-9)
     assert len(expected) > 1
     assert max(g["m"] for g in expected) > 0
     found = ufm.ufm.mixture.to("cpu")
-    for b in range(2):
+    for b in range(streams):
         for k, g in enumerate(expected):
             for name, key in (("mean", "mean"), ("covariance", "cov"), ("disagreement", "m"), ("features", "features")):
                 if name != "features" or variant == "default":
@@ -160,7 +160,7 @@ def test_agrees_with_the_reference(compiled_backend, name, dtype, tolerance):
     if compiled_backend.name == "triton":  # as above
         config = config.replace(initial_capacity=config.max_components or 64)
     fast, reference = compiled_backend.module(config, dtype), UfMStar(config.replace(backend="torch"), dtype=dtype)
-    few = {"count": 2, "streams": 2, "size": (24, 32)} if slow else {"count": 4, "size": (32, 48)}
+    few = {"count": 2, "streams": 2, "size": (21, 24)} if slow else {"count": 4, "size": (32, 48)}
     for arguments, more in frames(config=config, dtype=dtype, **few):
         a, b = tensors(fast(*arguments, **more)), tensors(reference(*arguments, **more))
         assert a.keys() == b.keys()
@@ -253,6 +253,8 @@ def hostile_cameras():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_check_agrees_with_the_reference(compiled_backend, dtype):
     poses, cameras = hostile_cameras()
+    if compiled_backend.slow:
+        poses, cameras = poses[::3], cameras[::3]
     b, generator = len(poses), torch.Generator().manual_seed(1)
 
     def hostile(*shape: int) -> torch.Tensor:

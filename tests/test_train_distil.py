@@ -92,7 +92,7 @@ def correlation(network, batch):
 def test_a_fastdepth_comes_to_state_it_too(tmp_path):
     size, lengths = (64, 96), {"tours": 2, "validation_tours": 1, "tour_frames": 8}
     spec = replace(SPEC, widths=0.1, size=size)
-    recipe = Recipe(spec, clip_frames=CLIP, max_steps=200, batch_size=2 * CLIP, learning_rate=0.01, clip=10.0)
+    recipe = Recipe(spec, clip_frames=CLIP, max_steps=100, batch_size=2 * CLIP, learning_rate=0.01, clip=10.0)
     data = DataConfig(**lengths, tour_stride=1, tour_size=size, cache=str(tmp_path), augmentation=None)
     settings = tiny_job(tmp_path, tmp_path / "out", recipe).settings
     job = Job(recipe, data, settings)
@@ -103,7 +103,7 @@ def test_a_fastdepth_comes_to_state_it_too(tmp_path):
     assert train_member(job, 0) is None
     after = correlation(load_for_training(job.folder(0) / WEIGHTS)[0], batch)
     print(f"Spearman {before:.2f} before, {after:.2f} after")
-    # Measured over four seeds: -.14 to .01 before, .32 to .50 after.
+    # Measured over three seeds: -.04 to .04 before, .37 to .39 after.
     assert after > before + 0.1
 
 

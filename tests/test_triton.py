@@ -20,6 +20,7 @@ from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.correspond import correspond
 
 DEVICE = "cpu" if INTERPRETED else "cuda"
+SIZE = (22, 30)
 
 pytestmark = [
     pytest.mark.interpreter,
@@ -58,7 +59,7 @@ def test_late_growth():
     config = UfMStarConfig(segment=SPGF, unmeasured="paper", initial_capacity=2)
     modules = [make_backend(name).module(config) for name in ("triton", "numba")]
     late = []
-    for i, (depth, pose, K, _) in enumerate(walks(1, 4)):
+    for i, (depth, pose, K, _) in enumerate(walks(1, 4, SIZE)):
         given = torch.full_like(depth, torch.nan) if i == 1 else depth
         a, e = (module(given, pose, K, (given / 100).nan_to_num()) for module in modules)
         late.append(bool((a.statistics.components < e.statistics.components).any()))
@@ -90,7 +91,7 @@ def test_capture_keeps_the_state_in_place(monkeypatch):
     )
 
     config = UfMStarConfig(segment=SPGF, backend="triton", on_bad_frame="skip", initial_capacity=16, max_components=16)
-    given = [frame[:3] for frame in walks(1, 2)]
+    given = [frame[:3] for frame in walks(1, 2, SIZE)]
     ufm, plain = UfMStar(config), UfMStar(config)
     captured = Captured(ufm, *given[0], record=lambda run: run)
     memory = ufm.mean
@@ -125,7 +126,7 @@ def test_what_the_limit_leaves_without_a_slot_counts_as_dropped():
 
 def test_what_waits_for_a_slot_is_in_whatever_is_saved_or_copied(monkeypatch):
     config = UfMStarConfig(segment=SPGF, backend="triton", initial_capacity=2)
-    first, second = (moved(frame[:3], DEVICE) for frame in walks(1, 2))
+    first, second = (moved(frame[:3], DEVICE) for frame in walks(1, 2, SIZE))
     ufm = UfMStar(config)
     new = int(ufm(*first).statistics.new)
     assert new > 2 == ufm.mean.shape[1], "some must wait"

@@ -35,16 +35,16 @@ def oracle_settings(config: SPGFConfig) -> oracle.Segmentation:
     return oracle.Segmentation(settings, config.min_pixels, config.min_rows, config.prune)
 
 
-def walks(streams, frames=8):
+def walks(streams, frames=8, size=(HEIGHT, WIDTH)):
     """Rendered sequences of ``streams`` cameras with anchors: the arguments of every frame, batched over streams."""
     rng = np.random.default_rng(0)
-    data = [scenes.sequence(frames, HEIGHT, WIDTH, 0.03 * (s + 1), seed=s) for s in range(streams)]
-    K = torch.tensor(np.stack([scenes.intrinsics(HEIGHT, WIDTH, 60 + 5 * s) for s in range(streams)]))
+    data = [scenes.sequence(frames, *size, 0.03 * (s + 1), seed=s) for s in range(streams)]
+    K = torch.tensor(np.stack([scenes.intrinsics(*size, 60 + 5 * s) for s in range(streams)]))
     for i in range(frames):
         depth = torch.tensor(np.stack([d[i] for d, _, _ in data]))
         pose = torch.tensor(np.stack([p[i] for _, p, _ in data]))
-        pixel = torch.tensor(rng.uniform(0, 1, (streams, 40, 2))) * torch.tensor([WIDTH - 1.0, HEIGHT - 1.0])
-        at = (pixel[..., 1].round() * WIDTH + pixel[..., 0].round()).long()
+        pixel = torch.tensor(rng.uniform(0, 1, (streams, 40, 2))) * torch.tensor([size[1] - 1.0, size[0] - 1.0])
+        at = (pixel[..., 1].round() * size[1] + pixel[..., 0].round()).long()
         sparse = depth.flatten(1).gather(1, at) * torch.tensor(rng.normal(1.1, 0.02, (streams, 40)))
         yield depth, pose, K, Anchors(pixel, sparse, torch.full_like(sparse, 1e-3))
 
