@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
@@ -24,6 +24,8 @@ _OUTSIDE, _WIDE = 0.1, 10.0
 # before it, which also leads so many depths away. Relative change of most depths while the pose stays: .07 to .5 within
 # 8 frames of the moving cameras of recordings.
 _ZOOM, _JUMP, _AWAY, _CHANGE = 1.2, 10.0, 2.0, 0.1
+# Of the depth maps every so many rows are looked at.
+_ROWS = 8
 # On an accelerator reading the counts waits: every so many frames.
 _EVERY = 64
 LOGGER = logging.getLogger("ufmstar_torch")
@@ -38,10 +40,10 @@ _CAUSES = (
 class _Track:
     """The frames of a stream without a fault so far."""
 
-    T: Tensor  # [4, 4] the last pose
+    T: list[list[float]]  # the last pose
     focal: tuple[float, float]  # last fx / W and fy / H
-    total: float  # sum of the last depth map
-    place: Tensor  # [3] of the last frame with anchors that moved, and how many did,
+    total: float  # sum of the last depth map's rows
+    place: list[float]  # of the last frame with anchors that moved, and how many did,
     moving: int = 0
     used: int = 0  # with how many anchors
     steps: int = 0  # poses that differ from the one before,
@@ -50,21 +52,23 @@ class _Track:
     still: int = 0  # last frames with one pose,
     depth: Tensor | None = None  # and the depth map of the first of them
 
-    def follow(self, T: Tensor, focal: tuple[float, float], depth: Tensor, total: float) -> Iterator[tuple[str, str]]:
+    def follow(
+        self, T: list[list[float]], focal: tuple[float, float], depth: Tensor, total: float
+    ) -> Iterator[tuple[str, str]]:
         """Take in a frame; kinds and texts of warnings."""
-        step = float((T[:3, 3] - self.T[:3, 3]).norm())
+        step = math.dist(_position(T), _position(self.T))
         if max(max(new / old, old / new) for new, old in zip(focal, self.focal, strict=True)) > _ZOOM:
             each = " and ".join(f"{fx:.2f} of the width, {fy:.2f} of the height" for fx, fy in (self.focal, focal))
             text = f"the focal length changed from frame to frame ({each}): every camera is a stream of its own, and "
             yield "camera", text + "another recording begins with reset()"
-        if torch.equal(T, self.T):
+        if T == self.T:
             yield from self._stay(depth)
         else:
             self.still, self.same = 0, self.same + 1 if total == self.total else 0
             if self.same == _FRAMES:
                 yield "depth", f"the depth map was the same in {_FRAMES + 1} frames of a moving camera: is it updated?"
-            far = _AWAY * total / max(int((depth > 0).sum()), 1) if step > _JUMP * self.largest else step
-            if self.steps >= _FRAMES and step > far:
+            sudden = self.steps >= _FRAMES and step > _JUMP * self.largest
+            if sudden and step > _AWAY * _mean(depth, total):
                 text = f"the camera jumped by {step:.3g} m, after steps of at most {self.largest:.3g} m. Another "
                 yield "jump", text + "recording, or a map that was moved, begins with reset()"
             self.steps, self.largest = self.steps + 1, max(self.largest, step)
@@ -83,9 +87,9 @@ class _Track:
 
     def anchored(self, used: int, depth: float) -> str:
         """Count the anchors used in a frame of this mean depth [m]; a warning where moving frames have hardly any."""
-        if float((self.T[:3, 3] - self.place).norm()) < _MOVED * depth:
+        if math.dist(position := _position(self.T), self.place) < _MOVED * depth:
             return ""
-        self.place, self.moving, self.used = self.T[:3, 3], self.moving + 1, self.used + used
+        self.place, self.moving, self.used = position, self.moving + 1, self.used + used
         if self.moving < _MOVED_FRAMES or self.used >= self.moving:
             return ""
         return (
@@ -93,6 +97,15 @@ class _Track:
             "views agree is not measured. An anchor has a pixel (u, v) of the image, a depth [m] and a variance [m^2]. "
             + _CAUSES
         )
+
+
+def _mean(depth: Tensor, total: float) -> float:
+    """[m] of the pixels with a depth, whose sum is ``total``; infinite without any."""
+    return total / count if (count := int((depth > 0).sum())) else math.inf
+
+
+def _position(T: list[list[float]]) -> list[float]:
+    return [row[3] for row in T[:3]]
 
 
 class StreamWarnings:
@@ -132,8 +145,9 @@ class StreamWarnings:
                 LOGGER.warning("stream %d: %s (said once)", b, text)
 
     def _tracked(self, frame: FrameInput, statistics: FrameStatistics) -> Iterator[tuple[int, str, str]]:
-        pixels, sums = statistics.valid_pixels.tolist(), frame.depth.sum((1, 2)).tolist()
-        poses, cameras = frame.T_world_cam.cpu(), frame.intrinsics.tolist()
+        rows = frame.depth[:, ::_ROWS]
+        sums, pixels = rows.sum((1, 2)).tolist(), statistics.valid_pixels.tolist()
+        poses, cameras = frame.T_world_cam.tolist(), frame.intrinsics.tolist()
         used = None if statistics.anchors_used is None else statistics.anchors_used.tolist()
         height, width = frame.size
         for b, fault in enumerate(statistics.fault.tolist()):
@@ -143,10 +157,10 @@ class StreamWarnings:
             if text := doubtful_centre(cameras[b], frame.size):
                 yield b, "centre", text
             if (track := self._tracks.get(b)) is None:
-                self._tracks[b] = track = _Track(T, focal, sums[b], T[:3, 3])
+                self._tracks[b] = track = _Track(T, focal, sums[b], _position(T))
             else:
-                yield from ((b, *said) for said in track.follow(T, focal, frame.depth[b], sums[b]))
-            if used is not None and (text := track.anchored(used[b], sums[b] / pixels[b])):
+                yield from ((b, *said) for said in track.follow(T, focal, rows[b], sums[b]))
+            if used is not None and (text := track.anchored(used[b], _mean(rows[b], sums[b]))):
                 yield b, "anchors", text
 
 
