@@ -162,6 +162,8 @@ def test_samples_depend_on_the_frame_and_their_number_alone(network_files, netwo
     choice = NetworkChoice("", "trained", (network_files["mc_dropout"].partition(":")[2],))
     of_run = choice.load(CPU, mode="full", samples=3)
     assert torch.equal(of_run.one(frames[2], 1).depth, first[2, 1]), "ufmstar run draws the same"
+    with pytest.raises(ValueError, match="the members of an ensemble must differ"):
+        replace(choice, weights=choice.weights * 2).load(CPU)
     same_image = replace(frames[0], index=1)
     assert not torch.equal(network.one(same_image, 0).depth, first[0, 0]), "each frame has its own draw"
 

@@ -342,6 +342,15 @@ def test_a_training_by_command(ufmstar, frames, tmp_path):
     assert (code, err) == (0, "")
 
 
+def test_a_file_that_cannot_be_read_ends_a_training_in_a_line(ufmstar, tmp_path):
+    path = write_frames(tmp_path / "walk")
+    for file in (path / "depth").iterdir():
+        file.write_bytes(b"no depth")
+    code, _, err = ufmstar(*words(path, tmp_path / "out", "--max-steps", 1))
+    assert code == 1
+    assert re.search(r"ufmstar train: failed: walk/\S+: .*--on-bad-file skip", err), err
+
+
 def test_a_stopped_training_says_how_to_go_on(ufmstar, frames, tmp_path):
     code, _, err = ufmstar(*words(frames, tmp_path / "out", "--max-minutes", 1e-9))
     assert (code, err) == (130, "ufmstar train: time budget spent; --resume goes on\n")

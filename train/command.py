@@ -179,6 +179,7 @@ def main(options: _Command) -> int:
     from lightning.pytorch.utilities import rank_zero_only
 
     from ufmstar_torch.eval.commands.terminal import stop_signals
+    from ufmstar_torch.eval.sequences.frame import FrameError
     from ufmstar_torch.train.fit import fit, report
     from ufmstar_torch.train.start import missing_start
 
@@ -188,7 +189,10 @@ def main(options: _Command) -> int:
         print(f"ufmstar train: {remark}", file=sys.stderr)
     command = ["ufmstar", "train", *options.words]
     with stop_signals(lambda text: print(text, file=sys.stderr), "step") as stop:
-        summary = fit(job, resume=options.resume, overwrite=options.overwrite, asked=stop, command=command)
+        try:
+            summary = fit(job, resume=options.resume, overwrite=options.overwrite, asked=stop, command=command)
+        except FrameError as error:
+            raise ValueError(f"{error} (--on-bad-file skip leaves such files out)") from error
     if "members" not in summary:
         return 0  # a further process of a distributed training: the first one reports
     print(report(summary))

@@ -128,17 +128,24 @@ def _images(options: PosesOptions) -> tuple[list[Any], tuple[int, int]]:
     return entries, size
 
 
+def _plain(name: str) -> str:
+    """An image's name without leading zeros, where it is a number."""
+    return str(int(name)) if name.isdecimal() else name
+
+
 def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]) -> dict[str, Any]:
     root = Path(options.source) if Path(options.source).is_dir() else Path(options.source).parent
     lens = _lens(options, root, size)
     if lens is not None:  # COLMAP's mapper fails on some lenses, and `run` has less to do
         images = [lens.see(entry) for entry in images]
     trajectory = None if options.trajectory is None else read_trajectory(resolve(root, options.trajectory))
+    named = {_plain(word.partition(":")[0]) for word in options.length[:2]}
+    always = {entry.name for entry in images if _plain(entry.name) in named}
+    if unknown := sorted(named - {_plain(name) for name in always}):
+        raise ValueError(f"--length: there is no image {', '.join(unknown)}; they are {images[0].name}, ...")
     out = options.out
     (out / "images").mkdir()
     with Bars() as bars, stop_signals(bars.say) as stop:
-        named = {word.partition(":")[0] for word in options.length[:2]}
-        always = {e.name for e in images if e.name in named or (e.name.isdecimal() and str(int(e.name)) in named)}
         how: dict[str, Any] = {"progress": lambda done: bars.show(Progress("frames", done, len(images))), "stop": stop}
         chosen, broken = write_keyframes(images, out / "images", always=always, **how)
         keyframes = [images[index] for index in chosen]

@@ -125,6 +125,10 @@ class NetworkChoice:
             raise ValueError(text)
         passes = (samples or SAMPLES) if sampling else None
         identity = self._identity(members, passes, inference) | ({} if self.base else {"mode": mode})
+        contents = [(file["sha256"], file["member"]) for file in identity["files"]]
+        if len(set(contents)) < len(contents):
+            names = ", ".join(file["name"] for file in identity["files"])
+            raise ValueError(f"weights: the members of an ensemble must differ, two of {names} are the same network")
         nameless = {"label": None, "files": [file | {"name": None} for file in identity["files"]]}
         content = json.dumps({**identity, **nameless, "device": device.type, "version": _VERSION}, sort_keys=True)
         digest = hashlib.sha256(content.encode()).hexdigest() if self.base else ""
