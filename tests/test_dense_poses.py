@@ -97,7 +97,7 @@ def known(frames=1, seed=0, noise=0.05, **wrong):
         error[:, :6] = rng.normal(0, 1, (3, 6)) * np.repeat([wrong.get("turned", 0), wrong.get("moved", 0)], 3)
         found = measured(pixel, rho, views, error, noise, rng)
         errors.positions(K, 320, 2.0)
-        fit = errors.corrected(pixel, found, found.agreed > 1, SHARES, views, K, 2.0)
+        fit = errors.corrected(pixel, found, SHARES, views, K, 2.0)
     return errors, found, fit, rho
 
 
@@ -123,7 +123,7 @@ def test_what_remains_of_wrong_poses_is_stated_beyond_first_order():
         errors._variance[:], errors._left[:] = np.square([0.002, 0.008]), 0
         errors._covariance *= 1e-4
         found = measured(pixel, rho, views, error, 0.02, rng)
-        fit = errors.corrected(pixel, found, found.agreed > 1, SHARES, views, K, 2.0)
+        fit = errors.corrected(pixel, found, SHARES, views, K, 2.0)
         sizes.append(np.abs(fit.rho - rho) / np.sqrt(fit.variance))
     assert 0.65 < np.median(sizes) / 0.674 < 1.3
     assert np.quantile(sizes, 0.9) / 1.645 < 1.5
@@ -140,7 +140,7 @@ def test_frames_that_contradict_their_poses_teach_nothing_of_the_camera():
     errors, found, *_ = known(3, camera=np.array([0.004, 1.0, -0.8, 0.0]))
     pixel, _, views = scene(5)
     before = errors.camera(K)
-    errors.corrected(pixel, found, found.agreed > 1, SHARES, views, K, 2.0, trusted=False)
+    errors.corrected(pixel, found, SHARES, views, K, 2.0, trusted=False)
     np.testing.assert_array_equal(errors.camera(K), before)
 
 
@@ -150,7 +150,7 @@ def test_nothing_measured_leaves_what_is_believed_of_the_poses():
     empty = Measured(*(np.full_like(x, np.nan) if x.dtype == float and x.ndim > 1 else np.zeros_like(x)
                        for x in vars(found).values()))  # fmt: skip
     before = errors.positions(K, 320, 2.0)
-    fit = errors.corrected(pixel, empty, empty.agreed > 1, SHARES, views, K, 2.0)
+    fit = errors.corrected(pixel, empty, SHARES, views, K, 2.0)
     assert np.isinf(fit.variance).all()
     np.testing.assert_allclose(errors.positions(K, 320, 2.0), before, rtol=1e-6)
 

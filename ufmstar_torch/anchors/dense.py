@@ -253,8 +253,9 @@ class DenseEvidence(SavedState):
         rho, variance, agreed = np.zeros(len(pixel)), np.ones(len(pixel)), np.zeros(len(pixel), np.bool_)
         expected = np.concatenate([np.flatnonzero(sighted.due), np.arange(known, len(pixel))])
         if compared is not None:
-            agreed[expected], fit, trusted = self._searched(small, pixel[expected], *compared, K, cell)
-            rho[expected], variance[expected] = fit.rho, fit.variance + np.square(_SCALE * fit.rho)
+            found, fit, trusted = self._searched(small, pixel[expected], *compared, K, cell)
+            at = expected[found]
+            agreed[at], rho[at], variance[at] = True, fit.rho, fit.variance + np.square(_SCALE * fit.rho)
         agreed &= (rho > np.sqrt(variance)) & trusted
         both, fine = self._memory.compare(sighted, rho[:known], variance[:known], agreed[:known])
         again, new = np.flatnonzero(agreed[:known] & fine), np.flatnonzero(agreed[known:]) + known
@@ -269,8 +270,8 @@ class DenseEvidence(SavedState):
 
     def _searched(
         self, small: NDArray[np.uint8], pixel: NDArray, views: Views, shares: NDArray, K: NDArray, cell: int
-    ) -> tuple[NDArray[np.bool_], Fit, bool]:
-        """Which pixels [N, 2] were measured, their depths without the errors of the poses, and whether views agree."""
+    ) -> tuple[NDArray[np.int64], Fit, bool]:
+        """Which pixels [N, 2] were measured, their depths without errors of the poses, and whether the views agree."""
         from ufmstar_torch.kernels.anchor_check_cpu import confirmed
         from ufmstar_torch.kernels.dense_cpu import measure
 
@@ -278,12 +279,9 @@ class DenseEvidence(SavedState):
         actual = measure(small, pixel, views, self._search())
         accepted = confirmed(pixel, actual, cell)
         alike = accepted[actual.agreed + actual.contradicted > 1]
-        trusted = len(alike) < _ENOUGH or bool(alike.mean() >= self.config.min_share)
-        return (
-            accepted,
-            self._errors.corrected(pixel, actual, accepted, shares, views, K, self._depth, trusted),
-            trusted,
-        )
+        trusted, found = len(alike) < _ENOUGH or bool(alike.mean() >= self.config.min_share), np.flatnonzero(accepted)
+        given = actual.only(found), shares, views, K, self._depth, trusted
+        return found, self._errors.corrected(pixel[found], *given), trusted
 
     def _coarse(self, small: NDArray[np.uint8], taken: NDArray[np.float64], views: Views, cell: int) -> Depths:
         """Depths of M pixels in the cells without a pixel of ``taken`` [N, 2], by windows

@@ -110,7 +110,6 @@ class PoseErrors(SavedState):
         self,
         pixel: NDArray[np.float64],
         measured: Measured,
-        accepted: NDArray[np.bool_],
         shares: NDArray[np.int64],
         views: Views,
         K: NDArray[np.float64],
@@ -121,15 +120,16 @@ class PoseErrors(SavedState):
 
         Args:
             pixel: [N, 2] (u, v).
-            measured: N pixels in V views.
-            accepted: [N] which of them hold.
+            measured: N pixels in V views, each in one at least.
             shares: [V] to which baseline each view belongs.
             views: V keyframes.
             K: [3, 3] of :meth:`camera` [px], which the views have.
             depth: median of the scene [m].
             trusted: False = nothing is learnt of the camera: poses and images contradict each other.
         """
-        used = accepted[:, None] & np.isfinite(measured.value)
+        if not len(pixel):
+            return Fit(measured.rho, measured.variance)
+        used = np.isfinite(measured.value)
         shows = used & np.isfinite(measured.across)
         speed, slope = (np.where(used, x, 1.0) for x in (measured.speed, measured.slope))
         along = np.where(used[..., None], measured.along, 0.0)

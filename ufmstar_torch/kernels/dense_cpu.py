@@ -10,7 +10,7 @@ copied at once; loops run over all pixels of a window, which compilers turn into
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -112,6 +112,10 @@ class Measured:
     slope: NDArray[np.float64]
     across: NDArray[np.float64]
     across_noise: NDArray[np.float64]
+
+    def only(self, chosen: NDArray[np.int64]) -> Measured:
+        """Some of the pixels."""
+        return Measured(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, search: Search) -> Measured:
