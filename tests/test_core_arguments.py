@@ -145,6 +145,10 @@ REFUSED = {
         lambda: UncertainDepth([Brightness()] * 2, mode="full", samples=3), ValueError, "samples must be at least 2"
     ),
     "a source of anchors that is off": (lambda: model(IMAGE, anchors="corners"), ValueError, "anchors go with"),
+    "anchors of another type": (
+        lambda: UncertainDepth(Brightness(), UfMStarConfig(anchors=AnchorConfig()), anchors=True),
+        TypeError, "anchors must be 'corners', 'dense', a file's name or a LandmarkSource, got True",
+    ),
     "an unknown source of anchors": (
         lambda: UncertainDepth(Brightness(), UfMStarConfig(anchors=AnchorConfig()), anchors="cornes"),
         ValueError, "anchors: 'cornes' is neither 'corners', 'dense' nor a file",

@@ -75,9 +75,12 @@ def landmark_source(value: str | Path | LandmarkSource) -> LandmarkSource:
 
     Raises:
         FileNotFoundError: no such file.
+        TypeError: neither a word, nor a file's name, nor a source.
         ValueError: no word of these and no file of landmarks.
     """
     if not isinstance(value, str | Path):
+        if not callable(getattr(value, "update", None)):
+            raise TypeError(f"anchors must be 'corners', 'dense', a file's name or a LandmarkSource, got {value!r}")
         return value
     if value == CORNERS:
         return LandmarkTracker()
