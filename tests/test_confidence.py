@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from types import SimpleNamespace
 
@@ -201,7 +202,9 @@ def test_a_network_states_it():
     assert torch.equal(network(image).confidence, image[:, 0])
     torch.testing.assert_close(Ensemble([network, network])(image).confidence, image[:, 0])
     assert UncertainDepth(network).ufm.config.confidence is None
-    model = UncertainDepth([network, network], UfMStarConfig(anchors=AnchorConfig()), preprocess=network.preprocess)
+    model = UncertainDepth(
+        [network, copy.deepcopy(network)], UfMStarConfig(anchors=AnchorConfig()), preprocess=network.preprocess
+    )
     assert model.ufm.config.confidence == ConfidenceConfig()
     given = next(frames(1, dtype=torch.float32))[2]
     out = model(image, torch.eye(4), K, anchors=given)

@@ -91,7 +91,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: Preprocess().apply_image(torch.zeros(1, 3, 6, 8, dtype=torch.int64)), "image must be uint8 or floating"),
     (lambda: Preprocess().apply_image(torch.full((1, 3, 6, 8), 255.0)), r"image must lie in \[0, 1\]"),
     (lambda: Preprocess().apply_image(torch.full((1, 3, 6, 8), NAN)), r"image must lie in \[0, 1\]"),
-    (lambda: Preprocess().apply_image(torch.zeros(1, 3, 0, 8)), "image must have at least one pixel"),
+    (lambda: Preprocess().apply_image(torch.zeros(1, 3, 0, 8)), r"image must be .*\(1, 3, 0, 8\)"),
     (lambda: onnx({}), r"needs \['outputs'\]"),
     (lambda: onnx({"outputs": {}}), r"needs \['kind'\]"),
     (lambda: onnx({"outputs": {"kind": "meters"}}), "kind"),

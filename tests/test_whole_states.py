@@ -13,7 +13,7 @@ from torch import nn
 from walks import SPGF
 
 from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStarConfig, UncertainDepth
-from ufmstar_torch.extension import Extension
+from ufmstar_torch.recalibrate import Recalibration
 
 KINDS = {
     "plain": {},
@@ -25,7 +25,7 @@ KINDS = {
 _TEXTURE = np.random.default_rng(0).integers(0, 255, (H + 8, W + 8, 3), dtype=np.uint8)
 
 
-class Warner(Extension):
+class Warner(Recalibration):
     """Warns once the step is through, where ``loud``."""
 
     loud = False
@@ -55,7 +55,9 @@ def frame(i):
 
 
 def model_of(kind, frames=0):
-    model = UncertainDepth(Network(), recalibration=Warner(), **({"config": UfMStarConfig(segment=SPGF)} | KINDS[kind]))
+    model = UncertainDepth(
+        Network(), recalibration=Warner((1.0,), (1.0,)), **({"config": UfMStarConfig(segment=SPGF)} | KINDS[kind])
+    )
     for i in range(frames):
         model(*frame(i))
     return model
