@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 import sys
@@ -15,11 +16,11 @@ CONTEXT.set_forkserver_preload(
 )
 
 
-def _call(begun, environment, function, arguments):
+def _call(begun, environment, module, name, arguments):
     os.setsid()
     os.environ.update(environment)
     begun.set()
-    function(*arguments)
+    getattr(importlib.import_module(module), name)(*arguments)
 
 
 def _program(words):
@@ -27,9 +28,10 @@ def _program(words):
 
 
 def start(function, *arguments, **environment):
-    """A process, of a process group of its own, that calls a function; it has begun when this returns."""
-    begun = CONTEXT.Event()
-    process = CONTEXT.Process(target=_call, args=(begun, environment, function, arguments))
+    """A process, of a process group of its own, that calls a function of a file of this folder; it has begun when this
+    returns."""
+    begun, module = CONTEXT.Event(), function.__module__.rpartition(".")[2]  # pytest knows it as tests.MODULE
+    process = CONTEXT.Process(target=_call, args=(begun, environment, module, function.__name__, arguments))
     process.start()
     assert begun.wait(120)
     return process
