@@ -12,12 +12,12 @@ import sys
 
 import numpy as np
 import pytest
-from numba.core import caching, event
+from numba.core import caching, codegen, compiler, event, typed_passes, untyped_passes
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.engine import warm_up as commands
 from ufmstar_torch.kernels import compile_cpu
-from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
 from ufmstar_torch.warm_up import warm_up
 
 COLD = """
@@ -41,7 +41,7 @@ print(json.dumps({"names": sorted(names), "late": len(late.buffer), "steps": ste
 @part
 def shifted(n, more):
     """Numbers from ``more`` on."""
-    out = np.empty((2, n), np.float32)
+    out = empty((2, n), np.float32)
     for i in range(n):
         out[0, i] = out[1, i] = i + more
     return out
@@ -72,10 +72,31 @@ def test_a_kernel_without_a_folder_to_be_kept_in_is_compiled_in_memory():
     assert rows.tolist() == [[1.0, 2.0, 3.0, 4.0]] * 2
 
 
-def test_numba_has_the_private_parts_that_are_used():
-    names = "_load_index _save_index _load_data _save_data _data_path _open_for_write _dump"
-    missing = [name for name in names.split() if not hasattr(caching.IndexDataCacheFile, name)]
-    assert not missing, f"numba changed: its cache has no {missing}; mend ufmstar_torch/kernels/compile_cpu.py"
+def test_a_part_becomes_machine_code_in_its_kernel_alone(monkeypatch):
+    optimised = []
+    once = compile_cpu._Library._optimize_final_module
+    monkeypatch.setattr(
+        compile_cpu._Library, "_optimize_final_module", lambda self: (optimised.append(self.name), once(self))
+    )
+    assert compiled_function()(3)[0] == 6.0
+    assert optimised == ["both"]
+
+
+@pytest.mark.parametrize(
+    ("owner", "names"),
+    [
+        (codegen.JITCodeLibrary, "_optimize_functions _optimize_final_module _finalize_final_module"),
+        (codegen.JITCodeLibrary, "_finalize_dynamic_globals get_pointer_to_function codegen enable_object_caching"),
+        (codegen.JITCPUCodegen, "_module_pass_manager set_env"),
+        (untyped_passes, "TranslateByteCode FixupArgs IRProcessing GenericRewrites ReconstructSSA"),
+        (typed_passes, "NopythonTypeInference PreLowerStripPhis IRLegalization NativeLowering NoPythonBackend"),
+        (compiler.Flags, "values options copy"),
+        (caching.IndexDataCacheFile, "_load_index _save_index _load_data _save_data _data_path _open_for_write _dump"),
+    ],
+)
+def test_numba_has_the_private_parts_that_are_used(owner, names):
+    missing = [name for name in names.split() if not hasattr(owner, name)]
+    assert not missing, f"numba changed: {owner.__name__} has no {missing}; mend ufmstar_torch/kernels/compile_cpu.py"
 
 
 def test_no_garbage_is_collected_while_kernels_are_compiled():

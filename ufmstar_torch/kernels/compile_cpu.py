@@ -3,8 +3,10 @@
 A kernel is kept on disk. A part is compiled into the kernels that call it and has no interface of its own; called from
 Python it is a plain function.
 
-This is the only file that touches numba's private parts, those of its cache (``tests/test_warm_up.py`` fails where
-numba changes them).
+This is the only file that touches numba's private parts (``tests/test_warm_up.py`` fails where numba changes them).
+numba optimises each function on its own, makes machine code of it, and does both again in every function that calls
+it. Here a part is optimised and made machine code only in its kernels; of numba's passes over a function those remain
+that such plain code needs. A first start takes half the time for it.
 
 A kernel on disk counts as long as its own file and those whose code and constants are compiled into kernels are the
 same: by itself numba looks at the first alone, and would go on with an outdated part. A damaged file, or one that
@@ -19,14 +21,124 @@ import logging
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numba
-from numba import njit
-from numba.core import caching
-from numba.extending import register_jitable
+from numba import njit, types
+from numba.core import caching, cgutils, codegen, compiler, typed_passes, untyped_passes
+from numba.core.compiler_machinery import PassManager, register_pass
+from numba.extending import intrinsic, register_jitable
+from numba.np.arrayobj import get_itemsize, make_array, populate_array
+from numpy.typing import NDArray
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_PASSES = (
+    untyped_passes.TranslateByteCode,
+    untyped_passes.FixupArgs,
+    untyped_passes.IRProcessing,
+    untyped_passes.GenericRewrites,
+    untyped_passes.ReconstructSSA,
+    typed_passes.NopythonTypeInference,
+    typed_passes.PreLowerStripPhis,
+    typed_passes.IRLegalization,
+)
+
+
+# Settings of a caller that change nothing in what it calls.
+_OF_THE_CALLER = ("release_gil", "no_cpython_wrapper", "no_cfunc_wrapper")
+
+
+class _Flags(compiler.Flags):
+    """Settings of a compilation. numba compares them for every operator, to look up what it has compiled: equal where
+    what is called is the same."""
+
+    __slots__ = ("_compared",)
+
+    def __hash__(self) -> int:
+        return hash(_Flags)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, _Flags):
+            return NotImplemented
+        return self is other or self._values_of_interest() == other._values_of_interest()
+
+    def _values_of_interest(self) -> list[Any]:
+        if not hasattr(self, "_compared"):  # nothing changes any more
+            self._compared = [value for name, value in self.values().items() if name not in _OF_THE_CALLER]
+        return self._compared
+
+
+class _Library(codegen.JITCodeLibrary):
+    """LLVM's code of a kernel with its parts, which is optimised once."""
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        ll_module.data_layout = self._codegen._data_layout
+
+    def _optimize_final_module(self) -> None:
+        passes, builder = self._codegen._module_pass_manager()
+        passes.run(self._final_module, builder)
+
+
+class _PartLibrary(_Library):
+    """LLVM's code of a part, for kernels to link."""
+
+    def _optimize_final_module(self) -> None:
+        """The kernel's optimisation is enough."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        return 0
+
+    @property
+    def codegen(self) -> Any:
+        return self
+
+    def set_env(self, env_name: str, env: Any) -> None:
+        """A part raises no exception whose values are known at run time only."""
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _KernelLowering(typed_passes.NativeLowering):
+    _name = "ufmstar_kernel_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        state.library = _Library(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library.enable_object_caching()
+        return super().run_pass(state)
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _PartLowering(typed_passes.NativeLowering):
+    _name = "ufmstar_part_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        state.library = _PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        return super().run_pass(state)
+
+
+class _Kernel(compiler.CompilerBase):
+    """The passes over a kernel."""
+
+    lowering: type[typed_passes.NativeLowering] = _KernelLowering
+
+    def __init__(self, typingctx, targetctx, library, args, return_type, flags, locals) -> None:
+        super().__init__(typingctx, targetctx, library, args, return_type, _Flags(flags), locals)
+
+    def define_pipelines(self) -> list[PassManager]:
+        manager = PassManager("ufmstar_torch")
+        for one in (*_PASSES, self.lowering, typed_passes.NoPythonBackend):
+            manager.add_pass(one, one.__name__)
+        manager.finalize()
+        return [manager]
+
+
+class _Part(_Kernel):
+    """The passes over a part."""
+
+    lowering = _PartLowering
 
 
 def _sources() -> str:
@@ -89,7 +201,7 @@ def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile at the first call, and keep the result on disk; in memory alone where no folder can be written to."""
 
     def decorated(function: Callable[..., Any]) -> Any:
-        settings = {**_OPTIONS, **options}
+        settings = {**_OPTIONS, **options, "pipeline_class": _Kernel}
         try:
             compiled = njit(cache=True, **settings)(function)
         except RuntimeError:  # numba: "no locator available"
@@ -103,7 +215,7 @@ def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def _inner(**options: Any) -> Any:
-    return register_jitable(error_model="numpy", no_cfunc_wrapper=True, **options)
+    return register_jitable(error_model="numpy", no_cfunc_wrapper=True, pipeline_class=_Part, **options)
 
 
 kernel = kept()
@@ -120,3 +232,41 @@ contracted = _inner(_nrt=False, fastmath={"contract"})
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
 reordered = kept(fastmath=_ANY_ORDER)
 reordered_leaf = _inner(_nrt=False, fastmath=_ANY_ORDER)
+
+
+@intrinsic
+def _empty(typing, shape, dtype):
+    """``np.empty(shape, dtype)``, which itself takes .1 s to compile for every kind of array."""
+    array = types.Array(dtype.dtype, len(shape) if isinstance(shape, types.BaseTuple) else 1, "C")
+    return array(shape, dtype), _allocated
+
+
+# As a type checker sees it from a kernel, where the typing context is not an argument.
+empty: Callable[..., NDArray[Any]] = cast(Any, _empty)
+
+
+def _allocated(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """A new array of the signature's type, whose shape is the first argument."""
+    kind, shape = signature.return_type, signature.args[0]
+    several = isinstance(shape, types.BaseTuple)
+    given = cgutils.unpack_tuple(builder, arguments[0]) if several else [arguments[0]]
+    sizes = [
+        context.cast(builder, size, of, types.intp)
+        for size, of in zip(given, shape.types if several else [shape], strict=True)
+    ]
+    itemsize = context.get_constant(types.intp, get_itemsize(context, kind))
+    strides = [itemsize]
+    for size in reversed(sizes):
+        strides.insert(0, builder.mul(strides[0], size))
+    align = context.get_constant(types.uint32, context.get_preferred_array_alignment(kind.dtype))
+    memory = context.nrt.meminfo_alloc_aligned(builder, strides.pop(0), align)
+    array, number = make_array(kind)(context, builder), context.get_value_type(types.intp)
+    populate_array(
+        array,
+        data=builder.bitcast(context.nrt.meminfo_data(builder, memory), context.get_data_type(kind.dtype).as_pointer()),
+        shape=cgutils.pack_array(builder, sizes, ty=number),
+        strides=cgutils.pack_array(builder, strides, ty=number),
+        itemsize=itemsize,
+        meminfo=memory,
+    )
+    return array._getvalue()

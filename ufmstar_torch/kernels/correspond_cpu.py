@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import leaf, part
+from ufmstar_torch.kernels.compile_cpu import empty, leaf, part
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, WEIGHT
 
 
@@ -24,13 +24,13 @@ def matches(fields, n, fields_c, n_c, K, height, width, thresholds):
         c [P], k [P] and the overlap beta_ck [P] of every pair, in increasing c and then k.
     """
     eta, eta_occl, near, widening = thresholds
-    image, image_c = np.empty((6, n), np.float64), np.empty((6, n_c), np.float64)
-    index, index_c = np.empty(n, np.int64), np.empty(n_c, np.int64)
+    image, image_c = empty((6, n), np.float64), empty((6, n_c), np.float64)
+    index, index_c = empty(n, np.int64), empty(n_c, np.int64)
     count = _project(fields, n, K, height, width, near, widening, index, image)
     count_c = _project(fields_c, n_c, K, height, width, near, widening, index_c, image_c)
     limit, limit_occl = _limit(eta), _limit(eta_occl)
-    members, overlap = np.empty(count, np.int64), np.empty(count, np.float64)
-    c, k, beta = np.empty(64, np.int64), np.empty(64, np.int64), np.empty(64, np.float64)
+    members, overlap = empty(count, np.int64), empty(count, np.float64)
+    c, k, beta = empty(64, np.int64), empty(64, np.int64), empty(64, np.float64)
     pairs = 0
     for i in range(count_c):
         m = _overlapping(image_c, i, image, count, eta, limit, members, overlap)
@@ -52,7 +52,7 @@ def _limit(eta):
 
 @part
 def _longer(values):
-    out = np.empty(2 * values.size, values.dtype)
+    out = empty(2 * values.size, values.dtype)
     for i in range(values.size):
         out[i] = values[i]
     return out

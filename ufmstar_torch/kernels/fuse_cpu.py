@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, leaf
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
 
 _SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
@@ -153,7 +153,7 @@ def floor_covariance(S, floor, work):
 def lift(mean, covariance, weight, near, focal, widening, epsilon):
     """Lift the covariances of occupied slots, which are the first ones, to the floor that a segment needs (``step``),
     in place: the variance across one pixel, and ``epsilon`` times the trace for storage."""
-    work = np.empty(WORK, np.float64)
+    work = empty(WORK, np.float64)
     for n in range(weight.size):
         if not weight[n] > 0:
             break

@@ -24,7 +24,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, leaf
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
 from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, bounds
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, WEIGHT, padded
 
@@ -54,27 +54,27 @@ def in_view(components, m, features, K, depth, farthest, prior_weight, prior_mea
     """
     height, width = depth.shape
     n = m.size
-    whitened = np.empty((WHITENED, components.shape[1]), np.float64)
-    index, every = np.empty(n, np.int64), np.empty(n, np.int64)
+    whitened = empty((WHITENED, components.shape[1]), np.float64)
+    index, every = empty(n, np.int64), empty(n, np.int64)
     whiten(components, n, whitened)
     for k in range(n):
         every[k] = k
         for i in range(6):
             whitened[i, k] *= _SCALE
         whitened[PEAK, k] = (math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED) * _LOG2_E
-    packed = np.empty((FIELDS, padded(n)), depth.dtype)
+    packed = empty((FIELDS, padded(n)), depth.dtype)
     _pack(components, whitened, every, n, packed)
     z = farthest
     left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
     right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
     box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
     settings = prior_weight, prior_mean, epsilon, math.log2(_PRIOR * prior_weight), n
-    work = np.empty(8 + packed.shape[1], depth.dtype)
+    work = empty(8 + packed.shape[1], depth.dtype)
     # Blocks take n components; a few more lower the threshold by more than what rounding can make of two boxes.
     chosen = cull(packed, n, n + n // 64 + 1, box, settings, work, index)
-    fields, constants = np.empty((chosen, FIELDS), np.float64), np.empty((chosen, TERMS), depth.dtype)
+    fields, constants = empty((chosen, FIELDS), np.float64), empty((chosen, TERMS), depth.dtype)
     _terms(components, whitened, index, m, features, fields, constants)
-    packed = np.empty((FIELDS, padded(chosen)), depth.dtype)
+    packed = empty((FIELDS, padded(chosen)), depth.dtype)
     _pack(components, whitened, index, chosen, packed)
     return index[:chosen], fields, packed, constants, settings
 

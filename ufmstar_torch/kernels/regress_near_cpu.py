@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, part
 from ufmstar_torch.kernels.regress_cull_cpu import HALF_LOG_TWO_PI_CUBED, PEAK, WHITENED, whiten
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE
 
@@ -20,7 +20,7 @@ def near(depth, K, pixels, components, m, features, settings, out, out_f, first,
     """
     prior_weight, prior_mean, sigmas, near, far = settings
     log_peak, local, extent = _prepared(components, m.size, sigmas)
-    gaps, kept, sums = np.empty(m.size, np.float64), np.empty(m.size, np.int64), np.empty(features.shape[1], np.float64)
+    gaps, kept, sums = empty(m.size, np.float64), empty(m.size, np.int64), empty(features.shape[1], np.float64)
     for i in range(first * pixels.size // shares, (first + 1) * pixels.size // shares):
         v = pixels[i] // depth.shape[1]
         u = pixels[i] - v * depth.shape[1]
@@ -38,8 +38,8 @@ def near(depth, K, pixels, components, m, features, settings, out, out_f, first,
 @part
 def _prepared(components, n, sigmas):
     """Log peak density [n], mean and whitening [n, 9], and half the sides of the components' boxes [n, 3]."""
-    log_peak, local, extent = np.empty(n, np.float64), np.empty((n, 9), np.float64), np.empty((n, 3), np.float64)
-    whitened = np.empty((WHITENED, n), np.float64)
+    log_peak, local, extent = empty(n, np.float64), empty((n, 9), np.float64), empty((n, 3), np.float64)
+    whitened = empty((WHITENED, n), np.float64)
     whiten(components, n, whitened)
     for k in range(n):
         log_peak[k] = math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED

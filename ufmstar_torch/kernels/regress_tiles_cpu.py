@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import contracted, kernel, leaf, part
+from ufmstar_torch.kernels.compile_cpu import contracted, empty, kernel, leaf, part
 from ufmstar_torch.kernels.regress_cull_cpu import FIELDS, cull, pad
 from ufmstar_torch.kernels.regress_vectors_cpu import PIXELS, TILE, TINY, mix, mix_more, mix_three, place
 from ufmstar_torch.kernels.vectors_cpu import LANES
@@ -46,7 +46,7 @@ def exact_at(depth, K, pixels, view, features, shift, out, out_f):
     """One stream at some pixels [n], indices into the flattened image, into out [n] and out_f [F, n]."""
     height, width = depth.shape
     columns, rows = (width + _BLOCK - 1) // _BLOCK, (height + _BLOCK - 1) // _BLOCK
-    begin, order = np.empty(rows * columns + 2, np.int64), np.empty(pixels.size, np.int64)
+    begin, order = empty(rows * columns + 2, np.int64), empty(pixels.size, np.int64)
     _by_block(pixels, width, columns, begin, order)
     tiles, lists, sums = _scratch(view, out_f.shape[0], shift)
     _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sums, out, out_f)
@@ -65,20 +65,19 @@ def _scratch(view, features, shift):
     """
     n, dtype, more = view[2].shape[1], view[2].dtype, features - _mixed(features)  # n is padded
     tiles = (
-        np.empty((2, PIXELS), dtype), np.empty(PIXELS, dtype), np.empty((_TILES, 3 * PIXELS), dtype),
-        np.empty((_TILES, 9), np.float64), np.empty(_TILES, np.bool_), np.empty((_TILES, PIXELS), dtype),
-        np.empty(10, dtype),
+        empty((2, PIXELS), dtype), empty(PIXELS, dtype), empty((_TILES, 3 * PIXELS), dtype),
+        empty((_TILES, 9), np.float64), empty(_TILES, np.bool_), empty((_TILES, PIXELS), dtype), empty(10, dtype),
     )  # fmt: skip
-    lists = np.empty((FIELDS, n), dtype), np.empty(n + 8, dtype), np.empty(n, np.int64), np.empty(n, np.int64)
-    start = np.empty(6, dtype)
+    lists = empty((FIELDS, n), dtype), empty(n + 8, dtype), empty(n, np.int64), empty(n, np.int64)
+    start = empty(6, dtype)
     start[_EVIDENCE], start[_TOTAL], start[_LAST], start[3] = view[4][0], view[4][0] * view[4][1], 0, TINY
     start[4], start[5] = shift[1], shift[0]
-    densities = np.empty((n if more > 0 else 0, PIXELS), dtype)
+    densities = empty((n if more > 0 else 0, PIXELS), dtype)
     return (
         tiles, lists,
         (
-            start, np.empty((n, 3), dtype), densities, np.empty((5, PIXELS), dtype),
-            np.empty((more, PIXELS), dtype), np.empty(n, dtype),
+            start, empty((n, 3), dtype), densities, empty((5, PIXELS), dtype),
+            empty((more, PIXELS), dtype), empty(n, dtype),
         ),
     )  # fmt: skip
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf, part
 from ufmstar_torch.kernels.segment_rows_cpu import (
     CXX,
     CXZ,
@@ -41,13 +41,10 @@ def join_rows(width, fy, cy, slope, lengths2, limits, spans, table, table_int):
     that ``runs`` name (see :func:`scan_rows`), -1 for none.
     """
     height, most = spans.shape[0], segments_of_row(width, limits)
-    member = np.empty(table.shape[0], np.int64)  # segment -> Gaussian
-    active, interval = np.empty(2 * most, np.int64), np.empty((2, 2 * most), np.int64)
-    gaussians, whole = (
-        np.empty((4 * most + 64, _GAUSSIAN), np.float64),
-        np.empty((4 * most + 64, _GAUSSIAN_INT), np.int64),
-    )
-    h, before, created, emitted = np.empty(_GAUSSIAN, np.float64), ZERO, ZERO, ZERO
+    member = empty(table.shape[0], np.int64)  # segment -> Gaussian
+    active, interval = empty(2 * most, np.int64), empty((2, 2 * most), np.int64)
+    gaussians, whole = empty((4 * most + 64, _GAUSSIAN), np.float64), empty((4 * most + 64, _GAUSSIAN_INT), np.int64)
+    h, before, created, emitted = empty(_GAUSSIAN, np.float64), ZERO, ZERO, ZERO
     for v in range(height):
         if created + spans[v, 1] - spans[v, 0] > gaussians.shape[0]:
             gaussians, whole = _doubled(gaussians), _doubled(whole)
@@ -56,8 +53,8 @@ def join_rows(width, fy, cy, slope, lengths2, limits, spans, table, table_int):
             active, interval, before, created, member, h,
         )  # fmt: skip
         before, emitted = _retire(active, interval, n, v, v == height - 1, whole, emitted)
-    kept, place, slot = np.empty(created, np.int64), np.empty(created, np.int64), np.empty(table.shape[0] + 1, np.int64)
-    n = _prune(whole, created, limits, np.empty(created, np.int64), kept, place)
+    kept, place, slot = empty(created, np.int64), empty(created, np.int64), empty(table.shape[0] + 1, np.int64)
+    n = _prune(whole, created, limits, empty(created, np.int64), kept, place)
     slot[0] = -1
     for v in range(height):
         for i in range(spans[v, 0], spans[v, 1]):
@@ -77,7 +74,7 @@ def write_labels(spans, runs, slot, labels):
 @part
 def _doubled(table):
     """The same rows with as many free ones behind them."""
-    out = np.empty((2 * table.shape[0], table.shape[1]), table.dtype)
+    out = empty((2 * table.shape[0], table.shape[1]), table.dtype)
     for i in range(table.shape[0]):
         for j in range(table.shape[1]):  # a slice assignment takes seconds to compile
             out[i, j] = table[i, j]

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, leaf
+from ufmstar_torch.kernels.compile_cpu import empty, kernel, leaf
 
 # Counters start here: numba gives a plain 0 another type, and would compile the functions called with it twice.
 ZERO: Any = np.int64(0)
@@ -52,12 +52,12 @@ def scan_rows(z, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, sp
     its runs.
     """
     width = z.shape[1]
-    depth, x, tau_z = np.empty(width, np.float64), np.empty(width, np.float64), np.empty(width, np.float64)
-    rx = np.empty(width, np.float64)
+    depth, x, tau_z = empty(width, np.float64), empty(width, np.float64), empty(width, np.float64)
+    rx = empty(width, np.float64)
     for u in range(width):
         rx[u] = (u - cx) / fx
-    place = np.empty(width + 1, np.int32)  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
-    older = np.empty((limits.max_open, 15), np.float64)
+    place = empty(width + 1, np.int32)  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
+    older = empty((limits.max_open, 15), np.float64)
     end, pixels = first * segments_of_row(width, limits), first * width
     for v in range(first, last):
         spans[v, 0], spans[v, 2] = end, pixels

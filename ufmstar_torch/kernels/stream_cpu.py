@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel
+from ufmstar_torch.kernels.compile_cpu import empty, kernel
 from ufmstar_torch.kernels.correspond_cpu import matches
 from ufmstar_torch.kernels.fuse_cpu import WORK, append, fuse_pairs
 from ufmstar_torch.kernels.rigid_cpu import FIELDS, gather, padded, relative, scatter, turn
@@ -33,17 +33,17 @@ def match(camera, started, first_before, first, mixture, segments, size, thresho
     for i in range(4):
         for j in range(4):
             first[i, j] = present[i, j] if fine and not started else first_before[i, j]
-    motion, n = np.empty((3, 4), np.float64), 0
+    motion, n = empty((3, 4), np.float64), 0
     relative(first, present, motion)
     while n < weight.size and weight[n] > 0:
         n += 1
-    here = np.empty((FIELDS, padded(n)), np.float64)
-    segments_here = np.empty((FIELDS, padded(weight_c.size)), np.float64)
+    here = empty((FIELDS, padded(n)), np.float64)
+    segments_here = empty((FIELDS, padded(weight_c.size)), np.float64)
     gather(n, mean, covariance, weight, here)
     turn(motion, here.shape[1], here.shape[1], here)
     gather(weight_c.size, mean_c, cov_c, weight_c, segments_here)
     c, k, overlap = matches(here, n, segments_here, weight_c.size, K, size[0], size[1], thresholds)
-    new, found, matched, created = np.empty(weight_c.size, np.bool_), 0, 0, 0
+    new, found, matched, created = empty(weight_c.size, np.bool_), 0, 0, 0
     for i in range(new.size):
         new[i] = True
     for i in range(c.size):
@@ -79,10 +79,10 @@ def join(present, first, slots, segments, pairs, distance, new, occupied, settin
     mean, covariance, weight, disagreement, count, features = slots
     mean_c, cov_c, weight_c, features_c = segments
     c, k, overlap = pairs
-    work, motion = np.empty(WORK, np.float64), np.empty((3, 4), np.float64)
-    moved, turned = np.empty(mean_c.shape, np.float64), np.empty(cov_c.shape, np.float64)
+    work, motion = empty(WORK, np.float64), empty((3, 4), np.float64)
+    moved, turned = empty(mean_c.shape, np.float64), empty(cov_c.shape, np.float64)
     relative(present, first, motion)
-    by_field = np.empty((FIELDS, padded(weight_c.size)), np.float64)
+    by_field = empty((FIELDS, padded(weight_c.size)), np.float64)
     gather(weight_c.size, mean_c, cov_c, weight_c, by_field)
     turn(motion, by_field.shape[1], by_field.shape[1], by_field)
     scatter(weight_c.size, by_field, moved, turned)
@@ -93,11 +93,11 @@ def join(present, first, slots, segments, pairs, distance, new, occupied, settin
     n = append(
         mean, covariance, weight, disagreement, count, features, moved, turned, weight_c, features_c, new, occupied
     )
-    here = np.empty((FIELDS, padded(n)), np.float64)
+    here = empty((FIELDS, padded(n)), np.float64)
     gather(n, mean, covariance, weight, here)
     relative(first, present, motion)
     turn(motion, here.shape[1], here.shape[1], here)
-    m, more = np.empty(n, np.float64), np.empty((n, features.shape[1] + extra), np.float64)
+    m, more = empty(n, np.float64), empty((n, features.shape[1] + extra), np.float64)
     for i in range(n):
         m[i] = disagreement[i]
         for f in range(features.shape[1]):
