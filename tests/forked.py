@@ -28,8 +28,7 @@ def _program(words):
 
 
 def start(function, *arguments, **environment):
-    """A process, of a process group of its own, that calls a function of a file of this folder; it has begun when this
-    returns."""
+    """Start a process in a new process group that calls a function of a test file; return once it runs."""
     begun, module = CONTEXT.Event(), function.__module__.rpartition(".")[2]  # pytest knows it as tests.MODULE
     process = CONTEXT.Process(target=_call, args=(begun, environment, module, function.__name__, arguments))
     process.start()
@@ -38,5 +37,5 @@ def start(function, *arguments, **environment):
 
 
 def start_program(words):
-    """``ufmstar`` in a process of its own."""
+    """Start the command ``ufmstar`` in a new process."""
     return start(_program, [str(word) for word in words])

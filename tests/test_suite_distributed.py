@@ -96,7 +96,7 @@ def in_two(words, stop=lambda: False):
 
 @pytest.mark.slow
 def test_processes_end_in_good_order_by_a_stop_by_an_error_and_by_a_kill(tmp_path, monkeypatch):
-    monkeypatch.setattr(multiprocessing, "get_context", lambda _: forked.CONTEXT)  # spawned ones: the tests beside
+    monkeypatch.setattr(multiprocessing, "get_context", lambda _: forked.CONTEXT)  # the other tests here spawn
     with pytest.raises(RuntimeError, match=r"d/c: TypeError: a mistake"):
         in_two(acting(tmp_path / "a", "go", "wait", "fail"))
     assert len(list(tmp_path.glob("a/out/records/*/*/DepthOnly.json"))) == 1, "finished records stay"

@@ -85,7 +85,7 @@ def test_killed_in_the_middle_of_an_epoch_it_repeats_the_epoch_bit_for_bit(frame
 @pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_stopped_again_and_again_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path, workers, monkeypatch):
     """Two steps into the second and the third of three epochs of three steps; weights are there after each session."""
-    monkeypatch.setattr(torch.multiprocessing, "get_context", lambda _: CONTEXT)  # spawned ones: test_train_data.py
+    monkeypatch.setattr(torch.multiprocessing, "get_context", lambda _: CONTEXT)  # test_train_data.py spawns
     job = tiny_job(frames, tmp_path / "out", DROPOUT)
     job = replace(job, data=replace(job.data, workers=workers))
     for reached, kept in ((5, 3), (8, 6), (9, 9)):

@@ -50,7 +50,7 @@ class Record:
     ms: Mapping[str, float] = field(default_factory=dict)
     # "versions", "machine", "device", "runtime" of the networks, digests of networks and sequence.
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    path: Path = field(default=Path(), compare=False)  # its file, ROW.json; its sums lie in ROW.pt beside it
+    path: Path = field(default=Path(), compare=False)  # of ROW.json; ROW.pt in the same folder has the sums
 
     @cached_property
     def row(self) -> Row:

@@ -94,7 +94,7 @@ class DenseConfig(Checked):
 
 
 class Depths(NamedTuple):
-    """Of N pixels.
+    """Inverse depths measured at N pixels.
 
     Attributes:
         pixel: [N, 2] (u, v).
@@ -284,8 +284,8 @@ class DenseEvidence(SavedState):
         return found, self._errors.corrected(pixel[found], *given), trusted
 
     def _coarse(self, small: NDArray[np.uint8], taken: NDArray[np.float64], views: Views, cell: int) -> Depths:
-        """Depths of M pixels in the cells without a pixel of ``taken`` [N, 2], by windows
-        of twice the width: images and views of half the size."""
+        """Search the cells without a pixel of ``taken`` [N, 2] by windows of twice the width: in images of half the
+        size."""
         from ufmstar_torch.kernels.anchor_check_cpu import confirmed
         from ufmstar_torch.kernels.dense_cpu import Views, measure
 
