@@ -17,7 +17,7 @@ START = {
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
 PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
-REACH, RADIUS, WEAK, CLIP, APART = 1.0, 5 / 28, 0.25**2, 9.0, 0.5
+REACH, RADIUS, WEAK, CLIP, APART, OTHER = 1.0, 5 / 28, 0.25**2, 9.0, 0.5, 6
 
 
 def start():
@@ -133,8 +133,8 @@ def distances(logs, source):
     return way
 
 
-def update(state, depth, claimed, pixel, g, variance):
-    """One frame: depth [H, W] (0 = not valid), claimed V [m^2], anchors (pixel [N, 2], depth, variance), all valid.
+def update(state, depth, pixel, g, variance):
+    """One frame: depth [H, W] (0 = not valid), anchors (pixel [N, 2], depth, variance), all valid.
 
     Returns the state after it, posterior depth, variance, variance on the evidence's surface, and probability of
     another [H, W].
@@ -176,9 +176,7 @@ def update(state, depth, claimed, pixel, g, variance):
         weights = (part / total) ** 2 / count
         unit = ratio(state, name) / np.maximum(part, 1e-12)
         new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
-    counted = np.nan_to_num(claimed)
-    at_anchors = np.array([counted[r, c] for c, r in at]) / d**2
-    new |= discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, at_anchors)
+    new |= discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v)
     after = {"frames": state["frames"] + 1, "m0": m0, "b": mean[:4], "C": C[:4, :4], "sums": {}}
     for name, (value, prior, low, high) in START.items():
         above, below = state["sums"][name]
@@ -193,9 +191,9 @@ def update(state, depth, claimed, pixel, g, variance):
     wrong = ratio(state, "wrong")
     alone = [second_moment(0.0, *each) for each in zip(spread, share, offset, around, strict=True)]
     spread = [second_moment(wrong, *each) for each in zip(spread, share, offset, around, strict=True)]
-    posterior, variance, _ = read(depth, counted, logs, mean[:4], offset, spread, share)
-    _, inlier, unseen = read(depth, 0 * counted, logs, mean[:4], offset, alone, share)
-    return after, posterior, variance, inlier, np.minimum(wrong * (1 + 2 * unseen), 0.5)
+    posterior, variance, _ = read(depth, logs, mean[:4], offset, spread, share)
+    _, inlier, unseen = read(depth, logs, mean[:4], offset, alone, share)
+    return after, posterior, variance, inlier, np.minimum(wrong * (1 + OTHER * unseen), 0.5)
 
 
 def y_variance(shape, node, y, noise, used, centre):
@@ -216,15 +214,19 @@ def y_variance(shape, node, y, noise, used, centre):
 
 
 def second_moment(wrong, variance, share, offset, around):
-    """E[(e^n - 1)^2], n normal, or with the probability wrong (1 + 2 share) of n - offset; e^-offset at most 100."""
-    p, moments = min(wrong * (1 + 2 * share), 0.5), []
-    for v, q in ((variance, 1), (2 * around, min(math.exp(-offset), 100))):
-        v = min(v, 2)
+    """E[(e^n - 1)^2], n normal, or with the probability wrong (1 + 6 share) of n - offset; e^-offset at most 100."""
+    p, moments = min(wrong * (1 + OTHER * share), 0.5), []
+    for v, q in ((min(variance, 2), 1), (elsewhere(share, around), min(math.exp(-offset), 100))):
         moments.append(q * q * math.exp(2 * v) - 2 * q * math.exp(v / 2) + 1)
     return (1 - p) * moments[0] + p * moments[1]
 
 
-def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
+def elsewhere(share, around):
+    """Variance of y on another surface, at a distance of ``share`` widths from the evidence."""
+    return min(2 * around + 0.25 * min(share / RADIUS, 1), 2)
+
+
+def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v):
     held = np.zeros(len(y), bool)
     for k in range(3):
         number = state["frames"] * 3 + k + 1
@@ -241,12 +243,13 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
     area = believed / np.maximum(np.bincount(node, believed, minlength=logs.size)[node], 1e-12)
     share, around = away / REACH, y_variance(logs.shape, node, y, noise, rest, mean[0])[node]
     offset = H[:, FEATURES:] @ mean[FEATURES:]
-    own, wide = var + noise + away * ratio(state, "unseen"), noise + np.minimum(2 * around, 2)
-    final = [second_moment(wrong, *each) for each in zip(own, share, offset, around, strict=True)] + share * claimed
-    p = np.minimum(wrong * (1 + 2 * share), 0.5)
-    here, elsewhere = (1 - p) * normal(error, own), p * normal(error + offset, wide)
+    own = var + noise + away * ratio(state, "unseen")
+    wide = noise + [elsewhere(*each) for each in zip(share, around, strict=True)]
+    final = [second_moment(wrong, *each) for each in zip(own, share, offset, around, strict=True)]
+    p = np.minimum(wrong * (1 + OTHER * share), 0.5)
+    here, other = (1 - p) * normal(error, own), p * normal(error + offset, wide)
     return pairs(state, logs, held, node, error, var, away, noise) | {
-        "wrong": ((area * elsewhere / (here + elsewhere)).sum(), (area * (1 + 2 * share)).sum()),
+        "wrong": ((area * other / (here + other)).sum(), (area * (1 + OTHER * share)).sum()),
         "calibration": ((area * error**2 / final).sum(), area.sum()),
     }
 
@@ -275,7 +278,7 @@ def pairs(state, logs, held, node, error, var, away, noise):
     return {"amplitude": (sums[0], sums[1]), "unseen": (sums[2], sums[3])}
 
 
-def read(depth, claimed, logs, b, offset, spread, share):
+def read(depth, logs, b, offset, spread, share):
     h, w = depth.shape
     rows, cols = logs.shape
     out, variance, unseen = np.full((3, h, w), np.nan)
@@ -295,6 +298,6 @@ def read(depth, claimed, logs, b, offset, spread, share):
                     sums += weight * np.array([1, offset[k], spread[k], share[k]])
             offset_, spread_, share_ = sums[1:] / sums[0]
             out[i, j] = depth[i, j] * math.exp(min(max(y + offset_, -math.log(100)), math.log(100)))
-            variance[i, j] = out[i, j] ** 2 * (spread_ + share_ * claimed[i, j] / depth[i, j] ** 2)
+            variance[i, j] = out[i, j] ** 2 * spread_
             unseen[i, j] = share_
     return out, variance, unseen

@@ -38,6 +38,7 @@ class Anchors:
             None = by nothing that is known.
         shared: [B] variance of inverse depths by an error that all anchors of the frame have in common, as wrong poses
             make [1/m^2]; None = 0.
+        scale: [B] variance of the logarithm of a factor that all depths of the frame have in common; None = 0.
     """
 
     pixel: Tensor
@@ -46,6 +47,7 @@ class Anchors:
     valid: Tensor | None = None
     pose_error: Tensor | None = None
     shared: Tensor | None = None
+    scale: Tensor | None = None
 
     @classmethod
     def from_points(
@@ -133,7 +135,7 @@ class AnchorInput:
         rejected: [B] anchors that would be valid, but are off by more; None = not counted.
         contradiction: [B] mean of their r^2, at most 100^2, where they are more than the valid ones: then they are no
             outliers, and show the error; else 0. None likewise.
-        pose_error, shared: [B] as in :class:`Anchors`.
+        pose_error, shared, scale: [B] as in :class:`Anchors`.
     """
 
     pixel: Tensor
@@ -147,6 +149,7 @@ class AnchorInput:
     contradiction: Tensor | None = None
     pose_error: Tensor | None = None
     shared: Tensor | None = None
+    scale: Tensor | None = None
 
 
 def check_anchors(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor] = ()) -> AnchorInput:
@@ -199,6 +202,7 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor] = (
         contradiction=torch.where(many, square / rejected.clamp_min(1), torch.zeros_like(square)),
         pose_error=anchors.pose_error,
         shared=anchors.shared,
+        scale=anchors.scale,
     )
 
 

@@ -24,7 +24,7 @@ _CAUSES = (
 # A file may be named by a str too; type checkers then find no misspelt word.
 Given = Literal["corners", "dense"] | Path | LandmarkSource
 _IN_A_ROW = 8  # images that contradict their poses before the warning; what a blurred one shows lasts for some
-_PARTS = ("pixel", "depth", "variance", "valid", "pose_error", "shared")
+_PARTS = ("pixel", "depth", "variance", "valid", "pose_error", "shared", "scale")
 
 
 class StreamLandmarks:

@@ -121,6 +121,7 @@ class Landmarks:
         shared: variance of inverse depths by errors of the poses, the same error for all landmarks of the image
             [1/m^2]; it is in ``variance`` too. Infinite where the poses contradict the images.
         contradicted: the poses contradict the images, and no depth is used.
+        scale: variance of the logarithm of a factor that all depths of the image have in common; in ``variance`` too.
     """
 
     pixel: NDArray[np.float64]
@@ -131,6 +132,7 @@ class Landmarks:
     pose_error: float = float("nan")
     shared: float = 0.0
     contradicted: bool = False
+    scale: float = 0.0
 
     @classmethod
     def skipped(cls, fault: str) -> Landmarks:
@@ -159,7 +161,8 @@ class Landmarks:
             return torch.from_numpy(full).to(intrinsics.device)
 
         valid = torch.arange(room, device=intrinsics.device)[None] < n
-        frame = torch.tensor([[self.pose_error], [self.shared]], dtype=torch.float64, device=intrinsics.device)
+        errors = [[self.pose_error], [self.shared], [self.scale]]
+        frame = torch.tensor(errors, dtype=torch.float64, device=intrinsics.device)
         result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, *frame)
         return result.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 

@@ -23,6 +23,7 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
     Grid,
     Running,
     away_from,
+    elsewhere_variance,
     fitted,
     scene_of,
     second_moments,
@@ -77,7 +78,7 @@ def _of_stream(
     field, left_out, weight = fitted(scene)
     away = away_from(scene, weight * config.weak_sigma**2 >= 1)
     if some:
-        kept = learnt(scene, field, weight, left_out, _relative(claimed, anchors), running)
+        kept = learnt(scene, field, weight, left_out, running)
     else:
         kept = running.drifted(grid.mean) if running.frames and valid.any() else packed
     node = np.arange(rows * cols)
@@ -86,15 +87,8 @@ def _of_stream(
     b = field.coefficients
     share, offset = away / config.reach, mean - (x * b).sum(1)
     variance = variance + running.ratios["roughness"] + away * running.ratios["unseen"]
-    p = wrong(running, share)
-    variance, inlier = second_moments(
-        scene, variance, p, offset, spread_around(scene, np.ones(len(scene.noise), np.bool_), b[0])
-    )
+    wide = elsewhere_variance(config, spread_around(scene, np.ones(len(scene.noise), np.bool_), b[0]), away)
+    variance, inlier = second_moments(config, variance, wrong(running, share), offset, wide)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, share], 1)
-    depth, spread, inlier, unseen = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
+    depth, spread, inlier, unseen = read(depth, valid, logs, nodes, b, grid.mean, (rows, cols), config)
     return kept, depth, spread, wrong(running, unseen).astype(unseen.dtype), inlier
-
-
-def _relative(claimed: NDArray[Any], anchors: AnchorRows) -> Floats:
-    V = claimed.ravel()[anchors.at_pixel].astype(np.float64)
-    return np.where(np.isnan(V), 0.0, V) / anchors.predicted**2

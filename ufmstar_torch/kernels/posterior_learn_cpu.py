@@ -11,6 +11,7 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
     Running,
     Scene,
     away_from,
+    elsewhere_variance,
     second_moments,
     spread_around,
     wrong,
@@ -18,11 +19,9 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
 from ufmstar_torch.posterior.learn import APART, LEAST_REST, STEPS
 
 
-def learnt(
-    scene: Scene, field: Field, weight: Floats, left_out: LeftOut, claimed: Floats, running: Running
-) -> Floats:  # fmt: skip
+def learnt(scene: Scene, field: Field, weight: Floats, left_out: LeftOut, running: Running) -> Floats:
     """Packed."""
-    above, below = running.added(_of_neighbours(scene, left_out, running) | _of_discs(scene, weight, claimed, running))
+    above, below = running.added(_of_neighbours(scene, left_out, running) | _of_discs(scene, weight, running))
     first = [running.frames + 1, scene.grid.mean]
     return np.concatenate([first, above, below, field.coefficients, field.covariance.ravel()])
 
@@ -39,7 +38,7 @@ def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[st
     return sums
 
 
-def _of_discs(scene: Scene, weight: Floats, claimed: Floats, running: Running) -> dict[str, tuple[float, float]]:
+def _of_discs(scene: Scene, weight: Floats, running: Running) -> dict[str, tuple[float, float]]:
     held, config = _discs(scene, running.frames), scene.config
     rest = ~held
     held = held & (np.count_nonzero(rest) >= LEAST_REST)
@@ -50,13 +49,12 @@ def _of_discs(scene: Scene, weight: Floats, claimed: Floats, running: Running) -
     error, offset = scene.observed.value[held] - mean, mean - (x * b).sum(1)
     believed = np.where(held, scene.believed(), 0.0)
     area = (believed / np.maximum(scene.counted(believed), 1e-12))[held]
-    share, spread = away / config.reach, spread_around(scene, rest, b[0])[node]
+    share, wide = away / config.reach, elsewhere_variance(config, spread_around(scene, rest, b[0])[node], away)
     p, own = wrong(running, share), variance + noise + away * running.ratios["unseen"]
-    wide = noise + np.minimum(config.spread * spread, config.widest)
-    z2 = error**2 / own - (error + offset) ** 2 / wide
+    z2 = error**2 / own - (error + offset) ** 2 / (noise + wide)
     with np.errstate(over="ignore", divide="ignore"):  # certainly on its own surface, or never on another
-        elsewhere = 1 / (1 + np.exp(-np.log(p / (1 - p)) - (np.log(own / wide) + z2) / 2))
-    stated = second_moments(scene, own, p, offset, spread)[0] + share * claimed[held]
+        elsewhere = 1 / (1 + np.exp(-np.log(p / (1 - p)) - (np.log(own / (noise + wide)) + z2) / 2))
+    stated = second_moments(config, own, p, offset, wide)[0]
     sums = {
         "wrong": (area * elsewhere, area * (1 + config.other * share)),
         "calibration": (area * error**2 / stated, area),

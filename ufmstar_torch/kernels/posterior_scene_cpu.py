@@ -185,9 +185,15 @@ def wrong(running: Running, share: NDArray[Any]) -> NDArray[Any]:
     return np.minimum(running.ratios["wrong"] * (1 + running.config.other * share), MOST_WRONG)
 
 
-def second_moments(scene: Scene, variance: Floats, p: Floats, offset: Floats, spread: Floats) -> tuple[Floats, Floats]:
-    config, q = scene.config, np.exp(np.minimum(-offset, LARGEST))
-    own, wide = (np.minimum(v, config.widest) for v in (variance, config.spread * spread))
+def elsewhere_variance(config: PosteriorConfig, around: Floats, away: Floats) -> Floats:
+    wide = config.spread * around + config.prior_sigma**2 * np.minimum(away / config.radius, 1)
+    return np.minimum(wide, config.widest)
+
+
+def second_moments(
+    config: PosteriorConfig, variance: Floats, p: Floats, offset: Floats, wide: Floats
+) -> tuple[Floats, Floats]:  # fmt: skip
+    own, q = np.minimum(variance, config.widest), np.exp(np.minimum(-offset, LARGEST))
     tail = q * q * np.exp(2 * wide) - 2 * q * np.exp(wide / 2) + 1
     inlier: Floats = np.exp(2 * own) - 2 * np.exp(own / 2) + 1
     return (1 - p) * inlier + p * tail, inlier

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.anchors import AnchorInput
 from ufmstar_torch.anchors.extension import AnchorFrame
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension, FrameExtension, Tensors, Total
@@ -43,10 +44,8 @@ class PosteriorFrame(FrameExtension):
         more = torch.zeros_like(posterior.variance)
         if anchors is not None and anchors.contradiction is not None:  # most are off by more than a factor of 100
             more = posterior.depth.square() * anchors.contradiction[:, None, None].to(more.dtype)
-        if anchors is not None and anchors.shared is not None:  # an error of the poses, which no anchor beside can show
-            shared = anchors.shared[:, None, None].to(more.dtype)
-            most = self._config.posterior.prior_sigma**2 * posterior.depth.square()
-            more = more + torch.minimum(posterior.depth**4 * shared, most)
+        if anchors is not None:
+            more = more + _of_all(anchors, posterior.depth, self._config.posterior.prior_sigma**2)
         floor = self._config.variance_floor
         variance, inlier = (v.clamp_min(floor) + more for v in (posterior.variance, posterior.inlier))
         self._posterior = replace(posterior, variance=variance, inlier=inlier)
@@ -61,6 +60,14 @@ class PosteriorFrame(FrameExtension):
             "posterior_depth": p.depth, "posterior_variance": p.variance,
             "posterior_outlier": p.outlier, "posterior_inlier_variance": p.inlier,
         }  # fmt: skip
+
+
+def _of_all(anchors: AnchorInput, depth: Tensor, most: float) -> Tensor:
+    """Variance of the depth [B, H, W] by the errors that all anchors of the frame have in common [m^2], which no anchor
+    shows beside the others; at most ``most`` of the squared depth."""
+    none = torch.zeros((), dtype=depth.dtype, device=depth.device)
+    shared, scale = (none if x is None else x[:, None, None].to(depth) for x in (anchors.shared, anchors.scale))
+    return depth.square() * (depth.square() * shared + scale).clamp_max(most)
 
 
 class PosteriorExtension(Extension):

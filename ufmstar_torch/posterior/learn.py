@@ -15,7 +15,15 @@ from torch.nn.functional import pad
 from ufmstar_torch.fixed_order import total
 from ufmstar_torch.posterior.field import Field
 from ufmstar_torch.posterior.running import Running, ratios
-from ufmstar_torch.posterior.scene import LeftOut, Scene, away_from, second_moments, spread_around, wrong
+from ufmstar_torch.posterior.scene import (
+    LeftOut,
+    Scene,
+    away_from,
+    elsewhere_variance,
+    second_moments,
+    spread_around,
+    wrong,
+)
 
 # Variance of the difference between neighbouring nodes, over that of the link between them: on a square lattice the
 # other ways from one to the other are worth as much as the link.
@@ -26,11 +34,9 @@ LEAST_REST = 5
 STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
-def learnt(
-    scene: Scene, field: Field, weight: Tensor, left_out: LeftOut, claimed: Tensor, running: Running,
-) -> Running:  # fmt: skip
+def learnt(scene: Scene, field: Field, weight: Tensor, left_out: LeftOut, running: Running) -> Running:
     """The memory after the frame."""
-    sums = _of_neighbours(scene, left_out, running) | _of_discs(scene, weight, claimed, running)
+    sums = _of_neighbours(scene, left_out, running) | _of_discs(scene, weight, running)
     added = {name: running.added(name, *sums[name]) for name in ratios(scene.config)}
     above, below = ({name: pair[i] for name, pair in added.items()} for i in range(2))
     after = running.frames + 1, scene.grid.mean, above, below, field.coefficients, field.covariance
@@ -51,7 +57,7 @@ def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[st
     return sums
 
 
-def _of_discs(scene: Scene, weight: Tensor, claimed: Tensor, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
+def _of_discs(scene: Scene, weight: Tensor, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
     """Sums for all else that is learnt, from anchors whose whole region is left out."""
     held = _discs(scene, running.frames) & scene.valid
     rest = scene.valid & ~held
@@ -63,12 +69,12 @@ def _of_discs(scene: Scene, weight: Tensor, claimed: Tensor, running: Running) -
     believed = torch.where(held, scene.believed(), 0.0)
     area = believed / scene.counted(believed).clamp_min(1e-12)
     share, offset = away / scene.config.reach, mean - (scene.observed.features * b[:, None]).sum(-1)
-    spread, p = torch.gather(spread_around(scene, rest, b[:, 0]), 1, scene.observed.node), wrong(running, share)
+    around, p = torch.gather(spread_around(scene, rest, b[:, 0]), 1, scene.observed.node), wrong(running, share)
     own = variance + scene.noise + away * running.ratio("unseen")[:, None]
-    wide = scene.noise + (scene.config.spread * spread).clamp_max(scene.config.widest)
-    z2 = error.square() / own - (error + offset).square() / wide
-    elsewhere = torch.sigmoid(p.logit() + ((own / wide).log() + z2) / 2)
-    stated = second_moments(scene, own, p, offset, spread)[0] + share * claimed
+    wide = elsewhere_variance(scene.config, around, away)
+    z2 = error.square() / own - (error + offset).square() / (scene.noise + wide)
+    elsewhere = torch.sigmoid(p.logit() + ((own / (scene.noise + wide)).log() + z2) / 2)
+    stated = second_moments(scene.config, own, p, offset, wide)[0]
     return _of_pairs(scene, held, torch.stack([error, variance, away, scene.noise]), running) | {
         "wrong": (total(area * elsewhere, 1), total(area * (1 + scene.config.other * share), 1)),
         "calibration": (total(area * error.square() / stated, 1), total(area, 1)),

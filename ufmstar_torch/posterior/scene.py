@@ -157,11 +157,19 @@ def wrong(running: Running, share: Tensor) -> Tensor:
     return (running.ratio("wrong")[:, None] * (1 + running.config.other * share)).clamp_max(MOST_WRONG)
 
 
-def second_moments(scene: Scene, variance: Tensor, p: Tensor, offset: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
-    """Variances over the squared depth: all in all, and of y's ``variance`` alone; with the probability p, which the
-    former contains, the local correction ``offset`` does not hold and y has the variance of ``spread``."""
-    config, q = scene.config, (-offset).clamp_max(LARGEST).exp()
-    own, wide = (v.clamp_max(config.widest) for v in (variance, config.spread * spread))
+def elsewhere_variance(config: PosteriorConfig, around: Tensor, away: Tensor) -> Tensor:
+    """Variance of y on another surface than the evidence's: from ``around``, that of the anchors' y, and, with the
+    distance ``away`` from the evidence, what it was before the first anchor. At most ``widest``."""
+    wide = config.spread * around + config.prior_sigma**2 * (away / config.radius).clamp_max(1)
+    return wide.clamp_max(config.widest)
+
+
+def second_moments(
+    config: PosteriorConfig, variance: Tensor, p: Tensor, offset: Tensor, wide: Tensor
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Variances over the squared depth: in total, and of y's ``variance`` alone. With the probability p, which the
+    total contains, the local correction ``offset`` does not hold and y has the variance ``wide``."""
+    own, q = variance.clamp_max(config.widest), (-offset).clamp_max(LARGEST).exp()
     tail = q.square() * (2 * wide).exp() - 2 * q * (wide / 2).exp() + 1
     inlier = (2 * own).exp() - 2 * (own / 2).exp() + 1
     return (1 - p) * inlier + p * tail, inlier

@@ -18,23 +18,24 @@ difference of f across a link is Student's t in the same way, so that f may jump
 Variance over the squared depth at a node, with v the field's variance + roughness + unseen distance, and
 share = min(1, distance/reach):
 
-    (1 - p) m(v) + p tail + share V/d^2,      p = wrong (1 + other share),      m(v) = E[(e^n - 1)^2],      n ~ N(0, v).
+    (1 - p) m(v) + p tail,      p = wrong (1 + other share),      m(v) = E[(e^n - 1)^2],      n ~ N(0, v).
 
 The error of the depth is log-normal, so m exceeds v where v is large. p is the probability that the depth is of another
 surface than its evidence: ``outlier``. ``inlier`` is m(v) alone.
 
 The distance from evidence is geodesic, in widths of the image, and differences of log d lengthen it: on tours the
-variance of the error grows in proportion to it. V = M + A + E counts where evidence is far. ``learn`` says how
-``unseen``, ``wrong`` and the other ratios (``running``) are learnt.
+variance of the error grows in proportion to it. ``learn`` learns ``unseen``, ``wrong`` and the other ratios
+(``running``) from the anchors.
 
 ``tail`` is the second moment about the posterior depth if the local correction f does not hold, because the evidence is
-wrong or lies on another surface. Then y - b . x is normal with the variance v, and the depth log-normal:
+wrong or lies on another surface. Then y - b . x is normal with the variance w, and the depth log-normal:
 
-    tail = E[(e^(n - f) - 1)^2] = q^2 e^(2 v) - 2 q e^(v/2) + 1,      q = e^-f <= 100,      n ~ N(0, v).
+    tail = E[(e^(n - f) - 1)^2] = q^2 e^(2 w) - 2 q e^(w/2) + 1,      q = e^-f <= 100,      n ~ N(0, w),
+    w = spread s^2 + sigma_b^2 min(1, distance/radius),
 
-v is ``spread`` times the variance of the anchors' y around, of a Gaussian window, and neither v exceeds ``widest``. So
-no pixel is more certain than contradictory evidence allows, and a depth that was pulled far below the global correction
-is less certain than one above it.
+with s^2 the variance of the anchors' y around, of a Gaussian window. Neither v nor w exceeds ``widest``. So no pixel is
+more certain than contradictory evidence allows, another surface that has no evidence is as uncertain as before the
+first anchor, and a depth that was pulled far below the global correction is less certain than one above it.
 
 A stream that is given anchors of which none was valid so far has that variance without evidence, about the network's
 depth: nothing was measured, and nothing reads as certain. A stream without anchors is UfM*'s.
@@ -55,7 +56,15 @@ from ufmstar_torch.posterior.grid import Grid
 from ufmstar_torch.posterior.learn import learnt
 from ufmstar_torch.posterior.read import read
 from ufmstar_torch.posterior.running import Running
-from ufmstar_torch.posterior.scene import Scene, away_from, fitted, second_moments, spread_around, wrong
+from ufmstar_torch.posterior.scene import (
+    Scene,
+    away_from,
+    elsewhere_variance,
+    fitted,
+    second_moments,
+    spread_around,
+    wrong,
+)
 
 
 @dataclass(frozen=True)
@@ -106,20 +115,19 @@ def update(
     """
     given = anchors is not None
     anchors = anchors if anchors is not None and anchors.valid.shape[1] else _none(frame)
-    running, grid, known_claim = Running.of(packed, config), Grid.of(frame, config), claimed.nan_to_num()
+    running, grid = Running.of(packed, config), Grid.of(frame, config)
     scene = Scene.of(grid, frame, anchors, running)
     field, left_out, weight = fitted(scene)
     away = away_from(scene, anchors.valid & (weight * config.weak_sigma**2 >= 1))
-    after = learnt(scene, field, weight, left_out, _relative(known_claim, anchors), running)
+    after = learnt(scene, field, weight, left_out, running)
     features, b = grid.features(), field.coefficients
     mean, variance = field.at(torch.arange(features.shape[1], device=b.device).expand_as(away), features)
     offset, share = mean - (features * b[:, None]).sum(-1), away / config.reach
     variance = variance + running.ratio("roughness")[:, None] + away * running.ratio("unseen")[:, None]
-    p = wrong(running, share)
-    variance, inlier = second_moments(scene, variance, p, offset, spread_around(scene, anchors.valid, b[:, 0]))
+    wide = elsewhere_variance(config, spread_around(scene, anchors.valid, b[:, 0]), away)
+    variance, inlier = second_moments(config, variance, wrong(running, share), offset, wide)
     nodes = torch.stack([grid.log_depth, offset, variance, inlier, share], -1)
-    maps = frame.depth, frame.valid, known_claim
-    depth, spread, inlier, unseen = read(*maps, nodes, b, grid.mean, grid.size, config)
+    depth, spread, inlier, unseen = read(frame.depth, frame.valid, nodes, b, grid.mean, grid.size, config)
     outlier = wrong(running, unseen.flatten(1)).view_as(unseen).to(unseen.dtype)
     some = anchors.valid.any(1)
     known = (some | (running.frames > 0) | given)[:, None, None]
@@ -140,9 +148,3 @@ def _none(frame: FrameInput) -> AnchorInput:
     one, zero = like.new_ones(b, 1), like.new_zeros(b, 1)
     index = torch.zeros(b, 1, dtype=torch.int64, device=like.device)
     return AnchorInput(like.new_zeros(b, 1, 2), index, one, one, zero, zero, index.bool())
-
-
-def _relative(claimed: Tensor, anchors: AnchorInput) -> Tensor:
-    """[B, N] V/d^2 at the anchors."""
-    at = torch.gather(claimed.flatten(1), 1, anchors.index).double()
-    return torch.where(anchors.valid, at / anchors.predicted.square(), torch.zeros_like(at))
