@@ -133,8 +133,8 @@ def distances(logs, source):
     return way
 
 
-def update(state, depth, pixel, g, variance):
-    """One frame: depth [H, W] (0 = not valid), anchors (pixel [N, 2], depth, variance), all valid.
+def update(state, depth, claimed, pixel, g, variance):
+    """One frame: depth [H, W] (0 = not valid), claimed V [m^2], anchors (pixel [N, 2], depth, variance), all valid.
 
     Returns the state after it, posterior depth, variance, variance on the evidence's surface, and probability of
     another [H, W].
@@ -191,8 +191,8 @@ def update(state, depth, pixel, g, variance):
     wrong = ratio(state, "wrong")
     alone = [second_moment(0.0, *each) for each in zip(spread, share, offset, around, strict=True)]
     spread = [second_moment(wrong, *each) for each in zip(spread, share, offset, around, strict=True)]
-    posterior, variance, _ = read(depth, logs, mean[:4], offset, spread, share)
-    _, inlier, unseen = read(depth, logs, mean[:4], offset, alone, share)
+    posterior, variance, _ = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, share)
+    _, inlier, unseen = read(depth, 0 * depth, logs, mean[:4], offset, alone, share)
     return after, posterior, variance, inlier, np.minimum(wrong * (1 + OTHER * unseen), 0.5)
 
 
@@ -278,7 +278,7 @@ def pairs(state, logs, held, node, error, var, away, noise):
     return {"amplitude": (sums[0], sums[1]), "unseen": (sums[2], sums[3])}
 
 
-def read(depth, logs, b, offset, spread, share):
+def read(depth, claimed, logs, b, offset, spread, share):
     h, w = depth.shape
     rows, cols = logs.shape
     out, variance, unseen = np.full((3, h, w), np.nan)
@@ -298,6 +298,6 @@ def read(depth, logs, b, offset, spread, share):
                     sums += weight * np.array([1, offset[k], spread[k], share[k]])
             offset_, spread_, share_ = sums[1:] / sums[0]
             out[i, j] = depth[i, j] * math.exp(min(max(y + offset_, -math.log(100)), math.log(100)))
-            variance[i, j] = out[i, j] ** 2 * spread_
+            variance[i, j] = out[i, j] ** 2 * max(spread_, share_ * claimed[i, j] / depth[i, j] ** 2)
             unseen[i, j] = share_
     return out, variance, unseen

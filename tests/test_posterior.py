@@ -54,7 +54,7 @@ def test_values_against_the_oracle_over_frames(tier):
     state, packed = oracle.start(), torch.zeros(1, SIZE, dtype=torch.float64)
     for seed in range(2):
         depth, _, claimed, *anchors = scene(seed, (12, 16), 40)
-        state, expected, variance, inlier, outlier = oracle.update(state, depth, *anchors)
+        state, expected, variance, inlier, outlier = oracle.update(state, depth, claimed, *anchors)
         packed, out = tier(packed, *checked(depth, *anchors), torch.from_numpy(claimed)[None], MODEL)
         np.testing.assert_allclose(out.depth[0], expected, rtol=1e-8)
         np.testing.assert_allclose(out.variance[0], variance, rtol=1e-7)
@@ -258,11 +258,15 @@ def test_contradictory_anchors_and_depth_that_they_pull_near_are_less_certain():
     assert result["nearer"] > 1.3 * result["farther"]
 
 
-def test_far_from_evidence_the_variance_is_larger():
+def test_far_from_evidence_the_variance_is_larger_and_never_below_what_ufm_star_claims():
     depth, _, _, pixel, g, variance = scene(0, n=120)
     near = pixel[:, 0] < 12
-    result = updated(depth, (pixel[near], g[near], variance[near]))[1].variance[0]
-    assert float(result[:, 44:].mean() / result[8:, :10].mean()) > 4
+    anchors = pixel[near], g[near], variance[near]
+    none, small, large = (updated(depth, anchors, np.full((36, 48), v))[1].variance[0] for v in (0.0, 0.01, 5.0))
+    assert float(none[:, 44:].mean() / none[8:, :10].mean()) > 4
+    torch.testing.assert_close(small, none, equal_nan=True)  # it is less than what the anchors leave open
+    assert float((large - none)[:, 44:].mean()) > 0.1
+    assert bool((large >= none)[np.nonzero(depth)].all())
 
 
 def test_another_surface_without_evidence_is_as_uncertain_as_before_the_first_anchor():

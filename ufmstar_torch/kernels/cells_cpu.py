@@ -67,7 +67,7 @@ def _highest_over_lowest(depth, valid, index, out):
 
 
 def read(
-    depth: NDArray[Any], valid: NDArray[np.bool_], logs: NDArray[Any], nodes: Floats,
+    depth: NDArray[Any], valid: NDArray[np.bool_], logs: NDArray[Any], claimed: NDArray[Any], nodes: Floats,
     coefficients: Floats, mean: float, size: tuple[int, int], config: PosteriorConfig,
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:  # fmt: skip
     """As :func:`ufmstar_torch.posterior.read.read`, with log d."""
@@ -82,14 +82,14 @@ def read(
     base = coefficients[0] - coefficients[1] * mean + coefficients[2] * (2 * u - 1)
     slopes = coefficients[1], coefficients[3]
     limits = config.edge_contrast**2, LARGEST
-    _pixels(depth, valid, logs, left, right, between - before, base, slopes, limits, y, spread, inlier, share)
+    _pixels(depth, valid, logs, claimed, left, right, between - before, base, slopes, limits, y, spread, inlier, share)
     factor = np.exp(y, out=y)
     square = factor * factor
     return depth * factor, spread * square, inlier * square, share
 
 
 @with_nan
-def _pixels(depth, valid, logs, left, right, across, base, slopes, limits, y, spread, inlier, shares):
+def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limits, y, spread, inlier, shares):
     """y [H, W], the variances of d e^y over e^2y, and the share without evidence at every pixel; NaN where not valid.
 
     ``left`` and ``right`` [R, 5, W] are the nodes before and after each column, ``across`` by how much the one after it
@@ -104,10 +104,10 @@ def _pixels(depth, valid, logs, left, right, across, base, slopes, limits, y, sp
         top = min(int(at), max(rows - 2, 0))
         below, low = at - top, min(top + 1, rows - 1)
         n0, n1, n2, n3 = left[top], right[top], left[low], right[low]
-        depths, used, gs = depth[i], valid[i], logs[i]
+        depths, used, gs, Vs = depth[i], valid[i], logs[i], claimed[i]
         ys, out, inside, far = y[i], spread[i], inlier[i], shares[i]
         for j in range(len(across)):
-            g, d, beside = np.float64(gs[j]), np.float64(depths[j]), across[j]
+            g, d, V, beside = np.float64(gs[j]), np.float64(depths[j]), np.float64(Vs[j]), across[j]
             a0, a1, a2, a3 = g - n0[0, j], g - n1[0, j], g - n2[0, j], g - n3[0, j]
             q0, q1, q2, q3 = alike + a0 * a0, alike + a1 * a1, alike + a2 * a2, alike + a3 * a3
             w0, w1 = (1 - below) * (1 - beside) * q1 * (q2 * q3), (1 - below) * beside * q0 * (q2 * q3)
@@ -120,5 +120,5 @@ def _pixels(depth, valid, logs, left, right, across, base, slopes, limits, y, sp
             value = base[j] + by_depth * g + by_row * (2 * v - 1) + offset * share
             ys[j] = min(max(value, -largest), largest) if used[j] else np.nan
             far[j] = unseen * share if used[j] else np.nan
-            out[j] = own * d * d * share
+            out[j] = max(own * d * d, unseen * (V if V == V else 0.0)) * share
             inside[j] = here * d * d * share

@@ -90,5 +90,5 @@ def _of_stream(
     wide = elsewhere_variance(config, spread_around(scene, np.ones(len(scene.noise), np.bool_), b[0]), away)
     variance, inlier = second_moments(config, variance, wrong(running, share), offset, wide)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, share], 1)
-    depth, spread, inlier, unseen = read(depth, valid, logs, nodes, b, grid.mean, (rows, cols), config)
+    depth, spread, inlier, unseen = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
     return kept, depth, spread, wrong(running, unseen).astype(unseen.dtype), inlier

@@ -45,7 +45,7 @@ class PosteriorFrame(FrameExtension):
         if anchors is not None and anchors.contradiction is not None:  # most are off by more than a factor of 100
             more = posterior.depth.square() * anchors.contradiction[:, None, None].to(more.dtype)
         if anchors is not None:
-            more = more + _of_all(anchors, posterior.depth, self._config.posterior.prior_sigma**2)
+            more = more + common_error(anchors, posterior.depth, self._config.posterior.prior_sigma**2)
         floor = self._config.variance_floor
         variance, inlier = (v.clamp_min(floor) + more for v in (posterior.variance, posterior.inlier))
         self._posterior = replace(posterior, variance=variance, inlier=inlier)
@@ -62,7 +62,7 @@ class PosteriorFrame(FrameExtension):
         }  # fmt: skip
 
 
-def _of_all(anchors: AnchorInput, depth: Tensor, most: float) -> Tensor:
+def common_error(anchors: AnchorInput, depth: Tensor, most: float) -> Tensor:
     """Variance of the depth [B, H, W] by the errors that all anchors of the frame have in common [m^2], which no anchor
     shows beside the others; at most ``most`` of the squared depth."""
     none = torch.zeros((), dtype=depth.dtype, device=depth.device)

@@ -15,8 +15,8 @@ LARGEST = math.log(FARTHEST_OFF)
 
 
 def read(
-    depth: Tensor, valid: Tensor, nodes: Tensor, coefficients: Tensor, mean: Tensor, size: tuple[int, int],
-    config: PosteriorConfig,
+    depth: Tensor, valid: Tensor, claimed: Tensor, nodes: Tensor, coefficients: Tensor, mean: Tensor,
+    size: tuple[int, int], config: PosteriorConfig,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Depth, variances and the share without evidence at every pixel.
 
@@ -25,6 +25,7 @@ def read(
 
     Args:
         depth, valid: [B, H, W].
+        claimed: [B, H, W] UfM*'s variance [m^2], by the share without evidence the least one.
         nodes: [B, n, 5] log d, y less the coefficients' part, variance over the squared depth, the same on the surface
             of the evidence, and share without evidence.
         coefficients: [B, 4] of 1, log d - m_0, u, v.
@@ -55,6 +56,7 @@ def read(
     c = coefficients[:, None, None].expand(b, height, width, 4).unbind(-1)
     y = c[0] + c[1] * (logs - mean[:, None, None]) + c[2] * (2 * u - 1) + c[3] * (2 * v - 1)[:, None] + offset
     corrected = d * y.clamp(-LARGEST, LARGEST).exp()
+    variance = torch.maximum(variance, unseen * claimed.double() / d.square())
     maps = corrected, corrected.square() * variance, corrected.square() * inlier, unseen
     corrected, variance, inlier, unseen = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in maps)
     return corrected, variance, inlier, unseen

@@ -18,7 +18,7 @@ difference of f across a link is Student's t in the same way, so that f may jump
 Variance over the squared depth at a node, with v the field's variance + roughness + unseen distance, and
 share = min(1, distance/reach):
 
-    (1 - p) m(v) + p tail,      p = wrong (1 + other share),      m(v) = E[(e^n - 1)^2],      n ~ N(0, v).
+    max((1 - p) m(v) + p tail, share V/d^2),      p = wrong (1 + other share),      m(v) = E[(e^n - 1)^2],  n ~ N(0, v).
 
 The error of the depth is log-normal, so m exceeds v where v is large. p is the probability that the depth is of another
 surface than its evidence: ``outlier``. ``inlier`` is m(v) alone.
@@ -127,7 +127,8 @@ def update(
     wide = elsewhere_variance(config, spread_around(scene, anchors.valid, b[:, 0]), away)
     variance, inlier = second_moments(config, variance, wrong(running, share), offset, wide)
     nodes = torch.stack([grid.log_depth, offset, variance, inlier, share], -1)
-    depth, spread, inlier, unseen = read(frame.depth, frame.valid, nodes, b, grid.mean, grid.size, config)
+    maps = frame.depth, frame.valid, claimed.nan_to_num()
+    depth, spread, inlier, unseen = read(*maps, nodes, b, grid.mean, grid.size, config)
     outlier = wrong(running, unseen.flatten(1)).view_as(unseen).to(unseen.dtype)
     some = anchors.valid.any(1)
     known = (some | (running.frames > 0) | given)[:, None, None]
