@@ -90,7 +90,7 @@ class PoseRefinement(SavedState):
         Returns:
             [W, 4, 4] refined poses; the given ones where too few corners are seen, or after a jump.
         """
-        from ufmstar_torch.kernels.bundle_cpu import FAR, NEAR, equations, inverse_depths  # compiles when first needed
+        from ufmstar_torch.kernels.bundle_cpu import FAR, NEAR, equations, inverse_depths, moved  # compiles when needed
 
         self.shared, self.jumped = 0.0, False
         tracks, views = seen[:, -1] & (seen.sum(1) > 1), np.flatnonzero(seen.any(0))
@@ -144,17 +144,3 @@ class PoseRefinement(SavedState):
         product = float((error * self._last).sum()) / 3
         self.correlated = max(_MEMORY * self.correlated + (1 - _MEMORY) * product, 0.0)
         self._last = error
-
-
-def moved(T_world_cam: NDArray[np.float64], error: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses [W, 4, 4] rotated about their own axes [rad] and shifted along the world's [m] by ``error`` [6 W]."""
-    w, s = error.reshape(-1, 2, 3).swapaxes(0, 1)
-    angle = np.linalg.norm(w, axis=1)[:, None, None]
-    x, y, z = w.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
-    first, second = np.sinc(angle / np.pi), np.square(np.sinc(angle / (2 * np.pi))) / 2  # sin(a)/a, (1 - cos(a))/a^2
-    result = T_world_cam.copy()
-    result[:, :3, :3] = T_world_cam[:, :3, :3] @ (np.eye(3) + first * cross + second * cross @ cross)
-    result[:, :3, 3] += s
-    return result
