@@ -19,6 +19,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.anchors.saved_state import SavedState
 
 # [px] Standard deviations of a position: by errors of the poses before any is learnt, the least and the largest one
@@ -119,7 +120,7 @@ class PoseRefinement(SavedState):
             return T_world_cam
         if not (np.isfinite(poses).all() and np.isfinite(covariance).all()):
             return T_world_cam
-        self.shared = float(np.median((by_error @ covariance * by_error).sum(1)))
+        self.shared = median((by_error @ covariance * by_error).sum(1))
         self._learn(error[-6:].reshape(2, 3) / unit, covariance.diagonal()[-6:].reshape(2, 3) / unit**2)
         refined = T_world_cam.copy()
         refined[views] = poses

@@ -23,6 +23,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.dense_keyframes import Keyframes
 from ufmstar_torch.anchors.dense_memory import Memory
 from ufmstar_torch.anchors.dense_poses import Fit, PoseErrors
+from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.tracker import (
     REPEATED,
@@ -264,7 +265,7 @@ class DenseEvidence(SavedState):
         rho[:known], variance[:known] = both.rho, both.variance
         kept = np.concatenate([np.flatnonzero(fine), new]) if trusted else new
         if len(kept) >= _ENOUGH:
-            self._depth *= float(np.exp((1 - self.config.memory) * np.log(np.median(1 / rho[kept]) / self._depth)))
+            self._depth *= float(np.exp((1 - self.config.memory) * np.log(median(1 / rho[kept]) / self._depth)))
         tried = known + (0 if compared is None else len(expected))
         return Depths(pixel[kept], rho[kept], variance[kept]), tried, trusted
 

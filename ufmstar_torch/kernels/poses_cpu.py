@@ -178,7 +178,7 @@ def _equations(
     mean[:] = 0
     mean_change[:] = 0
     for k in range(views):
-        first, camera = POSE * k, POSE * (views - 1)  # the place of a number of the pose, and of the camera, less its own
+        first, camera = POSE * k, POSE * (views - 1)  # added to c: its place among the errors
         by_view[:] = 0
         for n in range(count):
             w, a = weight[n, k], across_weight[n, k]
