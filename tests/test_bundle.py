@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from landmark_runs import true_depth, walk
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.anchors.bundle import PoseRefinement, moved
+from ufmstar_torch.anchors.bundle import PoseRefinement
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.kernels.bundle_cpu import equations, inverse_depths
+from ufmstar_torch.kernels.bundle_cpu import equations, inverse_depths, moved
 
 K = np.array([[260.0, 0, 160], [0, 260, 120], [0, 0, 1]])
 

@@ -19,6 +19,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.anchors.saved_state import SavedState
 
 # [px] Standard deviations of a position: by errors of the poses before any is learnt, the least and the largest one
@@ -90,7 +91,7 @@ class PoseRefinement(SavedState):
         Returns:
             [W, 4, 4] refined poses; the given ones where too few corners are seen, or after a jump.
         """
-        from ufmstar_torch.kernels.bundle_cpu import FAR, NEAR, equations, inverse_depths  # compiles when first needed
+        from ufmstar_torch.kernels.bundle_cpu import FAR, NEAR, equations, inverse_depths, moved  # compiles when needed
 
         self.shared, self.jumped = 0.0, False
         tracks, views = seen[:, -1] & (seen.sum(1) > 1), np.flatnonzero(seen.any(0))
@@ -119,7 +120,7 @@ class PoseRefinement(SavedState):
             return T_world_cam
         if not (np.isfinite(poses).all() and np.isfinite(covariance).all()):
             return T_world_cam
-        self.shared = float(np.median((by_error @ covariance * by_error).sum(1)))
+        self.shared = median((by_error @ covariance * by_error).sum(1))
         self._learn(error[-6:].reshape(2, 3) / unit, covariance.diagonal()[-6:].reshape(2, 3) / unit**2)
         refined = T_world_cam.copy()
         refined[views] = poses
@@ -144,17 +145,3 @@ class PoseRefinement(SavedState):
         product = float((error * self._last).sum()) / 3
         self.correlated = max(_MEMORY * self.correlated + (1 - _MEMORY) * product, 0.0)
         self._last = error
-
-
-def moved(T_world_cam: NDArray[np.float64], error: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses [W, 4, 4] rotated about their own axes [rad] and shifted along the world's [m] by ``error`` [6 W]."""
-    w, s = error.reshape(-1, 2, 3).swapaxes(0, 1)
-    angle = np.linalg.norm(w, axis=1)[:, None, None]
-    x, y, z = w.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
-    first, second = np.sinc(angle / np.pi), np.square(np.sinc(angle / (2 * np.pi))) / 2  # sin(a)/a, (1 - cos(a))/a^2
-    result = T_world_cam.copy()
-    result[:, :3, :3] = T_world_cam[:, :3, :3] @ (np.eye(3) + first * cross + second * cross @ cross)
-    result[:, :3, 3] += s
-    return result

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.optional import optional
 
 # Lucas-Kanade on patches 8 px wide and 16 high over four octaves, at most ten iterations each. OpenCV computes eight
@@ -86,7 +87,7 @@ def _ratio_at(
         means.append(cv2.blur(image, _AROUND)[v, u].astype(np.float64))
     one, other = means
     counted = (np.minimum(one, other) > _COUNTED[0]) & (np.maximum(one, other) < _COUNTED[1])
-    return float(np.median(other[counted] / one[counted])) if counted.any() else 1.0
+    return median(other[counted] / one[counted]) if counted.any() else 1.0
 
 
 def _followed(

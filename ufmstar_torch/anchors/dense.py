@@ -23,6 +23,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.dense_keyframes import Keyframes
 from ufmstar_torch.anchors.dense_memory import Memory
 from ufmstar_torch.anchors.dense_poses import Fit, PoseErrors
+from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.anchors.tracker import (
     REPEATED,
@@ -267,7 +268,7 @@ class DenseEvidence(SavedState):
         rho[:known], variance[:known] = both.rho, both.variance
         kept = np.concatenate([np.flatnonzero(fine), new]) if trusted else new
         if len(kept) >= _ENOUGH:
-            self._depth *= float(np.exp((1 - self.config.memory) * np.log(np.median(1 / rho[kept]) / self._depth)))
+            self._depth *= float(np.exp((1 - self.config.memory) * np.log(median(1 / rho[kept]) / self._depth)))
         tried = known + (0 if compared is None else len(expected))
         return Depths(pixel[kept], rho[kept], variance[kept]), tried, trusted
 
@@ -306,12 +307,12 @@ class DenseEvidence(SavedState):
 
     def _apart(self, corners: Landmarks, taken: NDArray[np.float64], width: int) -> NDArray[np.int64]:
         """Indices of the corners that become anchors: certain ones, away from the ``taken`` positions [N, 2]."""
+        from ufmstar_torch.kernels.anchor_check_cpu import apart
+
         over = self._tracker.remaining_error / max(self._tracker.baseline, 1e-9) / self._tracker.focal
         sigma = np.maximum(np.sqrt(corners.variance) / corners.depth, over * np.maximum(corners.depth, self._depth))
         fine = np.flatnonzero(sigma <= self.config.corner_sigma)
-        (u, v), (taken_u, taken_v) = corners.pixel[fine].T[..., None], taken.T
-        square = (np.square(u - taken_u) + np.square(v - taken_v)).min(1, initial=np.inf)
-        return fine[square > (self.config.corner_distance * width) ** 2]
+        return fine[apart(corners.pixel[fine], taken, self.config.corner_distance * width)]
 
     def _search(self) -> Search:
         from ufmstar_torch.kernels.dense_cpu import Search

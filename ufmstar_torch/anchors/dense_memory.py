@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.anchors.saved_state import SavedState
 
 # A landmark is measured again where the camera has moved by this share of its depth since; times one more for every
@@ -198,10 +199,10 @@ class Memory(SavedState):
 def _beyond(square: NDArray[np.float64], variance: NDArray[np.float64]) -> float:
     """The variance that, added to those stated, makes squared differences of a median as they should have."""
     low, high = 1e-7, 0.3**2
-    if np.median(square / (variance + low)) <= _MEDIAN_SQUARE:
+    if median(square / (variance + low)) <= _MEDIAN_SQUARE:
         return 0.0
     for _ in range(_STEPS):
         middle = float(np.sqrt(low * high))
-        too_small = np.median(square / (variance + middle)) > _MEDIAN_SQUARE
+        too_small = median(square / (variance + middle)) > _MEDIAN_SQUARE
         low, high = (middle, high) if too_small else (low, middle)
     return high

@@ -25,6 +25,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.anchors.saved_state import SavedState
 from ufmstar_torch.kernels.dense_cpu import Measured, Views
 from ufmstar_torch.kernels.poses_cpu import CAMERA, POSE, Shown, Solution, linearised, solved
@@ -159,10 +160,10 @@ class PoseErrors(SavedState):
         """Precision [S, S] and mean [S] of the errors of some keyframes and of the camera, S = 6 V + 4."""
         sigma = np.sqrt(np.repeat(self._variance[shares], 3, axis=1))
         alike = np.where(np.eye(len(shares)), 1.0, _SHARED)
-        poses = np.einsum("kl,kc,lc,cd->kcld", alike, sigma, sigma, np.eye(POSE))
+        poses = np.einsum("kl,kc,lc,cd->kcld", np.linalg.inv(alike), 1 / sigma, 1 / sigma, np.eye(POSE))
         n = POSE * len(shares)
         precision = np.zeros((n + CAMERA, n + CAMERA))
-        precision[:n, :n] = np.linalg.inv(poses.reshape(n, n))
+        precision[:n, :n] = poses.reshape(n, n)
         precision[n:, n:] = np.linalg.inv(self._covariance)
         return precision, np.concatenate([np.zeros(n + 3), self._camera[3:]])  # K has the first three
 
@@ -198,7 +199,7 @@ class PoseErrors(SavedState):
         for share, each, count in zip(shares, left, shows.sum(0), strict=True):
             if count >= _ENOUGH:
                 self._left[share] = self._faded(self._left[share], each)
-        self._disagreement = self._faded(self._disagreement, np.median(residual) / _MEDIAN_SQUARE)
+        self._disagreement = self._faded(self._disagreement, median(residual) / _MEDIAN_SQUARE)
 
     def _prior(self, width: int) -> NDArray[np.float64]:
         """[4, 4] covariance of the camera's errors before the first frame."""

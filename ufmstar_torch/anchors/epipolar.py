@@ -50,6 +50,12 @@ def off_lines(
     return np.linalg.norm(off, axis=1), rho, np.linalg.norm(moved, axis=1)
 
 
+def median(values: NDArray[np.float64]) -> float:
+    """The median of values [N], N at least 1; ``np.median`` takes five times as long for some hundred."""
+    ordered, n = np.sort(values), len(values)
+    return float(ordered[(n - 1) // 2] + ordered[n // 2]) / 2
+
+
 def weighted_median(values: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
     """The median of values [N] with weights [N]."""
     order = values.argsort()

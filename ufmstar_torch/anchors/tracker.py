@@ -19,7 +19,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.bundle import PoseRefinement
 from ufmstar_torch.anchors.corners import find, follow
-from ufmstar_torch.anchors.epipolar import NEAREST, off_lines, weighted_median
+from ufmstar_torch.anchors.epipolar import NEAREST, median, off_lines, weighted_median
 from ufmstar_torch.anchors.saved_state import SavedState, saved_image
 from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.optional import optional
@@ -348,13 +348,13 @@ class LandmarkTracker(SavedState):
         first = order[seen[chosen].argmax(1)]
         views = self._pixel[chosen, self._view], self._pixel[chosen, first], self._poses[self._view], self._poses[first]
         motion = np.linalg.norm(views[0] - views[1], axis=1)
-        far = self._depth * (_MEDIAN_DEPTH if np.median(motion) < _STILL else _FAR)
+        far = self._depth * (_MEDIAN_DEPTH if median(motion) < _STILL else _FAR)
         distance, rho, baseline = off_lines(*views, self._K, _NEAR * self._depth, far)
         cell = (views[0] * _CELLS / self._gray.shape[::-1]).astype(np.int64).clip(0, _CELLS - 1) @ [1, _CELLS]
         weight = 1 / np.bincount(cell)[cell]  # by area: a thing that moves by itself may have most of the corners
         now = weighted_median(distance, weight) / _MEDIAN
         self._off = now if self._off < 0 else _FOLLOWS * self._off + (1 - _FOLLOWS) * now
-        self.baseline = float(np.median(baseline))
+        self.baseline = median(baseline)
         shows = (rho > 0) & (motion > _MOVES)
         if shows.sum() >= _ENOUGH:
             self._judged += 1
@@ -379,7 +379,7 @@ class LandmarkTracker(SavedState):
         if known.sum() < _ENOUGH:
             return None
         rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ np.linalg.inv(K).T
-        usual = np.median(depth[known])
+        usual = median(depth[known])
         point = np.where(known[:, None], point, usual * rays @ last[:3, :3].T + last[:3, 3])
 
         def seen_by(pose: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -434,7 +434,7 @@ class LandmarkTracker(SavedState):
         residual = np.square(result.error) * 2 * views / np.maximum(2 * views - 3, 1)
         long = fits & result.ahead & (views >= _LONG)
         if long.sum() >= _ENOUGH:
-            self._noise = _MEMORY * self._noise + (1 - _MEMORY) * float(np.median(residual[long]))
+            self._noise = _MEMORY * self._noise + (1 - _MEMORY) * median(residual[long])
         # A track that fits worse than the noise allows is as uncertain as it fits.
         one_pixel = np.einsum("i,nij,j->n", axis, result.covariance, axis)
         variance = _DRIFT * (views - 1) * np.maximum(residual, self._noise) * one_pixel

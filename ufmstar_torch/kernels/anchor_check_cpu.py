@@ -71,6 +71,23 @@ def confirmed(pixel: NDArray[np.float64], measured: Measured, cell: int) -> NDAr
     return fine
 
 
+def apart(pixel: NDArray[np.float64], taken: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:
+    """Which pixels [N, 2] lie farther than a distance [px] from all ``taken`` ones [M, 2]."""
+    far = np.ones(len(pixel), np.bool_)
+    _apart(pixel, taken, distance * distance, far)
+    return far
+
+
+@reordered
+def _apart(pixel, taken, square, far):
+    for n in range(len(pixel)):
+        for m in range(len(taken)):
+            du, dv = pixel[n, 0] - taken[m, 0], pixel[n, 1] - taken[m, 1]
+            if du * du + dv * dv <= square:
+                far[n] = False
+                break
+
+
 @reordered
 def _confirm(pixel, rho, variance, found, cell, lies_in, fine):
     for n in found:
@@ -100,7 +117,7 @@ def _check_anchors(image, pixel, rho, variance, cell, lies_in, moved, alone):
         lies_in[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n
     for n in range(len(pixel)):
         u, v = pixel[n, 0], pixel[n, 1]
-        alike, other = np.zeros(2), np.zeros(2)
+        alike_u = alike_v = other_u = other_v = 0.0
         count_alike = count_other = 0
         row, column = int(v) // cell, int(u) // cell
         for j in range(max(row - _CELLS, 0), min(row + _CELLS + 1, lies_in.shape[0])):
@@ -112,12 +129,12 @@ def _check_anchors(image, pixel, rho, variance, cell, lies_in, moved, alone):
                 over = 1 / max(np.sqrt(du * du + dv * dv), 1.0)
                 if difference < max(_SIGMAS**2 * (variance[n] + variance[m]), (_SHARE * rho[n]) ** 2):
                     count_alike += 1
-                    alike[0] += du * over
-                    alike[1] += dv * over
+                    alike_u += du * over
+                    alike_v += dv * over
                 else:
                     count_other += 1
-                    other[0] += du * over
-                    other[1] += dv * over
+                    other_u += du * over
+                    other_v += dv * over
                     alone[n] += difference
         if count_other == 0:
             continue
@@ -126,7 +143,7 @@ def _check_anchors(image, pixel, rho, variance, cell, lies_in, moved, alone):
         if count_alike == 0:
             continue
         eu, ev = _gradient(image, int(u + 0.5), int(v + 0.5))
-        apart = (alike[0] * eu + alike[1] * ev) / count_alike - (other[0] * eu + other[1] * ev) / count_other
+        apart = (alike_u * eu + alike_v * ev) / count_alike - (other_u * eu + other_v * ev) / count_other
         if abs(apart) >= _APART:
             into = np.sign(apart) * (2.0 if abs(apart) >= _FAR else 1.0)
             moved[n, 0] += into * eu

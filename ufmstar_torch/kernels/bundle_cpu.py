@@ -57,7 +57,14 @@ def equations(
     into, moved = _between(T_world_cam)
     to_view = np.ascontiguousarray(T_world_cam[:, :3, :3].transpose(0, 2, 1))
     _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, h, v)
-    return A + np.tril(A, -1).T, b, h, v
+    return A, b, h, v
+
+
+def moved(T_world_cam: NDArray[np.float64], error: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses [W, 4, 4] rotated about their own axes [rad] and shifted along the world's [m] by ``error`` [6 W]."""
+    result = T_world_cam.copy()
+    _move(error, result)
+    return result
 
 
 def _between(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -65,6 +72,22 @@ def _between(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDA
     R, C = T_world_cam[:, :3, :3], T_world_cam[:, :3, 3]
     into = R[:-1].transpose(0, 2, 1)
     return np.ascontiguousarray(into @ R[-1]), ((C[-1] - C[:-1])[:, None] @ R[:-1])[:, 0]
+
+
+@reordered
+def _move(error, poses):
+    for k in range(len(poses)):
+        x, y, z = error[POSE * k], error[POSE * k + 1], error[POSE * k + 2]
+        half = 0.5 * np.sqrt(x * x + y * y + z * z)
+        sinc = np.sin(half) / half if half > 0 else 1.0
+        first, second = sinc * np.cos(half), 0.5 * sinc * sinc  # sin(a)/a and (1 - cos(a))/a^2 of the angle a
+        for i in range(3):
+            a, b, c = poses[k, i, 0], poses[k, i, 1], poses[k, i, 2]
+            p, q, r = b * z - c * y, c * x - a * z, a * y - b * x  # the row times [w]x
+            poses[k, i, 0] += first * p + second * (q * z - r * y)
+            poses[k, i, 1] += first * q + second * (r * x - p * z)
+            poses[k, i, 2] += first * r + second * (p * y - q * x)
+            poses[k, i, 3] += error[POSE * k + 3 + i]
 
 
 @reordered
@@ -97,7 +120,7 @@ def _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, 
     views = precision.shape[1]
     last = POSE * views
     # By the newest pose and by view k's: rows u and v.
-    own, other = np.empty((2, POSE)), np.empty((2, POSE))
+    own, other, weighted = np.empty((2, POSE)), np.empty((2, POSE)), np.empty(h.shape)
     for n in range(len(ray)):
         x, y = ray[n, -1, 0], ray[n, -1, 1]
         row = h[n]
@@ -141,14 +164,11 @@ def _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, 
                 for d in range(c + 1):
                     A[last + c, last + d] += by_own * own[0, d] + by_own_v * own[1, d]
                     A[first + c, first + d] += by * other[0, d] + by_v * other[1, d]
-        over_total = 1 / total
-        v[n] = above * over_total
-        for c in range(last + POSE):
-            if row[c] == 0:
-                continue
-            b[c] -= row[c] * v[n]
-            by = row[c] * over_total
-            for d in range(c + 1):
-                A[c, d] -= by * row[d]
-        for c in range(last + POSE):
-            row[c] *= over_total
+        v[n] = above / total
+        weighted[n] = row
+        row /= total
+    for c in range(last + POSE):
+        for d in range(c):
+            A[d, c] = A[c, d]
+    A -= weighted.T @ h
+    b -= weighted.T @ v

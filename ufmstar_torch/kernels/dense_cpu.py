@@ -131,10 +131,16 @@ def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, 
     rho, variance, agreed, contradicted = np.zeros(n), np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64)
     each = np.full((n, v, 8), np.nan)
     into = rho, variance, agreed, contradicted, each
-    _measure(image, pixel, views.image, views.H, views.b, views.noise, search, *into)
+    _measure(image, pixel, eights(views.image), views.H, views.b, views.noise, search, *into)
     value, noise, _, _, speed, slope, across, across_noise = np.moveaxis(each, 2, 0)
     along = each[:, :, 2:4]
     return Measured(rho, variance, agreed, contradicted, value, noise, along, speed, slope, across, across_noise)
+
+
+def eights(images: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """View images [V, H, W] as [V, H W - 7] numbers: each holds the eight pixels from its place on."""
+    views, size = len(images), images[0].size
+    return np.ndarray((views, max(size - SIDE + 1, 0)), np.uint64, images, strides=(size, 1))
 
 
 @reordered
@@ -169,7 +175,7 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
     for n in range(len(pixel)):
         u, v, weight = pixel[n, 0], pixel[n, 1], 0.0
         for k in range(len(keys)):
-            key = keys[k].reshape(image.size)
+            key = keys[k]
             first = agreed[n] == 0
             at = start if first else rho[n]
             x, y = H[k, 0, 0] * u + H[k, 0, 1] * v + H[k, 0, 2], H[k, 1, 0] * u + H[k, 1, 1] * v + H[k, 1, 2]
@@ -264,7 +270,7 @@ def _warped(flat, width, height, u, v, H, b, rho, place, share, template):
 @reordered_leaf
 def sampled(flat, width, height, u, v, a, b, c, d, place, share, template):
     """The pixels of an image at (u, v) + ((a, b), (c, d)) x, for the pixels x of a template, bilinear. ``place`` and
-    ``share`` hold where they are. False where one lies outside."""
+    ``share`` are buffers. False where one lies outside."""
     far_u, far_v = (abs(a) + abs(b)) * (1 - FIRST), (abs(c) + abs(d)) * (1 - FIRST)
     if not (far_u <= u < width - 1.01 - far_u and far_v <= v < height - 1.01 - far_v):  # .01: for rounding
         return False
@@ -274,12 +280,15 @@ def sampled(flat, width, height, u, v, a, b, c, d, place, share, template):
         iu, iv = np.int32(su), np.int32(sv)
         share[0, k], share[1, k] = su - np.float32(iu), sv - np.float32(iv)
         place[k] = np.uint32(iv * np.int32(width) + iu)
+    for k in range(WIDE * WIDE):  # the four pixels around, as the bytes of a number, which vectors take apart
+        at = np.uint64(place[k])
+        below = at + np.uint64(width)
+        upper, lower = (flat[at + np.uint64(1)] << 8) | flat[at], (flat[below + np.uint64(1)] << 8) | flat[below]
+        place[k] = np.uint32((lower << 16) | upper)
     for k in range(WIDE * WIDE):
-        upper_at = np.uint64(place[k])
-        lower_at = upper_at + np.uint64(width)
-        upper, lower = np.float32(flat[upper_at]), np.float32(flat[lower_at])
-        upper += share[0, k] * (np.float32(flat[upper_at + np.uint64(1)]) - upper)
-        lower += share[0, k] * (np.float32(flat[lower_at + np.uint64(1)]) - lower)
+        upper, lower = np.float32(np.int32(place[k] & 255)), np.float32(np.int32(place[k] >> 16 & 255))
+        upper += share[0, k] * (np.float32(np.int32(place[k] >> 8 & 255)) - upper)
+        lower += share[0, k] * (np.float32(np.int32(place[k] >> 24)) - lower)
         template[k] = upper + share[1, k] * (lower - upper)
     return True
 
@@ -314,10 +323,10 @@ def normalised(template, patch, along_u, along_v):
 
 
 @reordered_leaf
-def _copied(key, at, width, rows):
-    """Rows of SIDE pixels of an image, the first of them from ``at`` on, a row in each number of ``rows``."""
-    for j in range(len(rows)):
-        rows[j] = key[at : at + SIDE].view(np.uint64)[0]
+def _copied(key, at, width, count, rows):
+    """Copy rows of SIDE pixels of an image (:func:`eights`), the first one from ``at`` on, to ``count`` numbers."""
+    for j in range(count):
+        rows[j] = key[np.uint64(at)]
         at += width
 
 
@@ -335,13 +344,13 @@ def _search(patch, key, width, height, x, y, z, b, low, high, rows, scores, plac
         return False
     steps = max(int(np.ceil(longest)), 1)
     du, dv = du / steps, dv / steps
-    best, at = np.float32(-2), -1
+    best, at, window = np.float32(-2), -1, rows[0].view(np.uint8)
     for s in range(steps + 1):
         left, top = int(np.floor(u_low + s * du + FIRST + 0.5)), int(np.floor(v_low + s * dv + FIRST + 0.5))
         scores[s] = -2
         if left >= 0 and top >= 0 and left + SIDE <= width and top + SIDE <= height:
-            _copied(key, top * width + left, width, rows[0, :SIDE])
-            scores[s] = zncc(patch, rows[0].view(np.uint8))
+            _copied(key, top * width + left, width, SIDE, rows[0])
+            scores[s] = zncc(patch, window)
             if scores[s] > best:
                 best, at = scores[s], s
     if at < 0:
@@ -393,8 +402,8 @@ def _refined(patch, along_u, along_v, key, width, height, u, v, eu, ev, rows, ou
             return False
         if iv * width + iu != copied:
             copied = iv * width + iu
-            _copied(key, copied, width, rows[0])
-            _copied(key, copied + 1, width, rows[1])
+            _copied(key, copied, width, SIDE + 1, rows[0])
+            _copied(key, copied + 1, width, SIDE + 1, rows[1])
         fu, fv = np.float32(left - iu), np.float32(top - iv)
         w00, w01, w10, w11 = (one - fv) * (one - fu), (one - fv) * fu, fv * (one - fu), fv * fu
         total = squares = cross = down_u = down_v = np.float32(0)

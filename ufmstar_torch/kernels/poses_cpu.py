@@ -130,22 +130,23 @@ def solved(shown: Shown, precision: NDArray[np.float64], start: NDArray[np.float
     n, v = shown.value.shape
     size = len(start)
     error, covariance, mean_change = np.zeros(size), np.zeros((size, size)), np.zeros((n, size))
-    rho, common, residual, beside = np.zeros(n), np.zeros(n), np.zeros((n, v)), np.zeros((n, v))
+    rho, residual, beside = np.zeros(n), np.zeros((n, v)), np.zeros((n, v))
     _solved(
         *(shown.change, shown.value, 1 / shown.variance),
         *(shown.across_change, shown.across, 1 / shown.across_variance),
-        *(precision, precision @ start, error, covariance, mean_change, rho, common, residual, beside),
+        *(precision, precision @ start, error, covariance, mean_change, rho, residual, beside),
     )
+    common = (mean_change @ covariance * mean_change).sum(1)
     return Solution(error, covariance, rho, common, residual, beside)
 
 
 @reordered
 def _solved(
     change, value, weight, across_change, across, across_weight,
-    precision, right, error, covariance, mean_change, rho, common, residual, beside,
+    precision, right, error, covariance, mean_change, rho, residual, beside,
 ):  # fmt: skip
     count, views, _ = change.shape
-    mean, size = np.zeros(count), len(right)
+    mean, by = np.zeros(count), np.empty(EACH)
     for turn in range(ROUNDS):
         A, r = precision.copy(), right.copy()
         student = 0.0 if turn == 0 else STUDENT
@@ -155,23 +156,15 @@ def _solved(
         )
         _inverse(A, covariance)
         error[:] = covariance @ r
-        for n in range(count):
-            rho[n] = mean[n]
-            for c in range(size):
-                rho[n] -= mean_change[n, c] * error[c]
-            for k in range(views):
+        rho[:] = mean - mean_change @ error
+        for k in range(views):
+            by[:POSE], by[POSE:] = error[POSE * k : POSE * (k + 1)], error[POSE * views :]
+            for n in range(count):
                 left, left_across = value[n, k] - rho[n], across[n, k]
                 for c in range(EACH):
-                    by = error[POSE * k + c if c < POSE else POSE * (views - 1) + c]
-                    left -= change[n, k, c] * by
-                    left_across -= across_change[n, k, c] * by
+                    left -= change[n, k, c] * by[c]
+                    left_across -= across_change[n, k, c] * by[c]
                 residual[n, k], beside[n, k] = left * left * weight[n, k], left_across * left_across
-    for n in range(count):
-        for c in range(size):
-            total = 0.0
-            for d in range(size):
-                total += covariance[c, d] * mean_change[n, d]
-            common[n] += mean_change[n, c] * total
 
 
 @reordered
@@ -181,39 +174,38 @@ def _equations(
     """Add the pixels to the normal equations A d = r; the means over the views, by their precisions, are written.
     ``student`` = 0: each counts in full."""
     count, views, _ = change.shape
-    size = POSE * views + CAMERA
-    place = np.empty(EACH, np.int64)
-    for n in range(count):
-        total = weighted = 0.0
-        row = mean_change[n]
-        row[:] = 0
-        for k in range(views):
+    total, by_view = np.zeros(count), np.zeros((EACH, EACH))
+    mean[:] = 0
+    mean_change[:] = 0
+    for k in range(views):
+        first, camera = POSE * k, POSE * (views - 1)  # added to c: its place among the errors
+        by_view[:] = 0
+        for n in range(count):
             w, a = weight[n, k], across_weight[n, k]
             if w == 0 and a == 0:
                 continue
             if student > 0:
                 w *= (student + 1) / (student + residual[n, k])
                 a *= (student + 1) / (student + beside[n, k] * a)
+            total[n] += w
+            mean[n] += w * value[n, k]
             for c in range(EACH):
-                place[c] = POSE * k + c if c < POSE else POSE * (views - 1) + c
-            total += w
-            weighted += w * value[n, k]
-            for c in range(EACH):
+                at = c + (first if c < POSE else camera)
                 by, by_across = w * change[n, k, c], a * across_change[n, k, c]
-                row[place[c]] += by
-                r[place[c]] += by * value[n, k] + by_across * across[n, k]
-                for d in range(c + 1):
-                    A[place[c], place[d]] += by * change[n, k, d] + by_across * across_change[n, k, d]
-        if total == 0:
-            continue
-        mean[n] = weighted / total
-        for c in range(size):
-            r[c] -= row[c] * mean[n]
-            by = row[c] / total
-            for d in range(c + 1):
-                A[c, d] -= by * row[d]
-        for c in range(size):
-            row[c] /= total
+                mean_change[n, at] += by
+                r[at] += by * value[n, k] + by_across * across[n, k]
+                for d in range(EACH):
+                    by_view[c, d] += by * change[n, k, d] + by_across * across_change[n, k, d]
+        for c in range(EACH):
+            for d in range(EACH):
+                A[c + (first if c < POSE else camera), d + (first if d < POSE else camera)] += by_view[c, d]
+    weighted = mean_change.copy()
+    for n in range(count):
+        if total[n] > 0:
+            mean[n] /= total[n]
+            mean_change[n] /= total[n]
+    A -= weighted.T @ mean_change
+    r -= weighted.T @ mean
 
 
 @reordered
