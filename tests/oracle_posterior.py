@@ -223,7 +223,7 @@ def second_moment(wrong, variance, share, offset, around):
 
 def elsewhere(share, around):
     """Variance of y on another surface, at a distance of ``share`` widths from the evidence."""
-    return min(around + 0.25 * min(share / RADIUS, 1), 2)
+    return min(2 * around + 0.25 * min(share / RADIUS, 1), 2)
 
 
 def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v):

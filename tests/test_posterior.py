@@ -271,7 +271,7 @@ def test_far_from_evidence_the_variance_is_larger_and_never_below_what_ufm_star_
 
 def test_another_surface_without_evidence_is_as_uncertain_as_before_the_first_anchor():
     around, away = np.array([0.1, 0.1, 0.1, 3.0]), np.array([0.0, MODEL.radius / 2, 1.0, 0.0])
-    expected = [0.1, 0.1 + MODEL.prior_sigma**2 / 2, 0.1 + MODEL.prior_sigma**2, MODEL.widest]
+    expected = [0.2, 0.2 + MODEL.prior_sigma**2 / 2, 0.2 + MODEL.prior_sigma**2, MODEL.widest]
     np.testing.assert_allclose(posterior_scene_cpu.elsewhere_variance(MODEL, around, away), expected)
     same = elsewhere_variance(MODEL, torch.from_numpy(around), torch.from_numpy(away))
     np.testing.assert_allclose(same, expected)

@@ -248,8 +248,6 @@ class DenseEvidence(SavedState):
     ) -> tuple[Depths, int, bool]:
         """Landmarks that the image shows, measured again where the camera has moved, and new ones in the cells between
         them; how many pixels were tried; False where the views contradict each other. The running estimates follow."""
-        from ufmstar_torch.kernels.anchor_check_cpu import CERTAIN
-
         sighted = self._memory.sighted(small, T, K, cell)
         known = len(sighted.slot)
         pixel = np.concatenate([sighted.pixel, _pixels(small, cell, sighted.pixel)])
@@ -263,8 +261,7 @@ class DenseEvidence(SavedState):
         both, fine = self._memory.compare(sighted, rho[:known], variance[:known], agreed[:known])
         again, new = np.flatnonzero(agreed[:known] & fine), np.flatnonzero(agreed[known:]) + known
         self._memory.write(both.slot[again], small, both.pixel[again], both.rho[again], both.variance[again], T, K)
-        lasting = new[variance[new] < np.square(CERTAIN * rho[new])]  # the next images measure the others better
-        self._memory.write(None, small, pixel[lasting], rho[lasting], variance[lasting], T, K)
+        self._memory.write(None, small, pixel[new], rho[new], variance[new], T, K)
         rho[:known], variance[:known] = both.rho, both.variance
         kept = np.concatenate([np.flatnonzero(fine), new]) if trusted else new
         if len(kept) >= _ENOUGH:

@@ -186,7 +186,7 @@ def wrong(running: Running, share: NDArray[Any]) -> NDArray[Any]:
 
 
 def elsewhere_variance(config: PosteriorConfig, around: Floats, away: Floats) -> Floats:
-    wide = around + config.prior_sigma**2 * np.minimum(away / config.radius, 1)
+    wide = config.spread * around + config.prior_sigma**2 * np.minimum(away / config.radius, 1)
     return np.minimum(wide, config.widest)
 
 

@@ -34,6 +34,7 @@ class PosteriorConfig(Checked):
         radius: of a disc; standard deviation of the Gaussian that weighs the anchors around a node
         wrong: probability that the local correction does not hold, at evidence, before it is learnt
         other: by how much of itself it has grown from ``reach`` on, since another surface may begin
+        spread: variance of y where it does not hold, at evidence, over that of the anchors' y around
         widest: variance of y from which on the variance of the depth grows no more
         edge_contrast: difference of log d at which a node counts half at a pixel
     """
@@ -57,6 +58,7 @@ class PosteriorConfig(Checked):
     radius: float = number(5 / 28, "r", "width", 0.0, open_low=True)
     wrong: float = number(0.03, "p_0", "1", 0.0, 0.5)
     other: float = number(6.0, "p_1", "1", 0.0)
+    spread: float = number(2.0, "a", "1", 0.0, 4.0)
     widest: float = number(2.0, "v_2", "1", 0.0, 4.0, open_low=True)
     edge_contrast: float = number(0.1, "delta", "1", 0.0, open_low=True)
 
