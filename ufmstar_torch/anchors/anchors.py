@@ -179,6 +179,9 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor] = (
     known = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & _inside(pixel, frame.size)
     if anchors.valid is not None:
         known = known & require_mask("anchors.valid", anchors.valid, shape, frame.depth)
+    for name in ("pose_error", "shared", "scale"):
+        if (of_frame := getattr(anchors, name)) is not None:
+            require_float(f"anchors.{name}", of_frame, [(b,)], frame.depth)
     one, zero = torch.ones_like(depth), torch.zeros_like(depth)
     pixel = torch.where(known[..., None], pixel, zero[..., None])
     u, v = pixel.round().long().unbind(-1)

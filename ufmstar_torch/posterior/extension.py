@@ -67,7 +67,7 @@ def common_error(anchors: AnchorInput, depth: Tensor, most: float) -> Tensor:
     shows beside the others; at most ``most`` of the squared depth."""
     none = torch.zeros((), dtype=depth.dtype, device=depth.device)
     shared, scale = (none if x is None else x[:, None, None].to(depth) for x in (anchors.shared, anchors.scale))
-    return depth.square() * (depth.square() * shared + scale).clamp_max(most)
+    return depth.square() * (depth.square() * shared + scale).clamp(0, most)
 
 
 class PosteriorExtension(Extension):
