@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors.dense_poses import PoseErrors
-from ufmstar_torch.kernels.anchor_check_cpu import check_anchors, confirmed
+from ufmstar_torch.kernels.anchor_check_cpu import check_anchors, confirmed, farther
 from ufmstar_torch.kernels.dense_cpu import Measured, Views
 from ufmstar_torch.kernels.poses_cpu import Shown, linearised, solved
 
@@ -203,6 +203,14 @@ def test_matches_of_one_view_hold_where_the_oracle_finds_support():
         np.testing.assert_array_equal(result, expected)
         seen.append([np.mean(result[agreed == 1]), np.mean(~result[(agreed == 1) & (contradicted == 0)])])
     assert np.mean(seen, 0).min() > 0.1, "some hold and some do not"
+
+
+@pytest.mark.parametrize("count", [0, 1, 30])
+def test_pixels_far_from_all_others(count):
+    rng = np.random.default_rng(0)
+    pixel, taken = rng.uniform(0, 100, (40, 2)), rng.uniform(0, 100, (count, 2))
+    nearest = np.linalg.norm(pixel[:, None] - taken, axis=2).min(1, initial=np.inf)
+    np.testing.assert_array_equal(farther(pixel, taken, 9.0), nearest > 9.0)
 
 
 def test_nothing_is_confirmed_where_nothing_was_measured():

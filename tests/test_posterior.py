@@ -325,6 +325,7 @@ def test_before_the_first_anchor_of_a_source_nothing_reads_as_certain():
     share = relative(out)[frame.valid[0]]
     assert float(share.min()) > MODEL.prior_sigma**2
     assert float(share.max()) < 2
+    assert 1.0 < float(share.median().sqrt()) < 1.2
 
 
 def test_a_frame_without_anchors_keeps_the_correction_learns_nothing_and_grows_less_certain():

@@ -304,12 +304,12 @@ class DenseEvidence(SavedState):
 
     def _apart(self, corners: Landmarks, taken: NDArray[np.float64], width: int) -> NDArray[np.int64]:
         """Indices of the corners that become anchors: certain ones, away from the ``taken`` positions [N, 2]."""
-        from ufmstar_torch.kernels.anchor_check_cpu import apart
+        from ufmstar_torch.kernels.anchor_check_cpu import farther
 
         over = self._tracker.remaining_error / max(self._tracker.baseline, 1e-9) / self._tracker.focal
         sigma = np.maximum(np.sqrt(corners.variance) / corners.depth, over * np.maximum(corners.depth, self._depth))
         fine = np.flatnonzero(sigma <= self.config.corner_sigma)
-        return fine[apart(corners.pixel[fine], taken, self.config.corner_distance * width)]
+        return fine[farther(corners.pixel[fine], taken, self.config.corner_distance * width)]
 
     def _search(self) -> Search:
         from ufmstar_torch.kernels.dense_cpu import Search

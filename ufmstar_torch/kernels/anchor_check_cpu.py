@@ -69,15 +69,15 @@ def confirmed(pixel: NDArray[np.float64], measured: Measured, cell: int) -> NDAr
     return fine
 
 
-def apart(pixel: NDArray[np.float64], taken: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:
+def farther(pixel: NDArray[np.float64], taken: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:
     """Which pixels [N, 2] lie farther than a distance [px] from all ``taken`` ones [M, 2]."""
     far = np.ones(len(pixel), np.bool_)
-    _apart(pixel, taken, distance * distance, far)
+    _farther(pixel, taken, distance * distance, far)
     return far
 
 
 @reordered
-def _apart(pixel, taken, square, far):
+def _farther(pixel, taken, square, far):
     for n in range(len(pixel)):
         for m in range(len(taken)):
             du, dv = pixel[n, 0] - taken[m, 0], pixel[n, 1] - taken[m, 1]

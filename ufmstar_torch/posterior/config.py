@@ -31,7 +31,8 @@ class PosteriorConfig(Checked):
         weak_sigma: an anchor whose noise has this standard deviation counts half by area; a noisier one is no evidence
         reach: distance from the evidence from which on a node has none
         discs: discs of anchors that are held out in a frame
-        radius: of a disc; standard deviation of the Gaussian that weighs the anchors around a node
+        radius: of a disc; standard deviation of the Gaussian that weighs the anchors around a node; distance from the
+            evidence from which on another surface is as uncertain as before the first anchor
         wrong: probability that the local correction does not hold, at evidence, before it is learnt
         other: by how much of itself it has grown from ``reach`` on, since another surface may begin
         spread: variance of y where it does not hold, at evidence, over that of the anchors' y around

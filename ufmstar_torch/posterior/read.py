@@ -25,7 +25,7 @@ def read(
 
     Args:
         depth, valid: [B, H, W].
-        claimed: [B, H, W] UfM*'s variance [m^2], by the share without evidence the least one.
+        claimed: [B, H, W] UfM*'s variance [m^2]; times the share without evidence, it bounds the variance from below.
         nodes: [B, n, 5] log d, y less the coefficients' part, variance over the squared depth, the same on the surface
             of the evidence, and share without evidence.
         coefficients: [B, 4] of 1, log d - m_0, u, v.
