@@ -135,8 +135,8 @@ def alone(pixel, rho, variance, cell):
 
 
 def confirmed(pixel, rho, variance, agreed, contradicted, cell):
-    """[N] measurements that hold: two views agree; or one, and so do at least three others in the 5 x 5 cells around,
-    90 % of all there, each certain to 20 %. No two have a cell in common."""
+    """[N] measurements that hold: two views agree; or one, which is not certain to 20 %, or with which at least three
+    others in the 5 x 5 cells around agree, 90 % of all there, each certain to 20 %. No two have a cell in common."""
     cells, fine = np.floor(pixel / cell), (agreed > 1) & (contradicted == 0)
     found = [n for n in range(len(rho)) if agreed[n] > 0 and contradicted[n] == 0]
     for n in found:
@@ -147,5 +147,6 @@ def confirmed(pixel, rho, variance, agreed, contradicted, cell):
             if (rho[m] - rho[n]) ** 2 < max(9 * (variance[m] + variance[n]), (0.05 * rho[n]) ** 2)
             and variance[m] < (0.2 * rho[m]) ** 2
         ]
-        fine[n] |= agreed[n] == 1 and len(alike) >= 3 and len(alike) >= 0.9 * len(near)
+        supported = len(alike) >= 3 and len(alike) >= 0.9 * len(near)
+        fine[n] |= agreed[n] == 1 and (supported or variance[n] >= (0.2 * rho[n]) ** 2)
     return fine

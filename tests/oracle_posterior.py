@@ -14,6 +14,7 @@ START = {
     "noise": (1.0, 20.0, 0.25, 16.0),
     "unseen": (0.1, 20.0, 0.0, 16.0),
     "wrong": (0.03, 20.0, 0.003, 0.3),
+    "inlier": (1.0, 20.0, 0.05, 4.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
 PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
@@ -184,11 +185,11 @@ def update(state, depth, claimed, pixel, g, variance):
         above = MEMORY * above + (1 - MEMORY) * prior * value + new[name][0]
         after["sums"][name] = [min(max(above, low * below), high * below), below]
     HX = design(X, np.arange(n), n)
-    spread = np.einsum("ij,jk,ik->i", HX, C, HX) + roughness
-    spread = spread + away * ratio(state, "unseen")
+    spread = np.einsum("ij,jk,ik->i", HX, C, HX) + ratio(after, "roughness") + away * ratio(after, "unseen")
+    spread = spread * inlier_factor(after, away)
     offset, share = HX[:, 4:] @ mean[4:], away / REACH
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
-    wrong = ratio(state, "wrong")
+    wrong = ratio(after, "wrong")
     alone = [second_moment(0.0, *each) for each in zip(spread, share, offset, around, strict=True)]
     spread = [second_moment(wrong, *each) for each in zip(spread, share, offset, around, strict=True)]
     posterior, variance, _ = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, share)
@@ -221,6 +222,11 @@ def second_moment(wrong, variance, share, offset, around):
     return (1 - p) * moments[0] + p * moments[1]
 
 
+def inlier_factor(state, away):
+    """What was learnt of held-out anchors fades within the width of a disc."""
+    return 1 + (ratio(state, "inlier") - 1) * np.maximum(1 - away / (2 * RADIUS), 0)
+
+
 def elsewhere(share, around):
     """Variance of y on another surface, at a distance of ``share`` widths from the evidence."""
     return min(2 * around + 0.25 * min(share / RADIUS, 1), 2)
@@ -243,13 +249,16 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v):
     area = believed / np.maximum(np.bincount(node, believed, minlength=logs.size)[node], 1e-12)
     share, around = away / REACH, y_variance(logs.shape, node, y, noise, rest, mean[0])[node]
     offset = H[:, FEATURES:] @ mean[FEATURES:]
-    own = var + noise + away * ratio(state, "unseen")
+    factor = inlier_factor(state, away)
+    own = factor * (var + noise + away * ratio(state, "unseen"))
     wide = noise + [elsewhere(*each) for each in zip(share, around, strict=True)]
     final = [second_moment(wrong, *each) for each in zip(own, share, offset, around, strict=True)]
     p = np.minimum(wrong * (1 + OTHER * share), 0.5)
     here, other = (1 - p) * normal(error, own), p * normal(error + offset, wide)
+    here, other = here / (here + other), other / (here + other)
     return pairs(state, logs, held, node, error, var, away, noise) | {
-        "wrong": ((area * other / (here + other)).sum(), (area * (1 + OTHER * share)).sum()),
+        "wrong": ((area * other).sum(), (area * (1 + OTHER * share)).sum()),
+        "inlier": ((area * here * factor * error**2 / own).sum(), (area * here).sum()),
         "calibration": ((area * error**2 / final).sum(), area.sum()),
     }
 

@@ -316,3 +316,32 @@ def test_surfaces_without_fine_texture_are_measured_by_wider_windows():
     assert len(depth) > 2 * fine, "most of these windows have no contrast of their own"
     assert np.median(np.abs(depth / 2 - 1)) < 0.03
     assert np.mean(np.abs(depth - 2) < 3 * sigma) > 0.95
+
+
+def test_the_second_image_shows_the_far_wall_too_and_not_the_near_thing_alone():
+    """A textured plate at 1 m before a wall at 6 m, and a step of 2 cm: the wall moves by a pixel."""
+    rng, K = np.random.default_rng(0), np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])
+    texture = [gaussian_filter(rng.uniform(0, 255, (400, 500)), 1.2) for _ in range(2)]
+    texture = [(128 + 40 * (x - x.mean()) / x.std()).clip(0, 255) for x in texture]
+    v, u = np.mgrid[:240, :320].astype(float)
+
+    def view(x):
+        wall, plate = (
+            map_coordinates(t, [v + 50, u + 50 + 300 * x / z], order=1)
+            for t, z in zip(texture, (6.0, 1.0), strict=True)
+        )
+        left = u + 300 * x
+        return np.where((left > 60) & (left < 260), plate, wall).astype(np.uint8)
+
+    evidence = DenseEvidence(DenseConfig(start_depth=1.0))
+    for x in (0.0, 0.02):
+        T = np.eye(4)
+        T[0, 3] = x
+        result = evidence.update(view(x), T, K)
+    far = (result.pixel[:, 0] < 45) | (result.pixel[:, 0] > 275)
+    assert (~far).sum() > 50
+    assert far.sum() > 50, "the wall is no less measured than the plate"
+    inverse = 1 / result.depth[far]
+    sigma = np.sqrt(result.variance[far]) * inverse**2
+    assert np.median(np.abs(inverse - 1 / 6) / sigma) < 2, "by as much as stated"
+    assert np.median(result.depth[far]) > 2.5

@@ -160,6 +160,18 @@ def test_an_error_that_held_out_anchors_show_makes_what_is_unseen_less_certain()
         assert least <= float(out.unseen) < most
 
 
+def test_outliers_do_not_widen_what_is_stated_of_the_other_pixels():
+    """A twentieth of the anchors is off by a factor of 2.5: ``outlier`` states it, and ``inlier`` narrows again."""
+    packed = None
+    for seed in range(12):
+        depth, factor, claimed, pixel, g, _ = scene(seed, n=150)
+        packed, out = updated(depth, (pixel, g, (0.05 * g) ** 2), claimed, packed)
+    seen = depth > 0
+    error = np.log(out.depth[0].numpy() / (depth * factor))[seen]
+    assert float(Running.of(packed, MODEL).ratio("inlier")) < 0.3
+    assert 0.22 < np.sqrt((error**2 / (out.inlier / out.depth.square())[0].numpy()[seen]).mean()) < 1
+
+
 def wall(error):
     """Learnt of a flat wall in twelve frames; the anchor of a cell is off by a factor e^error [28, 28]."""
     depth, packed = np.full((56, 56), 2.0), None

@@ -251,17 +251,20 @@ class DenseEvidence(SavedState):
         sighted = self._memory.sighted(small, T, K, cell)
         known = len(sighted.slot)
         pixel = np.concatenate([sighted.pixel, _pixels(small, cell, sighted.pixel)])
-        rho, variance, agreed = np.zeros(len(pixel)), np.ones(len(pixel)), np.zeros(len(pixel), np.bool_)
+        rho, variance = np.zeros(len(pixel)), np.ones(len(pixel))
+        agreed, lasts = np.zeros((2, len(pixel)), np.bool_)
         expected = np.concatenate([np.flatnonzero(sighted.due), np.arange(known, len(pixel))])
         if compared is not None:
-            found, fit, trusted = self._searched(small, pixel[expected], *compared, K, cell)
+            found, fit, lasting, trusted = self._searched(small, pixel[expected], *compared, K, cell)
             at = expected[found]
+            lasts[at] = lasting
             agreed[at], rho[at], variance[at] = True, fit.rho, fit.variance + np.square(_SCALE * fit.rho)
         agreed &= (rho > np.sqrt(variance)) & trusted
         both, fine = self._memory.compare(sighted, rho[:known], variance[:known], agreed[:known])
         again, new = np.flatnonzero(agreed[:known] & fine), np.flatnonzero(agreed[known:]) + known
         self._memory.write(both.slot[again], small, both.pixel[again], both.rho[again], both.variance[again], T, K)
-        self._memory.write(None, small, pixel[new], rho[new], variance[new], T, K)
+        lasting = new[lasts[new]]
+        self._memory.write(None, small, pixel[lasting], rho[lasting], variance[lasting], T, K)
         rho[:known], variance[:known] = both.rho, both.variance
         kept = np.concatenate([np.flatnonzero(fine), new]) if trusted else new
         if len(kept) >= _ENOUGH:
@@ -271,9 +274,10 @@ class DenseEvidence(SavedState):
 
     def _searched(
         self, small: NDArray[np.uint8], pixel: NDArray, views: Views, shares: NDArray, K: NDArray, cell: int
-    ) -> tuple[NDArray[np.int64], Fit, bool]:
-        """Which pixels [N, 2] were measured, their depths without errors of the poses, and whether the views agree."""
-        from ufmstar_torch.kernels.anchor_check_cpu import confirmed
+    ) -> tuple[NDArray[np.int64], Fit, NDArray[np.bool_], bool]:
+        """Which pixels [N, 2] were measured, their depths without errors of the poses, which of them are remembered (an
+        uncertain match of one view is not: the next images measure it better), and whether the views agree."""
+        from ufmstar_torch.kernels.anchor_check_cpu import CERTAIN, confirmed
         from ufmstar_torch.kernels.dense_cpu import measure
 
         self._baseline = float(np.linalg.norm(np.linalg.inv(K) @ views.b[-1]))
@@ -282,7 +286,9 @@ class DenseEvidence(SavedState):
         alike = accepted[actual.agreed + actual.contradicted > 1]
         trusted, found = len(alike) < _ENOUGH or bool(alike.mean() >= self.config.min_share), np.flatnonzero(accepted)
         given = actual.only(found), shares, views, K, self._depth, trusted
-        return found, self._errors.corrected(pixel[found], *given), trusted
+        fit = self._errors.corrected(pixel[found], *given)
+        lasting = (actual.agreed[found] > 1) | (fit.variance < np.square(CERTAIN * fit.rho))
+        return found, fit, lasting, trusted
 
     def _coarse(self, small: NDArray[np.uint8], taken: NDArray[np.float64], views: Views, cell: int) -> Depths:
         """Search the cells without a pixel of ``taken`` [N, 2] by windows of twice the width: in images of half the

@@ -18,8 +18,8 @@ _SIGMAS, _SHARE = 3.0, 0.05
 # that share goes with the eighth power of the share of others around it, counted with one more that is alike.
 _WRONG, _POWER = 0.026, 8
 # Least number of neighbours that support a single match, their least share, and the largest standard deviation of one
-# that does, as a share.
-_LEAST, _MOST, _CERTAIN = 3, 0.9, 0.2
+# that does, as a share. A match beyond it needs no support.
+_LEAST, _MOST, CERTAIN = 3, 0.9, 0.2
 # A side is that of the surface where the mean directions of those alike and of the others differ by this much along the
 # gradient (2 = opposite); the pixel then moves to it by 1 px, or by 2 px where they differ by _FAR.
 _APART, _FAR = 0.25, 1.0
@@ -54,8 +54,10 @@ def check_anchors(
 
 
 def confirmed(pixel: NDArray[np.float64], measured: Measured, cell: int) -> NDArray[np.bool_]:
-    """Which measurements hold: those on which two views agree, and those of one view that nearly all others around
-    them support. A single match may be wrong; but wrong ones beside each other have different depths.
+    """Which measurements hold: those on which two views agree, those of one view that nearly all others around them
+    support, and those of one view that state a large error themselves. A single match may be wrong; but wrong ones
+    beside each other have different depths, and where there is little parallax no match is far off. Without the last
+    kind, the first views of a place would measure its near surfaces alone.
 
     Args:
         pixel: [N, 2] (u, v).
@@ -102,9 +104,10 @@ def _confirm(pixel, rho, variance, found, cell, lies_in, fine):
                     continue
                 count += 1
                 limit = max(_SIGMAS**2 * (variance[n] + variance[m]), (_SHARE * rho[n]) ** 2)
-                if (rho[m] - rho[n]) ** 2 < limit and variance[m] < (_CERTAIN * rho[m]) ** 2:
+                if (rho[m] - rho[n]) ** 2 < limit and variance[m] < (CERTAIN * rho[m]) ** 2:
                     alike += 1
         fine[n] = alike >= _LEAST and alike >= _MOST * count
+        fine[n] |= variance[n] >= (CERTAIN * rho[n]) ** 2
 
 
 @reordered

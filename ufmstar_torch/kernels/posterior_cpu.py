@@ -25,6 +25,7 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
     away_from,
     elsewhere_variance,
     fitted,
+    inlier_factor,
     scene_of,
     second_moments,
     spread_around,
@@ -84,11 +85,11 @@ def _of_stream(
     node = np.arange(rows * cols)
     x = features(grid.log_depth - grid.mean, (node % cols + 0.5) / cols, (node // cols + 0.5) / rows)
     mean, variance = at(field, node, x)
-    b = field.coefficients
+    b, now = field.coefficients, Running.of(kept, config)
     share, offset = away / config.reach, mean - (x * b).sum(1)
-    variance = variance + running.ratios["roughness"] + away * running.ratios["unseen"]
+    variance = inlier_factor(now, away) * (variance + now.ratios["roughness"] + away * now.ratios["unseen"])
     wide = elsewhere_variance(config, spread_around(scene, np.ones(len(scene.noise), np.bool_), b[0]), away)
-    variance, inlier = second_moments(config, variance, wrong(running, share), offset, wide)
+    variance, inlier = second_moments(config, variance, wrong(now, share), offset, wide)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, share], 1)
     depth, spread, inlier, unseen = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
-    return kept, depth, spread, wrong(running, unseen).astype(unseen.dtype), inlier
+    return kept, depth, spread, wrong(now, unseen).astype(unseen.dtype), inlier

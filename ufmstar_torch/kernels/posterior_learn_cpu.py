@@ -12,6 +12,7 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
     Scene,
     away_from,
     elsewhere_variance,
+    inlier_factor,
     second_moments,
     spread_around,
     wrong,
@@ -50,13 +51,15 @@ def _of_discs(scene: Scene, weight: Floats, running: Running) -> dict[str, tuple
     believed = np.where(held, scene.believed(), 0.0)
     area = (believed / np.maximum(scene.counted(believed), 1e-12))[held]
     share, wide = away / config.reach, elsewhere_variance(config, spread_around(scene, rest, b[0])[node], away)
-    p, own = wrong(running, share), variance + noise + away * running.ratios["unseen"]
+    p, factor = wrong(running, share), inlier_factor(running, away)
+    own = factor * (variance + noise + away * running.ratios["unseen"])
     z2 = error**2 / own - (error + offset) ** 2 / (noise + wide)
     with np.errstate(over="ignore", divide="ignore"):  # certainly on its own surface, or never on another
         elsewhere = 1 / (1 + np.exp(-np.log(p / (1 - p)) - (np.log(own / (noise + wide)) + z2) / 2))
     stated = second_moments(config, own, p, offset, wide)[0]
     sums = {
         "wrong": (area * elsewhere, area * (1 + config.other * share)),
+        "inlier": (area * (1 - elsewhere) * factor * error**2 / own, area * (1 - elsewhere)),
         "calibration": (area * error**2 / stated, area),
     }
     added = {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}

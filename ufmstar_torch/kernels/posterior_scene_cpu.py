@@ -185,6 +185,11 @@ def wrong(running: Running, share: NDArray[Any]) -> NDArray[Any]:
     return np.minimum(running.ratios["wrong"] * (1 + running.config.other * share), MOST_WRONG)
 
 
+def inlier_factor(running: Running, away: Floats) -> Floats:
+    factor: Floats = 1 + (running.ratios["inlier"] - 1) * np.maximum(1 - away / (2 * running.config.radius), 0)
+    return factor
+
+
 def elsewhere_variance(config: PosteriorConfig, around: Floats, away: Floats) -> Floats:
     wide = config.spread * around + config.prior_sigma**2 * np.minimum(away / config.radius, 1)
     return np.minimum(wide, config.widest)

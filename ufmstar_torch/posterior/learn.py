@@ -3,7 +3,8 @@
 Roughness and noise follow from anchors that are left out alone. For the rest, discs that move over the image are left
 out of the field, which then predicts the anchors in them. Products of errors in neighbouring cells teach the amplitude,
 and ``unseen`` in proportion to the distance from evidence. ``wrong`` is the mean probability that an anchor lies on
-another surface, by area and not by number, since corners cluster on what is well textured.
+another surface, by area and not by number, since corners cluster on what is well textured. ``inlier`` is the mean z^2
+of the anchors that do not: outliers have widened the field's variance, and ``wrong`` states them already.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from ufmstar_torch.posterior.scene import (
     Scene,
     away_from,
     elsewhere_variance,
+    inlier_factor,
     second_moments,
     spread_around,
     wrong,
@@ -70,13 +72,15 @@ def _of_discs(scene: Scene, weight: Tensor, running: Running) -> dict[str, tuple
     area = believed / scene.counted(believed).clamp_min(1e-12)
     share, offset = away / scene.config.reach, mean - (scene.observed.features * b[:, None]).sum(-1)
     around, p = torch.gather(spread_around(scene, rest, b[:, 0]), 1, scene.observed.node), wrong(running, share)
-    own = variance + scene.noise + away * running.ratio("unseen")[:, None]
+    factor = inlier_factor(running, away)
+    own = factor * (variance + scene.noise + away * running.ratio("unseen")[:, None])
     wide = elsewhere_variance(scene.config, around, away)
     z2 = error.square() / own - (error + offset).square() / (scene.noise + wide)
     elsewhere = torch.sigmoid(p.logit() + ((own / (scene.noise + wide)).log() + z2) / 2)
     stated = second_moments(scene.config, own, p, offset, wide)[0]
     return _of_pairs(scene, held, torch.stack([error, variance, away, scene.noise]), running) | {
         "wrong": (total(area * elsewhere, 1), total(area * (1 + scene.config.other * share), 1)),
+        "inlier": (total(area * (1 - elsewhere) * factor * error.square() / own, 1), total(area * (1 - elsewhere), 1)),
         "calibration": (total(area * error.square() / stated, 1), total(area, 1)),
     }
 

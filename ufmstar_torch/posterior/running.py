@@ -3,8 +3,9 @@
 Everything here is learnt from anchors alone, in frames that have some: how far the network's error varies (amplitude),
 how much anchors and network differ from one pixel to the next (roughness), by what factor the anchors' variances are
 stated too small (noise), how fast the error grows with the distance from evidence (unseen), how often the local
-correction does not hold (wrong), and how well held-out anchors were predicted (calibration). Each is a ratio of two
-sums that fade towards a prior, so that a few anchors do not decide.
+correction does not hold (wrong), by what factor the variance is stated too small where it does (inlier), and how well
+held-out anchors were predicted (calibration). Each is a ratio of two sums that fade towards a prior, so that a few
+anchors do not decide.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ def ratios(config: PosteriorConfig) -> dict[str, Ratio]:
         "noise": Ratio(1.0, weight, 0.25, 16.0),
         "unseen": Ratio(config.unseen, weight, 0.0, 16.0),
         "wrong": Ratio(config.wrong, weight, config.wrong / 10, 10 * config.wrong),
+        "inlier": Ratio(1.0, weight, 0.05, 4.0),
         "calibration": Ratio(0.0, 0.0, 0.0, 1e6),
     }
 

@@ -157,6 +157,13 @@ def wrong(running: Running, share: Tensor) -> Tensor:
     return (running.ratio("wrong")[:, None] * (1 + running.config.other * share)).clamp_max(MOST_WRONG)
 
 
+def inlier_factor(running: Running, away: Tensor) -> Tensor:
+    """[B, n] by what the variance of y on the evidence's own surface is multiplied, at distances ``away`` [B, n] from
+    it. Held-out anchors are within a disc's reach of others: from a disc's width on, they say nothing."""
+    near = (1 - away / (2 * running.config.radius)).clamp_min(0)
+    return 1 + (running.ratio("inlier")[:, None] - 1) * near
+
+
 def elsewhere_variance(config: PosteriorConfig, around: Tensor, away: Tensor) -> Tensor:
     """Variance of y on another surface than the evidence's: from ``around``, that of the anchors' y, and, with the
     distance ``away`` from the evidence, what it was before the first anchor. At most ``widest``."""

@@ -15,13 +15,15 @@ anchor is distributed about the prediction of the others as Student's t. What (n
 prediction's variance, with z from the leave-one-out residual, is counted as its noise: this takes outliers out. The
 difference of f across a link is Student's t in the same way, so that f may jump where the anchors say so.
 
-Variance over the squared depth at a node, with v the field's variance + roughness + unseen distance, and
+Variance over the squared depth at a node, with v = h (the field's variance + roughness + unseen distance), and
 share = min(1, distance/reach):
 
-    max((1 - p) m(v) + p tail, share V/d^2),      p = wrong (1 + other share),      m(v) = E[(e^n - 1)^2],  n ~ N(0, v).
+    max((1 - p) m(v) + p tail, share V/d^2),      p = wrong (1 + other share),      m(v) = E[(e^n - 1)^2],  n ~ N(0, v),
+    h = 1 + (inlier - 1) max(0, 1 - distance/(2 radius)),
 
-The error of the depth is log-normal, so m exceeds v where v is large. p is the probability that the depth is of another
-surface than its evidence: ``outlier``. ``inlier`` is m(v) alone.
+with what was learnt up to this frame, its held-out anchors included. The error of the depth is log-normal, so m exceeds
+v where v is large. p is the probability that the depth is of another surface than its evidence: ``outlier``. ``inlier``
+is m(v) alone.
 
 The distance from evidence is geodesic, in widths of the image, and differences of log d lengthen it: on tours the
 variance of the error grows in proportion to it. ``learn`` learns ``unseen``, ``wrong`` and the other ratios
@@ -61,6 +63,7 @@ from ufmstar_torch.posterior.scene import (
     away_from,
     elsewhere_variance,
     fitted,
+    inlier_factor,
     second_moments,
     spread_around,
     wrong,
@@ -119,25 +122,24 @@ def update(
     scene = Scene.of(grid, frame, anchors, running)
     field, left_out, weight = fitted(scene)
     away = away_from(scene, anchors.valid & (weight * config.weak_sigma**2 >= 1))
-    after = learnt(scene, field, weight, left_out, running)
+    some = anchors.valid.any(1)
+    drifted = torch.where(frame.valid.flatten(1).any(1)[:, None], running.drifted(grid.mean), packed)
+    kept = torch.where(some[:, None], learnt(scene, field, weight, left_out, running).packed(), drifted)
+    now = Running.of(kept, config)
     features, b = grid.features(), field.coefficients
     mean, variance = field.at(torch.arange(features.shape[1], device=b.device).expand_as(away), features)
     offset, share = mean - (features * b[:, None]).sum(-1), away / config.reach
-    variance = variance + running.ratio("roughness")[:, None] + away * running.ratio("unseen")[:, None]
+    variance = variance + now.ratio("roughness")[:, None] + away * now.ratio("unseen")[:, None]
     wide = elsewhere_variance(config, spread_around(scene, anchors.valid, b[:, 0]), away)
-    variance, inlier = second_moments(config, variance, wrong(running, share), offset, wide)
+    variance, inlier = second_moments(config, inlier_factor(now, away) * variance, wrong(now, share), offset, wide)
     nodes = torch.stack([grid.log_depth, offset, variance, inlier, share], -1)
     maps = frame.depth, frame.valid, claimed.nan_to_num()
     depth, spread, inlier, unseen = read(*maps, nodes, b, grid.mean, grid.size, config)
-    outlier = wrong(running, unseen.flatten(1)).view_as(unseen).to(unseen.dtype)
-    some = anchors.valid.any(1)
+    outlier = wrong(now, unseen.flatten(1)).view_as(unseen).to(unseen.dtype)
     known = (some | (running.frames > 0) | given)[:, None, None]
     plain = torch.where(frame.valid, frame.depth, torch.nan)
-    drifted = torch.where(frame.valid.flatten(1).any(1)[:, None], running.drifted(grid.mean), packed)
-    kept = torch.where(some[:, None], after.packed(), drifted).to(packed.dtype)
-    now = Running.of(kept, config)
     calibration = torch.where(now.below["calibration"] > 0, now.ratio("calibration"), torch.nan)
-    return kept, Posterior(
+    return kept.to(packed.dtype), Posterior(
         torch.where(known, depth, plain), torch.where(known, spread, claimed), calibration, now.ratio("unseen"),
         torch.where(known, outlier, torch.nan), torch.where(known, inlier, claimed),
     )  # fmt: skip
