@@ -18,7 +18,7 @@ START = {
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
 PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
-REACH, RADIUS, WEAK, CLIP, APART, OTHER = 1.0, 5 / 28, 0.25**2, 9.0, 0.5, 6
+REACH, RADIUS, WEAK, CLIP, APART, OTHER = 1.0, 0.15, 0.25**2, 9.0, 0.5, 6
 
 
 def start():
@@ -56,7 +56,7 @@ def links(logs):
                 if r + dr < rows and c + dc < cols:
                     d = abs(logs[r + dr, c + dc] - logs[r, c])
                     i = r * cols + c
-                    yield i, i + dr * cols + dc, 0.004 + 2 * d * d, 1 / n + d
+                    yield i, i + dr * cols + dc, 0.0015 + 6 * d * d, 1 / n + d
 
 
 def features(logs, u, v):
@@ -229,7 +229,7 @@ def inlier_factor(state, away):
 
 def elsewhere(share, around):
     """Variance of y on another surface, at a distance of ``share`` widths from the evidence."""
-    return min(2 * around + 0.25 * min(share / RADIUS, 1), 2)
+    return min(around + 0.25 * min(share / RADIUS, 1), 2)
 
 
 def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v):

@@ -191,7 +191,7 @@ def inlier_factor(running: Running, away: Floats) -> Floats:
 
 
 def elsewhere_variance(config: PosteriorConfig, around: Floats, away: Floats) -> Floats:
-    wide = config.spread * around + config.prior_sigma**2 * np.minimum(away / config.radius, 1)
+    wide = around + config.prior_sigma**2 * np.minimum(away / config.radius, 1)
     return np.minimum(wide, config.widest)
 
 

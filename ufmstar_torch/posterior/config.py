@@ -35,13 +35,12 @@ class PosteriorConfig(Checked):
             evidence from which on another surface is as uncertain as before the first anchor
         wrong: probability that the local correction does not hold, at evidence, before it is learnt
         other: by how much of itself it has grown from ``reach`` on, since another surface may begin
-        spread: variance of y where it does not hold, at evidence, over that of the anchors' y around
         widest: variance of y from which on the variance of the depth grows no more
         edge_contrast: difference of log d at which a node counts half at a pixel
     """
 
-    link_variance: float = number(0.004, "v_0", "1", 0.0, open_low=True)
-    edge_variance: float = number(2.0, "v_1", "1", 0.0, open_low=True)
+    link_variance: float = number(0.0015, "v_0", "1", 0.0, open_low=True)
+    edge_variance: float = number(6.0, "v_1", "1", 0.0, open_low=True)
     precision: float = number(0.5, "kappa", "1", 0.0, open_low=True)
     prior_sigma: float = number(0.5, "sigma_b", "1", 0.0, open_low=True)
     tilt_sigma: float = number(0.2, "sigma_t", "1", 0.0, open_low=True)
@@ -56,10 +55,9 @@ class PosteriorConfig(Checked):
     weak_sigma: float = number(0.25, "sigma_w", "1", 0.0, open_low=True)
     reach: float = number(1.0, "l", "width", 0.0, open_low=True)
     discs: int = number(3, "", "1", 0, 16)
-    radius: float = number(5 / 28, "r", "width", 0.0, open_low=True)
+    radius: float = number(0.15, "r", "width", 0.0, open_low=True)
     wrong: float = number(0.03, "p_0", "1", 0.0, 0.5)
     other: float = number(6.0, "p_1", "1", 0.0)
-    spread: float = number(2.0, "a", "1", 0.0, 4.0)
     widest: float = number(2.0, "v_2", "1", 0.0, 4.0, open_low=True)
     edge_contrast: float = number(0.1, "delta", "1", 0.0, open_low=True)
 

@@ -167,7 +167,7 @@ def inlier_factor(running: Running, away: Tensor) -> Tensor:
 def elsewhere_variance(config: PosteriorConfig, around: Tensor, away: Tensor) -> Tensor:
     """Variance of y on another surface than the evidence's: from ``around``, that of the anchors' y, and, with the
     distance ``away`` from the evidence, what it was before the first anchor. At most ``widest``."""
-    wide = config.spread * around + config.prior_sigma**2 * (away / config.radius).clamp_max(1)
+    wide = around + config.prior_sigma**2 * (away / config.radius).clamp_max(1)
     return wide.clamp_max(config.widest)
 
 

@@ -33,7 +33,7 @@ variance of the error grows in proportion to it. ``learn`` learns ``unseen``, ``
 wrong or lies on another surface. Then y - b . x is normal with the variance w, and the depth log-normal:
 
     tail = E[(e^(n - f) - 1)^2] = q^2 e^(2 w) - 2 q e^(w/2) + 1,      q = e^-f <= 100,      n ~ N(0, w),
-    w = spread s^2 + sigma_b^2 min(1, distance/radius),
+    w = s^2 + sigma_b^2 min(1, distance/radius),
 
 with s^2 the variance of the anchors' y around, of a Gaussian window. Neither v nor w exceeds ``widest``. So no pixel is
 more certain than contradictory evidence allows, another surface that has no evidence is as uncertain as before the
