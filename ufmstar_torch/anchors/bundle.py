@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.anchors.saved_state import SavedState
 
-# [px] Standard deviations of a position: by errors of the poses before any is learnt, the least and the largest one
-# that is learnt, and by tracking from one view to the next (.25 to .4 on recordings and tours).
-_FIRST, _LEAST, _LARGEST, _TRACKING = 0.1, 0.003, 20.0, 0.35
+# [px] Standard deviations of a position: by errors of the poses before any is learnt (best on tours whose poses err by
+# .05 to .15 degrees and 2 mm), the least and the largest one that is learnt, and by tracking from one view to the next
+# (.25 to .4 on recordings and tours).
+_FIRST, _LEAST, _LARGEST, _TRACKING = 0.5, 0.003, 20.0, 0.35
 # The variance of a corner's position v views before is 1 + _DRIFT (v - 1) times that of the view before.
 _DRIFT = 0.6
 # Information of a position, over that of an independent one: neighbouring corners err alike, and a corner in several
@@ -54,6 +55,7 @@ class PoseRefinement(SavedState):
 
     HELD: ClassVar = {
         "_variance": "given_pose_variance",
+        "_learnt": "pose_errors_learnt",
         "_last": "last_pose_error",
         "_lately": "surprise_lately",
         "correlated": "correlated_pose_variance",
@@ -67,6 +69,7 @@ class PoseRefinement(SavedState):
         """Forget everything."""
         self._variance = np.full(2, _FIRST**2 / 2)  # of a position, by w and by s [px^2]
         self._last = np.zeros((2, 3))  # w and s of the last pose as shifts of a position [px]
+        self._learnt = 0  # errors of poses that the variance is from
         self.correlated, self.shared, self.jumped = 0.0, 0.0, False
         self._lately = _SURPRISE
 
@@ -140,7 +143,9 @@ class PoseRefinement(SavedState):
         """Follow the given poses' errors by the newest one's [2, 3] and its posterior variance, in pixels."""
         shown = (1 - remains / self._variance[:, None]).sum(1)  # of three numbers, what the images showed
         excess = np.square(error).sum(1) - shown * self._variance
-        variance = self._variance + (1 - _MEMORY) * excess / np.maximum(shown, 1)
+        self._learnt += 1
+        share = max(1 - _MEMORY, 1 / (self._learnt + 1))  # at first a mean of them and the prior
+        variance = self._variance + share * excess / np.maximum(shown, 1)
         self._variance = variance.clip(_LEAST**2 / 2, _LARGEST**2 / 2)
         product = float((error * self._last).sum()) / 3
         self.correlated = max(_MEMORY * self.correlated + (1 - _MEMORY) * product, 0.0)

@@ -34,8 +34,8 @@ from ufmstar_torch.kernels.poses_cpu import CAMERA, POSE, Shown, Solution, linea
 _ENOUGH = 10
 # The median of the square of a standard normal variable.
 _MEDIAN_SQUARE = 0.4549
-# [px] Standard deviation of a position by errors of the poses before it is estimated, and the least one.
-_FIRST, _LEAST = 0.3, 0.003
+# [px] Standard deviation of a position by errors of the refined poses before it is estimated, and the least one.
+_FIRST, _LEAST = 0.1, 0.003
 # A pixel's own variance over the one stated by its match is so many times the mean squared difference of its views,
 # with the running one as that of one more: views share the patch and its errors. Fitted on tours.
 _PATCH = 2.0

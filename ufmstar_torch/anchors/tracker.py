@@ -47,6 +47,9 @@ _NEAR, _FAR, _MEDIAN_DEPTH = 1 / 50, 10.0, 1.0
 # Share of the running comparison with the poses that remains after a frame; the motion of a corner that shows a depth,
 # and of an image that stands still [px].
 _FOLLOWS, _MOVES, _STILL = 0.6, 1.0, 0.2
+# Least baseline of the corners, a median, over the depth of the scene: refined poses of a camera that stands or only
+# turns are as far apart as the given ones may err.
+_PARALLAX = 0.005
 # Cells of the image, in a row, that count alike in what corners show of the poses.
 _CELLS = 6
 # The median of the absolute value of a standard normal variable.
@@ -119,7 +122,7 @@ class Landmarks:
         pose_error: standard deviation of tracked corners from their epipolar lines by the given poses [px]; NaN = not
             measured.
         shared: variance of inverse depths by errors of the poses, the same error for all landmarks of the image
-            [1/m^2]; it is in ``variance`` too. Infinite where the poses contradict the images.
+            [1/m^2]; it is in ``variance`` too. Infinite where the poses contradict not the newest image alone.
         contradicted: the poses contradict the images, and no depth is used.
         scale: variance of the logarithm of a factor that all depths of the image have in common; in ``variance`` too.
     """
@@ -195,6 +198,7 @@ class LandmarkTracker(SavedState):
         "_view": "view",
         "_noise": "noise",
         "_off": "off",
+        "_now": "off_now",
         "baseline": "baseline",
         "_depth": "depth",
         "_judged": "depths_judged",
@@ -221,7 +225,9 @@ class LandmarkTracker(SavedState):
         self._view = -1
         self._refinement.reset()
         self._noise = self.config.pixel_noise**2
-        self._off = -1.0  # standard deviation of corners from their epipolar lines [px]; negative = not measured
+        # Standard deviation of corners from their epipolar lines [px], lately and in the newest image; negative = not
+        # measured.
+        self._off = self._now = -1.0
         self.baseline, self._depth = 0.0, self.config.start_depth  # of the views, and of the scene [m]
         self._judged = 0  # images that showed the scene's depth
         self._point = np.full((n, 3), np.nan)  # of the corners in the newest image [m]; the window decides it
@@ -327,8 +333,13 @@ class LandmarkTracker(SavedState):
 
     @property
     def contradicted(self) -> bool:
-        """True where the poses contradict the images."""
-        return self.remaining_error > self.config.max_pose_error * self._gray.shape[1]
+        """True where the poses contradict the images, lately or the newest one alone."""
+        return max(self.remaining_error, self._now) > self._limit
+
+    @property
+    def _limit(self) -> float:
+        """Largest error of positions by the poses [px]."""
+        return self.config.max_pose_error * self._gray.shape[1]
 
     def _refine(self) -> None:
         """Refine the window's poses by its corners."""
@@ -352,8 +363,8 @@ class LandmarkTracker(SavedState):
         distance, rho, baseline = off_lines(*views, self._K, _NEAR * self._depth, far)
         cell = (views[0] * _CELLS / self._gray.shape[::-1]).astype(np.int64).clip(0, _CELLS - 1) @ [1, _CELLS]
         weight = 1 / np.bincount(cell)[cell]  # by area: a thing that moves by itself may have most of the corners
-        now = weighted_median(distance, weight) / _MEDIAN
-        self._off = now if self._off < 0 else _FOLLOWS * self._off + (1 - _FOLLOWS) * now
+        self._now = weighted_median(distance, weight) / _MEDIAN
+        self._off = self._now if self._off < 0 else _FOLLOWS * self._off + (1 - _FOLLOWS) * self._now
         self.baseline = median(baseline)
         shows = (rho > 0) & (motion > _MOVES)
         if shows.sum() >= _ENOUGH:
@@ -422,8 +433,8 @@ class LandmarkTracker(SavedState):
         chosen, result = self._triangulated()
         none = _NO_DEPTH if tracked else _NO_TRACK
         if self.contradicted:
-            none = contradiction(self.remaining_error, config.max_pose_error * self._gray.shape[1])
-        if result is None or self.contradicted:
+            none = contradiction(max(self.remaining_error, self._now), self._limit)
+        if result is None or self.contradicted or self.baseline < _PARALLAX * self._depth:
             nothing, shared = np.zeros(0), self.shared(self.baseline)
             pixel = np.zeros((0, 2))
             return Landmarks(pixel, nothing, nothing, tracked, none, self.pose_error, shared, self.contradicted)
@@ -452,8 +463,8 @@ class LandmarkTracker(SavedState):
 
     def shared(self, baseline: float) -> float:
         """Variance of inverse depths by errors of the poses over a baseline [m], alike for all points [1/m^2]; infinite
-        where the poses contradict the images: what earlier ones taught may be as wrong."""
-        if self.contradicted:
+        where the poses contradict more images than the newest: what earlier ones taught may be as wrong."""
+        if self.remaining_error > self._limit:
             return float("inf")
         return self.pose_variance / max(self._K[0, 0] * baseline, 1e-9) ** 2 if self.pose_variance else 0.0
 
