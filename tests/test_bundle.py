@@ -114,6 +114,17 @@ def test_right_poses_hardly_move(seed):
     assert refinement.given**0.5 < 0.15
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_noise_of_the_first_poses_is_learnt_faster_than_that_of_later_ones(seed):
+    """Four exact ones: a mean of them and the prior, of whose variance a fifth remains."""
+    rng, refinement = np.random.default_rng(seed), PoseRefinement()
+    first = refinement.given
+    for _ in range(4):
+        truth, pixel = scene(rng, noise=0.1)
+        refinement.refine(pixel, np.ones(pixel.shape[:2], bool), truth, K, 2.0)
+    assert refinement.given < 0.35 * first
+
+
 def test_poses_that_lag_behind_have_correlated_errors():
     rng, refinement = np.random.default_rng(0), PoseRefinement()
     for _ in range(25):

@@ -116,13 +116,14 @@ def test_a_late_trajectory_gives_no_depth_or_one_as_uncertain_as_it_is_wrong(tou
     assert np.median(sizes) < 2.5 * 0.6745
 
 
-def test_one_blurred_image_is_no_contradiction_to_report(tour, kind, caplog):
+def test_one_blurred_image_is_no_contradiction_to_report_and_nothing_learnt_is_forgotten(tour, kind, caplog):
     streams, K = StreamLandmarks(kind), torch.from_numpy(tour[0].intrinsics)
     contradicted = 0
     for i, frame in enumerate(tour):
         image = frame.image if i != 5 else np.roll(frame.image, 10, axis=0)
         streams.update(torch.from_numpy(image).permute(2, 0, 1)[None], torch.from_numpy(frame.T_world_cam), K)
         contradicted += streams.last[0].contradicted
+        assert np.isfinite(streams.last[0].shared)
     assert contradicted > 0, "its depths are not used"
     assert "contradict the images" not in caplog.text
 
