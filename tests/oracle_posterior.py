@@ -186,7 +186,7 @@ def update(state, depth, claimed, pixel, g, variance):
         after["sums"][name] = [min(max(above, low * below), high * below), below]
     HX = design(X, np.arange(n), n)
     spread = np.einsum("ij,jk,ik->i", HX, C, HX) + ratio(after, "roughness") + away * ratio(after, "unseen")
-    spread = spread * inlier_factor(after, away)
+    spread = spread * inlier_factor(after, away) + steepness(logs.shape, mean[FEATURES:])
     offset, share = HX[:, 4:] @ mean[4:], away / REACH
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
     wrong = ratio(after, "wrong")
@@ -222,6 +222,16 @@ def second_moment(wrong, variance, share, offset, around):
     return (1 - p) * moments[0] + p * moments[1]
 
 
+def steepness(shape, f):
+    """Variance of f among each node and its eight neighbours; a border's nodes are their own outer neighbours."""
+    f, out = f.reshape(shape), np.empty(shape)
+    for r in range(shape[0]):
+        for c in range(shape[1]):
+            rows, cols = (np.clip([i - 1, i, i + 1], 0, n - 1) for i, n in zip((r, c), shape, strict=True))
+            out[r, c] = np.var(f[np.ix_(rows, cols)])
+    return out.ravel()
+
+
 def inlier_factor(state, away):
     """What was learnt of held-out anchors fades within the width of a disc."""
     return 1 + (ratio(state, "inlier") - 1) * np.maximum(1 - away / (2 * RADIUS), 0)
@@ -250,7 +260,7 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v):
     share, around = away / REACH, y_variance(logs.shape, node, y, noise, rest, mean[0])[node]
     offset = H[:, FEATURES:] @ mean[FEATURES:]
     factor = inlier_factor(state, away)
-    own = factor * (var + noise + away * ratio(state, "unseen"))
+    own = factor * (var + noise + away * ratio(state, "unseen")) + steepness(logs.shape, mean[FEATURES:])[node]
     wide = noise + [elsewhere(*each) for each in zip(share, around, strict=True)]
     final = [second_moment(wrong, *each) for each in zip(own, share, offset, around, strict=True)]
     p = np.minimum(wrong * (1 + OTHER * share), 0.5)

@@ -172,6 +172,19 @@ def test_outliers_do_not_widen_what_is_stated_of_the_other_pixels():
     assert 0.22 < np.sqrt((error**2 / (out.inlier / out.depth.square())[0].numpy()[seen]).mean()) < 1
 
 
+def test_where_the_field_jumps_the_depth_is_less_certain_than_on_either_side():
+    """A wall as predicted, and one whose right half is three times as far: its edge may lie a cell from where f has
+    it."""
+    depth = np.full((56, 56), 2.0)
+    rows, cols = (x.ravel() for x in np.mgrid[2:56:4, 2:56:4])
+    for factor, least, most in ((1.0, 0.9, 1.1), (3.0, 1.6, 10.0)):
+        packed, g = None, 2 * np.where(cols < 28, 1, factor)
+        for _ in range(10):
+            packed, out = updated(depth, (np.stack([cols, rows], -1) + 0.0, g, np.full(len(g), 1e-4)), packed=packed)
+        own = (out.inlier / out.depth.square())[0, 8:-8]
+        assert least < float(own[:, 26:32].mean() / own[:, 8:14].mean()) < most
+
+
 def wall(error):
     """Learnt of a flat wall in twelve frames; the anchor of a cell is off by a factor e^error [28, 28]."""
     depth, packed = np.full((56, 56), 2.0), None

@@ -29,6 +29,7 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
     scene_of,
     second_moments,
     spread_around,
+    steepness,
     wrong,
 )
 from ufmstar_torch.kernels.threads_cpu import each
@@ -88,6 +89,7 @@ def _of_stream(
     b, now = field.coefficients, Running.of(kept, config)
     share, offset = away / config.reach, mean - (x * b).sum(1)
     variance = inlier_factor(now, away) * (variance + now.ratios["roughness"] + away * now.ratios["unseen"])
+    variance = variance + steepness(grid, field.offset)
     wide = elsewhere_variance(config, spread_around(scene, np.ones(len(scene.noise), np.bool_), b[0]), away)
     variance, inlier = second_moments(config, variance, wrong(now, share), offset, wide)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, share], 1)

@@ -15,6 +15,7 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
     inlier_factor,
     second_moments,
     spread_around,
+    steepness,
     wrong,
 )
 from ufmstar_torch.posterior.learn import APART, LEAST_REST, STEPS
@@ -52,7 +53,7 @@ def _of_discs(scene: Scene, weight: Floats, running: Running) -> dict[str, tuple
     area = (believed / np.maximum(scene.counted(believed), 1e-12))[held]
     share, wide = away / config.reach, elsewhere_variance(config, spread_around(scene, rest, b[0])[node], away)
     p, factor = wrong(running, share), inlier_factor(running, away)
-    own = factor * (variance + noise + away * running.ratios["unseen"])
+    own = factor * (variance + noise + away * running.ratios["unseen"]) + steepness(scene.grid, field.offset)[node]
     z2 = error**2 / own - (error + offset) ** 2 / (noise + wide)
     with np.errstate(over="ignore", divide="ignore"):  # certainly on its own surface, or never on another
         elsewhere = 1 / (1 + np.exp(-np.log(p / (1 - p)) - (np.log(own / (noise + wide)) + z2) / 2))

@@ -190,6 +190,13 @@ def inlier_factor(running: Running, away: Floats) -> Floats:
     return factor
 
 
+def steepness(grid: Grid, f: Floats) -> Floats:
+    padded = np.pad(f.reshape(grid.rows, grid.cols), 1, mode="edge")
+    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(len(f), 9)
+    variance: Floats = around.var(1)
+    return variance
+
+
 def elsewhere_variance(config: PosteriorConfig, around: Floats, away: Floats) -> Floats:
     wide = around + config.prior_sigma**2 * np.minimum(away / config.radius, 1)
     return np.minimum(wide, config.widest)

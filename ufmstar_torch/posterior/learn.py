@@ -24,6 +24,7 @@ from ufmstar_torch.posterior.scene import (
     inlier_factor,
     second_moments,
     spread_around,
+    steepness,
     wrong,
 )
 
@@ -74,6 +75,7 @@ def _of_discs(scene: Scene, weight: Tensor, running: Running) -> dict[str, tuple
     around, p = torch.gather(spread_around(scene, rest, b[:, 0]), 1, scene.observed.node), wrong(running, share)
     factor = inlier_factor(running, away)
     own = factor * (variance + scene.noise + away * running.ratio("unseen")[:, None])
+    own = own + torch.gather(steepness(scene.grid, field.offset), 1, scene.observed.node)
     wide = elsewhere_variance(scene.config, around, away)
     z2 = error.square() / own - (error + offset).square() / (scene.noise + wide)
     elsewhere = torch.sigmoid(p.logit() + ((own / (scene.noise + wide)).log() + z2) / 2)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import pad, unfold
 
 from ufmstar_torch.anchors.anchors import AnchorInput
 from ufmstar_torch.frame import FrameInput
@@ -162,6 +162,13 @@ def inlier_factor(running: Running, away: Tensor) -> Tensor:
     it. Held-out anchors are within a disc's reach of others: from a disc's width on, they say nothing."""
     near = (1 - away / (2 * running.config.radius)).clamp_min(0)
     return 1 + (running.ratio("inlier")[:, None] - 1) * near
+
+
+def steepness(grid: Grid, f: Tensor) -> Tensor:
+    """[B, n] variance of the field's mean ``f`` [B, n] among a node and its eight neighbours: where an edge of depth lies
+    is known to a node only, and on its other side y is another surface's."""
+    padded = pad(f.unflatten(1, grid.size)[:, None], (1, 1, 1, 1), mode="replicate")
+    return unfold(padded, 3).var(1, correction=0)
 
 
 def elsewhere_variance(config: PosteriorConfig, around: Tensor, away: Tensor) -> Tensor:

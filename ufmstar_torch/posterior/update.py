@@ -15,15 +15,16 @@ anchor is distributed about the prediction of the others as Student's t. What (n
 prediction's variance, with z from the leave-one-out residual, is counted as its noise: this takes outliers out. The
 difference of f across a link is Student's t in the same way, so that f may jump where the anchors say so.
 
-Variance over the squared depth at a node, with v = h (the field's variance + roughness + unseen distance), and
-share = min(1, distance/reach):
+Variance over the squared depth at a node, with v = h (the field's variance + roughness + unseen distance) + steepness,
+and share = min(1, distance/reach):
 
     max((1 - p) m(v) + p tail, share V/d^2),      p = wrong (1 + other share),      m(v) = E[(e^n - 1)^2],  n ~ N(0, v),
     h = 1 + (inlier - 1) max(0, 1 - distance/(2 radius)),
 
-with what was learnt up to this frame, its held-out anchors included. The error of the depth is log-normal, so m exceeds
-v where v is large. p is the probability that the depth is of another surface than its evidence: ``outlier``. ``inlier``
-is m(v) alone.
+with what was learnt up to this frame, its held-out anchors included. ``steepness`` is the variance of f among a node
+and its neighbours: an edge of depth may lie a node from where f has it. The error of the depth is log-normal, so m
+exceeds v where v is large. p is the probability that the depth is of another surface than its evidence: ``outlier``.
+``inlier`` is m(v) alone.
 
 The distance from evidence is geodesic, in widths of the image, and differences of log d lengthen it: on tours the
 variance of the error grows in proportion to it. ``learn`` learns ``unseen``, ``wrong`` and the other ratios
@@ -66,6 +67,7 @@ from ufmstar_torch.posterior.scene import (
     inlier_factor,
     second_moments,
     spread_around,
+    steepness,
     wrong,
 )
 
@@ -131,7 +133,8 @@ def update(
     offset, share = mean - (features * b[:, None]).sum(-1), away / config.reach
     variance = variance + now.ratio("roughness")[:, None] + away * now.ratio("unseen")[:, None]
     wide = elsewhere_variance(config, spread_around(scene, anchors.valid, b[:, 0]), away)
-    variance, inlier = second_moments(config, inlier_factor(now, away) * variance, wrong(now, share), offset, wide)
+    variance = inlier_factor(now, away) * variance + steepness(grid, field.offset)
+    variance, inlier = second_moments(config, variance, wrong(now, share), offset, wide)
     nodes = torch.stack([grid.log_depth, offset, variance, inlier, share], -1)
     maps = frame.depth, frame.valid, claimed.nan_to_num()
     depth, spread, inlier, unseen = read(*maps, nodes, b, grid.mean, grid.size, config)
