@@ -165,8 +165,8 @@ def inlier_factor(running: Running, away: Tensor) -> Tensor:
 
 
 def steepness(grid: Grid, f: Tensor) -> Tensor:
-    """[B, n] variance of the field's mean ``f`` [B, n] among a node and its eight neighbours: where an edge of depth lies
-    is known to a node only, and on its other side y is another surface's."""
+    """[B, n] variance of the field's mean ``f`` [B, n] among a node and its eight neighbours. Where an edge of depth
+    lies is known to a node only, and on its other side y is another surface's."""
     padded = pad(f.unflatten(1, grid.size)[:, None], (1, 1, 1, 1), mode="replicate")
     return unfold(padded, 3).var(1, correction=0)
 
