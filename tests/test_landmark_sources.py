@@ -116,6 +116,12 @@ def test_a_late_trajectory_gives_no_depth_or_one_as_uncertain_as_it_is_wrong(tou
     assert np.median(sizes) < 2.5 * 0.6745
 
 
+def test_nothing_is_searched_where_errors_of_the_refined_poses_exceed_the_limit(tour):
+    usual, strict = (run(DenseEvidence(DenseConfig(corner_sigma=s)), tour) for s in (0.1, 1e-4))
+    assert len(strict[1].depth) == len(usual[1].depth) > 0, "two poses are not refined"
+    assert sum(len(r.depth) for r in strict[5:]) < 0.3 * sum(len(r.depth) for r in usual[5:])
+
+
 def test_one_blurred_image_is_no_contradiction_to_report_and_nothing_learnt_is_forgotten(tour, kind, caplog):
     streams, K = StreamLandmarks(kind), torch.from_numpy(tour[0].intrinsics)
     contradicted = 0

@@ -65,7 +65,8 @@ class DenseConfig(Checked):
         corners: corners that are followed.
         corner_distance: of a corner that is an anchor from all dense ones, as a share of the width.
         corner_sigma: its largest standard deviation, and the largest one that the distance of corners from their
-            epipolar lines makes over their baseline, as shares of its depth.
+            epipolar lines makes over their baseline, as shares of its depth. Where errors of the refined poses make a
+            larger one at the median depth, nothing is searched.
         start_depth: median depth of the scene before one is known [m]; right to a factor of 5.
         least_score: of a match, zero-mean normalised cross-correlation (ZNCC).
         rival: a match is unique where the best other one has this many times its 1 - ZNCC at least.
@@ -220,7 +221,8 @@ class DenseEvidence(SavedState):
 
         cell, K = _cell(small.shape[1]), self._errors.camera(K)
         trusted = not corners.contradicted
-        compared = self._compared(T, K, small.shape[1]) if trusted else None
+        sure = self._tracker.refined_variance * self._depth**2 <= self.config.corner_sigma**2
+        compared = self._compared(T, K, small.shape[1]) if trusted and sure else None
         found, searched, trusted = self._in_cells(small, T, K, cell, compared, trusted)
         self._contradicted = 0 if trusted else self._contradicted + 1
         if compared is not None and trusted:

@@ -326,6 +326,11 @@ class LandmarkTracker(SavedState):
         return (max(self._off, 0.0) ** 2 + self._refinement.correlated) ** 0.5
 
     @property
+    def refined_variance(self) -> float:
+        """Variance of inverse depths by the errors that remain in the refined poses [1/m^2]; 0 = not refined."""
+        return self._refinement.shared
+
+    @property
     def pose_variance(self) -> float:
         """Variance that errors of the poses add to a tracked position [px^2]."""
         off = max(self._off, 0.0) ** 2 - self.config.pixel_noise**2
