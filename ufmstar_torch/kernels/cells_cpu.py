@@ -66,6 +66,27 @@ def _highest_over_lowest(depth, valid, index, out):
         out[k] = high / low
 
 
+def local_variance(f: Floats) -> Floats:
+    """[R, C] variance of f [R, C] among each value and its eight neighbours; beyond the edge they are repeated."""
+    out = np.empty_like(f)
+    _vary(f, out)
+    return out
+
+
+@fast
+def _vary(f, out):
+    rows, cols = f.shape
+    for i in range(rows):
+        for j in range(cols):
+            total = squares = 0.0  # of differences from the one in the middle: less is lost in rounding
+            for r in range(i - 1, i + 2):
+                for c in range(j - 1, j + 2):
+                    left = f[min(max(r, 0), rows - 1), min(max(c, 0), cols - 1)] - f[i, j]
+                    total += left
+                    squares += left * left
+            out[i, j] = squares / 9 - (total / 9) ** 2
+
+
 def read(
     depth: NDArray[Any], valid: NDArray[np.bool_], logs: NDArray[Any], claimed: NDArray[Any], nodes: Floats,
     coefficients: Floats, mean: float, size: tuple[int, int], config: PosteriorConfig,

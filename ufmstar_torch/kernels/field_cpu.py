@@ -174,7 +174,7 @@ def _eliminate(diagonal, right, down, columns, cols, window, factor):
             row[c] = window[own, c] * scale
         for k in range(WINDOW):
             other, times = window[k], row[k]
-            for c in range(_WIDTH):
+            for c in range(len(row)):  # a constant length would be unrolled, without vectors
                 other[c] -= times * row[c]
         for k in range(WINDOW):
             window[k, own] = 0.0

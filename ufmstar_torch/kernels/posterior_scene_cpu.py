@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.cells_cpu import features, ranges
+from ufmstar_torch.kernels.cells_cpu import features, local_variance, ranges
 from ufmstar_torch.kernels.field_cpu import Field, Floats, Observed, Prior, at, distance, given
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.read import LARGEST
@@ -191,10 +191,7 @@ def inlier_factor(running: Running, away: Floats) -> Floats:
 
 
 def steepness(grid: Grid, f: Floats) -> Floats:
-    padded = np.pad(f.reshape(grid.rows, grid.cols), 1, mode="edge")
-    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(len(f), 9)
-    variance: Floats = around.var(1)
-    return variance
+    return local_variance(f.reshape(grid.rows, grid.cols)).ravel()
 
 
 def elsewhere_variance(config: PosteriorConfig, around: Floats, away: Floats) -> Floats:
