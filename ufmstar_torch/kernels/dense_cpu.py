@@ -170,7 +170,7 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
     place, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
     template, patch = np.empty(WIDE * WIDE, np.float32), np.empty(COUNT, np.float32)
     along_u, along_v = np.empty(COUNT, np.float32), np.empty(COUNT, np.float32)
-    rows = np.empty((2, SIDE + 1), np.uint64)
+    rows, windows = np.empty((2, SIDE + 1), np.uint64), np.empty((LONGEST + 1, SIDE), np.uint64)
     scores, best, out = np.empty(LONGEST + 1, np.float32), np.empty(4), np.empty(6)
     for n in range(len(pixel)):
         u, v, weight = pixel[n, 0], pixel[n, 1], 0.0
@@ -192,7 +192,7 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
             if not (
                 _warped(flat, width, height, u, v, H[k], b[k], at, place, share, template)
                 and normalised(template, patch, along_u, along_v)
-                and _search(patch, key, width, height, x, y, z, b[k], low, high, rows, scores, best)
+                and _search(patch, key, width, height, x, y, z, b[k], low, high, windows, scores, best)
             ):
                 continue
             if best[2] < least_score or (first and 1 - best[3] < least_rival * (1 - best[2])):
@@ -331,7 +331,7 @@ def _copied(key, at, width, count, rows):
 
 
 @reordered_leaf
-def _search(patch, key, width, height, x, y, z, b, low, high, rows, scores, place):
+def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, place):
     """The best window between two inverse depths; its centre on the line (u, v), its ZNCC, and the ZNCC of its rival,
     the best one more than APART steps away, in ``place``. False where there is none."""
     z_low, z_high = z + low * b[2], z + high * b[2]
@@ -344,13 +344,17 @@ def _search(patch, key, width, height, x, y, z, b, low, high, rows, scores, plac
         return False
     steps = max(int(np.ceil(longest)), 1)
     du, dv = du / steps, dv / steps
-    best, at, window = np.float32(-2), -1, rows[0].view(np.uint8)
+    best, at = np.float32(-2), -1
     for s in range(steps + 1):
         left, top = int(np.floor(u_low + s * du + FIRST + 0.5)), int(np.floor(v_low + s * dv + FIRST + 0.5))
         scores[s] = -2
         if left >= 0 and top >= 0 and left + SIDE <= width and top + SIDE <= height:
-            _copied(key, top * width + left, width, SIDE, rows[0])
-            scores[s] = zncc(patch, window)
+            _copied(key, top * width + left, width, SIDE, windows[s])
+            scores[s] = 0
+    # A loop of its own: a vector of 16 bytes cannot be read until the two numbers just written there are in the cache.
+    for s in range(steps + 1):
+        if scores[s] == 0:
+            scores[s] = zncc(patch, windows[s].view(np.uint8))
             if scores[s] > best:
                 best, at = scores[s], s
     if at < 0:
