@@ -194,10 +194,10 @@ def _equations(
                 by, by_across = w * change[n, k, c], a * across_change[n, k, c]
                 mean_change[n, at] += by
                 r[at] += by * value[n, k] + by_across * across[n, k]
-                for d in range(EACH):
+                for d in range(c + 1):  # a lower triangle, which :func:`_inverse` reads
                     by_view[c, d] += by * change[n, k, d] + by_across * across_change[n, k, d]
         for c in range(EACH):
-            for d in range(EACH):
+            for d in range(c + 1):
                 A[c + (first if c < POSE else camera), d + (first if d < POSE else camera)] += by_view[c, d]
     weighted = mean_change.copy()
     for n in range(count):
