@@ -48,7 +48,7 @@ def update(
     streams = zip(*maps, _anchors(anchors, len(packed)), strict=True)
     results = each(functools.partial(_of_stream, config), list(streams))
     kept, depth, variance, outlier, inlier = (np.stack([result[i] for result in results]) for i in range(5))
-    sums = [Running.of(row, config) for row in kept]
+    sums = [result[5] for result in results]
     calibration = [r.ratios["calibration"] if r.below[-1] > 0 else np.nan for r in sums]
     unseen = [r.ratios["unseen"] for r in sums]
     outputs = [torch.from_numpy(x) for x in (depth, variance, np.array(calibration), np.array(unseen), outlier, inlier)]
@@ -66,12 +66,14 @@ def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | Non
 def _of_stream(
     config: PosteriorConfig, packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any],
     given_: AnchorRows | None,
-) -> tuple[Floats, NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:  # fmt: skip
-    """The memory after the frame; depth, variance, the probability of another surface, and the variance on its own."""
+) -> tuple[Floats, NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], Running]:  # fmt: skip
+    """The memory after the frame; depth, variance, the probability of another surface, and the variance on its own;
+    the memory's parts."""
     running, anchors = Running.of(packed, config), _NONE if given_ is None else given_
     some = len(anchors.depth) > 0
     if given_ is None and not running.frames:
-        return packed, np.where(valid, depth, np.nan).astype(depth.dtype), claimed, np.full_like(depth, np.nan), claimed
+        own = np.where(valid, depth, np.nan).astype(depth.dtype)
+        return packed, own, claimed, np.full_like(depth, np.nan), claimed, running
     with np.errstate(all="ignore"):  # what is not valid is not read
         logs = np.log(depth)
     rows, cols = (min(SIDE, n) for n in depth.shape)
@@ -94,4 +96,4 @@ def _of_stream(
     variance, inlier = second_moments(config, variance, wrong(now, share), offset, wide)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, share], 1)
     depth, spread, inlier, unseen = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
-    return kept, depth, spread, wrong(now, unseen).astype(unseen.dtype), inlier
+    return kept, depth, spread, wrong(now, unseen).astype(unseen.dtype), inlier, now

@@ -40,17 +40,17 @@ class Running(NamedTuple):
 
     @classmethod
     def of(cls, packed: Floats, config: PosteriorConfig) -> Running:
-        above, below, b, covariance = np.split(packed[2:], np.cumsum([RATIOS, RATIOS, FEATURES]))
-        covariance, priors = covariance.reshape(FEATURES, FEATURES), ratios(config)
-        value, weight, least, largest = np.array(list(priors.values())).T
+        names, (value, weight, least, largest) = _priors(config)
+        (above, below), left = packed[2 : 2 + 2 * RATIOS].reshape(2, RATIOS), packed[2 + 2 * RATIOS :]
+        b, covariance = left[:FEATURES], left[FEATURES:].reshape(FEATURES, FEATURES)
         if packed[0] == 0:
             above, below, covariance = value * weight, weight, np.diag(config.prior_variance)
         known = np.where(below > 0, above / np.maximum(below, 1e-12), value).clip(least, largest)
-        by_name = dict(zip(priors, known.tolist(), strict=True))
+        by_name = dict(zip(names, known.tolist(), strict=True))
         return cls(config, packed[0], packed[1], above, below, b, covariance, by_name)
 
     def added(self, sums: dict[str, tuple[float, float]]) -> tuple[Floats, Floats]:
-        value, weight, least, largest = np.array(list(ratios(self.config).values())).T
+        value, weight, least, largest = _priors(self.config)[1]
         memory, (above, below) = 0.5 ** (1 / self.config.half_life), np.array([sums[name] for name in self.ratios]).T
         n = memory * self.below + (1 - memory) * weight + below
         total = memory * self.above + (1 - memory) * weight * value + above
@@ -68,6 +68,13 @@ class Running(NamedTuple):
             left = (1 - walked.diagonal() / self.config.prior_variance).clip(0, 1)
             walked = walked + np.diag(self.config.drift**2 * left)
         return T @ self.coefficients, walked
+
+
+@functools.lru_cache(maxsize=4)  # of each posterior, the same for every frame
+def _priors(config: PosteriorConfig) -> tuple[tuple[str, ...], Floats]:
+    """Names of the ratios [R], and their values, weights, least and largest values [4, R]."""
+    priors = ratios(config)
+    return tuple(priors), np.array(list(priors.values())).T
 
 
 class Grid(NamedTuple):
