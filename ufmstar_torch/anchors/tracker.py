@@ -163,9 +163,9 @@ class Landmarks:
             full[0, :n] = values
             return torch.from_numpy(full).to(intrinsics.device)
 
-        valid = torch.arange(room, device=intrinsics.device)[None] < n
-        errors = [[self.pose_error], [self.shared], [self.scale]]
-        frame = torch.tensor(errors, dtype=torch.float64, device=intrinsics.device)
+        # Made by NumPy: each of torch's operations takes several times as long after a network.
+        valid = torch.from_numpy(np.arange(room)[None] < n).to(intrinsics.device)
+        frame = torch.from_numpy(np.array([[self.pose_error], [self.shared], [self.scale]])).to(intrinsics.device)
         result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, *frame)
         return result.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
