@@ -176,11 +176,11 @@ def test_a_search_along_the_last_row_reads_nothing_beyond_the_image():
     """Python checks bounds; compiled code would read memory behind the image."""
     height, width = 12, 24
     key = np.random.default_rng(0).integers(0, 256, (height, width), dtype=np.uint8)
-    rows, scores, place = np.empty((2, 9), np.uint64), np.empty(9, np.float32), np.empty(4)
+    windows, scores, place = np.empty((9, 8), np.uint64), np.empty(9, np.float32), np.empty(4)
     patch = key[-8:, 7:15].astype(np.float32).ravel()
     patch -= patch.mean()
     patch /= np.linalg.norm(patch)
     line = (6.5, height - 4.5, 1.0, np.array([8.0, 0.0, 0.0]), 0.0, 1.0)
-    assert dense_cpu._search(patch, dense_cpu.eights(key[None])[0], width, height, *line, rows, scores, place)
+    assert dense_cpu._search(patch, dense_cpu.eights(key[None])[0], width, height, *line, windows, scores, place)
     assert place[:2].tolist() == [10.5, height - 4.5]
     assert place[2] == pytest.approx(1, abs=1e-5)
