@@ -265,8 +265,8 @@ class DenseEvidence(SavedState):
         both, fine = self._memory.compare(sighted, rho[:known], variance[:known], agreed[:known])
         again, new = np.flatnonzero(agreed[:known] & fine), np.flatnonzero(agreed[known:]) + known
         self._memory.write(both.slot[again], small, both.pixel[again], both.rho[again], both.variance[again], T, K)
-        lasting = new[lasts[new]]
-        self._memory.write(None, small, pixel[lasting], rho[lasting], variance[lasting], T, K)
+        remembered = new[lasts[new]]
+        self._memory.write(None, small, pixel[remembered], rho[remembered], variance[remembered], T, K)
         rho[:known], variance[:known] = both.rho, both.variance
         kept = np.concatenate([np.flatnonzero(fine), new]) if trusted else new
         if len(kept) >= _ENOUGH:
