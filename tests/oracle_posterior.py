@@ -12,13 +12,13 @@ START = {
     "amplitude": (1.0, 20.0, 0.1, 100.0),
     "roughness": (0.0025, 20.0, 1e-4, 0.04),
     "noise": (1.0, 20.0, 0.25, 16.0),
-    "unseen": (0.1, 20.0, 0.0, 16.0),
-    "wrong": (0.03, 20.0, 0.003, 0.3),
+    "unseen": (0.06, 20.0, 0.0, 16.0),
+    "wrong": (0.02, 20.0, 0.002, 0.2),
     "inlier": (1.0, 20.0, 0.05, 4.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
-PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
-REACH, RADIUS, WEAK, CLIP, APART, OTHER = 1.0, 0.15, 0.25**2, 9.0, 0.5, 6
+PRIOR, DRIFT, MEMORY = np.array([0.4, 0.4, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
+REACH, RADIUS, NEAR, WEAK, CLIP, APART, OTHER = 1.0, 0.15, 0.05, 0.25**2, 9.0, 0.5, 6
 
 
 def start():
@@ -177,7 +177,8 @@ def update(state, depth, claimed, pixel, g, variance):
         weights = (part / total) ** 2 / count
         unit = ratio(state, name) / np.maximum(part, 1e-12)
         new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
-    new |= discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v)
+    z2 = np.minimum(residual**2 / total, CLIP)
+    new |= discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v)
     after = {"frames": state["frames"] + 1, "m0": m0, "b": mean[:4], "C": C[:4, :4], "sums": {}}
     for name, (value, prior, low, high) in START.items():
         above, below = state["sums"][name]
@@ -186,20 +187,42 @@ def update(state, depth, claimed, pixel, g, variance):
         after["sums"][name] = [min(max(above, low * below), high * below), below]
     HX = design(X, np.arange(n), n)
     spread = np.einsum("ij,jk,ik->i", HX, C, HX) + ratio(after, "roughness") + away * ratio(after, "unseen")
-    spread = spread * inlier_factor(after, away) + steepness(logs.shape, mean[FEATURES:])
+    scale = local_scale(logs.shape, node, z2, noise, np.ones(N, bool))
+    spread = scale * (spread * inlier_factor(after, away) + steepness(logs.shape, mean[FEATURES:]))
     offset, share = HX[:, 4:] @ mean[4:], away / REACH
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
-    wrong = ratio(after, "wrong")
-    alone = [second_moment(0.0, *each) for each in zip(spread, share, offset, around, strict=True)]
-    spread = [second_moment(wrong, *each) for each in zip(spread, share, offset, around, strict=True)]
-    posterior, variance, _ = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, share)
-    _, inlier, unseen = read(depth, 0 * depth, logs, mean[:4], offset, alone, share)
-    return after, posterior, variance, inlier, np.minimum(wrong * (1 + OTHER * unseen), 0.5)
+    p = np.minimum(ratio(after, "wrong") * wrong_factor(share, scale), 0.5)
+    alone = [second_moment(0.0, *each) for each in zip(spread, offset, around, strict=True)]
+    spread = [second_moment(*each) for each in zip(p, spread, offset, around, strict=True)]
+    posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, p, share)
+    _, inlier, _ = read(depth, 0 * depth, logs, mean[:4], offset, alone, p, share)
+    return after, posterior, variance, inlier, outlier
+
+
+def local_scale(shape, node, z2, noise, used):
+    """Mean z^2 over the used anchors around each node, each cell and certain anchor alike, weighted by a Gaussian of
+    ``NEAR`` of the image, and of one of z^2 = 1."""
+    out, count = np.empty(shape), np.bincount(node, minlength=shape[0] * shape[1])
+    for r in range(shape[0]):
+        for c in range(shape[1]):
+            weights, values = [1.0], [1.0]
+            for k, i in enumerate(node):
+                if used[k]:
+                    far = ((i // shape[1] - r) / shape[0]) ** 2 + ((i % shape[1] - c) / shape[1]) ** 2
+                    weights.append(math.exp(-far / NEAR**2 / 2) / (1 + noise[k] / WEAK) / count[i])
+                    values.append(z2[k])
+            out[r, c] = np.average(values, weights=weights)
+    return out.ravel()
+
+
+def wrong_factor(share, scale):
+    """By what another surface is more probable; share = distance."""
+    return (1 + OTHER * share) * scale ** np.maximum(1 - share / RADIUS, 0)
 
 
 def y_variance(shape, node, y, noise, used, centre):
     """Variance over the used anchors around each node, each cell and certain anchor alike, weighted by a Gaussian of
-    ``RADIUS`` of the image, and of one of variance .25 about ``centre``."""
+    ``RADIUS`` of the image, and of one of variance .16 about ``centre``."""
     out, count = np.empty(shape), np.bincount(node, minlength=shape[0] * shape[1])
     for r in range(shape[0]):
         for c in range(shape[1]):
@@ -210,14 +233,14 @@ def y_variance(shape, node, y, noise, used, centre):
                     weights.append(math.exp(-far / RADIUS**2 / 2) / (1 + noise[k] / WEAK) / count[i])
                     values.append(y[k])
             middle = np.average(values, weights=weights)
-            out[r, c] = (np.average((np.array(values) - middle) ** 2, weights=weights)) + 0.25 / sum(weights)
+            out[r, c] = (np.average((np.array(values) - middle) ** 2, weights=weights)) + 0.16 / sum(weights)
     return out.ravel()
 
 
-def second_moment(wrong, variance, share, offset, around):
-    """E[(e^n - 1)^2], n normal, or with the probability wrong (1 + 6 share) of n - offset; e^-offset at most 100."""
-    p, moments = min(wrong * (1 + OTHER * share), 0.5), []
-    for v, q in ((min(variance, 2), 1), (elsewhere(share, around), min(math.exp(-offset), 100))):
+def second_moment(p, variance, offset, around):
+    """E[(e^n - 1)^2], n normal, or with the probability p of n - offset; e^-offset at most 100."""
+    moments = []
+    for v, q in ((min(variance, 2), 1), (elsewhere(around), min(math.exp(-offset), 100))):
         moments.append(q * q * math.exp(2 * v) - 2 * q * math.exp(v / 2) + 1)
     return (1 - p) * moments[0] + p * moments[1]
 
@@ -237,12 +260,12 @@ def inlier_factor(state, away):
     return 1 + (ratio(state, "inlier") - 1) * np.maximum(1 - away / (2 * RADIUS), 0)
 
 
-def elsewhere(share, around):
-    """Variance of y on another surface, at a distance of ``share`` widths from the evidence."""
-    return min(around + 0.25 * min(share / RADIUS, 1), 2)
+def elsewhere(around):
+    """Variance of y on another surface."""
+    return min(around + 0.16, 2)
 
 
-def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v):
+def discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v):
     held = np.zeros(len(y), bool)
     for k in range(3):
         number = state["frames"] * 3 + k + 1
@@ -254,20 +277,22 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v):
     mean, C = condition(mean0, Q, H, y, weight * rest)
     fit, var = H @ mean, np.einsum("ij,jk,ik->i", H, C, H)
     away = distances(logs, set(node[rest]))[node]
-    error, wrong = y - fit, ratio(state, "wrong")
+    error = y - fit
     believed = np.where(held, 1 / (1 + noise / WEAK), 0.0)
     area = believed / np.maximum(np.bincount(node, believed, minlength=logs.size)[node], 1e-12)
     share, around = away / REACH, y_variance(logs.shape, node, y, noise, rest, mean[0])[node]
     offset = H[:, FEATURES:] @ mean[FEATURES:]
     factor = inlier_factor(state, away)
+    scale = local_scale(logs.shape, node, z2, noise, rest)[node]
     own = factor * (var + noise + away * ratio(state, "unseen")) + steepness(logs.shape, mean[FEATURES:])[node]
-    wide = noise + [elsewhere(*each) for each in zip(share, around, strict=True)]
-    final = [second_moment(wrong, *each) for each in zip(own, share, offset, around, strict=True)]
-    p = np.minimum(wrong * (1 + OTHER * share), 0.5)
+    own, more_wrong = scale * own, wrong_factor(share, scale)
+    wide = noise + [elsewhere(x) for x in around]
+    p = np.minimum(ratio(state, "wrong") * more_wrong, 0.5)
+    final = [second_moment(*each) for each in zip(p, own, offset, around, strict=True)]
     here, other = (1 - p) * normal(error, own), p * normal(error + offset, wide)
     here, other = here / (here + other), other / (here + other)
     return pairs(state, logs, held, node, error, var, away, noise) | {
-        "wrong": ((area * other).sum(), (area * (1 + OTHER * share)).sum()),
+        "wrong": ((area * other).sum(), (area * more_wrong).sum()),
         "inlier": ((area * here * factor * error**2 / own).sum(), (area * here).sum()),
         "calibration": ((area * error**2 / final).sum(), area.sum()),
     }
@@ -297,10 +322,10 @@ def pairs(state, logs, held, node, error, var, away, noise):
     return {"amplitude": (sums[0], sums[1]), "unseen": (sums[2], sums[3])}
 
 
-def read(depth, claimed, logs, b, offset, spread, share):
+def read(depth, claimed, logs, b, offset, spread, p, share):
     h, w = depth.shape
     rows, cols = logs.shape
-    out, variance, unseen = np.full((3, h, w), np.nan)
+    out, variance, outlier = np.full((3, h, w), np.nan)
     for i in range(h):
         for j in range(w):
             if depth[i, j] <= 0:
@@ -309,14 +334,14 @@ def read(depth, claimed, logs, b, offset, spread, share):
             y = b[0] + b[1] * (g - logs.mean()) + b[2] * (2 * u - 1) + b[3] * (2 * v - 1)
             r, c = (min(max(x * n - 0.5, 0), n - 1) for x, n in ((v, rows), (u, cols)))
             top, left = (min(int(x), max(n - 2, 0)) for x, n in ((r, rows), (c, cols)))
-            sums = np.zeros(4)
+            sums = np.zeros(5)
             for row, by_row in ((top, 1 - (r - top)), (min(top + 1, rows - 1), r - top)):
                 for col, by_col in ((left, 1 - (c - left)), (min(left + 1, cols - 1), c - left)):
                     k = row * cols + col
                     weight = by_row * by_col / (1 + ((g - logs[row, col]) / 0.1) ** 2)
-                    sums += weight * np.array([1, offset[k], spread[k], share[k]])
-            offset_, spread_, share_ = sums[1:] / sums[0]
+                    sums += weight * np.array([1, offset[k], spread[k], p[k], share[k]])
+            offset_, spread_, p_, share_ = sums[1:] / sums[0]
             out[i, j] = depth[i, j] * math.exp(min(max(y + offset_, -math.log(100)), math.log(100)))
             variance[i, j] = out[i, j] ** 2 * max(spread_, share_ * claimed[i, j] / depth[i, j] ** 2)
-            unseen[i, j] = share_
-    return out, variance, unseen
+            outlier[i, j] = p_
+    return out, variance, outlier

@@ -177,12 +177,25 @@ def test_where_the_field_jumps_the_depth_is_less_certain_than_on_either_side():
     it."""
     depth = np.full((56, 56), 2.0)
     rows, cols = (x.ravel() for x in np.mgrid[2:56:4, 2:56:4])
-    for factor, least, most in ((1.0, 0.95, 1.05), (3.0, 1.5, 10.0)):
+    for factor, least, most in ((1.0, 0.95, 1.05), (3.0, 1.5, 50.0)):
         packed, g = None, 2 * np.where(cols < 28, 1, factor)
         for _ in range(10):
             packed, out = updated(depth, (np.stack([cols, rows], -1) + 0.0, g, np.full(len(g), 1e-4)), packed=packed)
         own = (out.inlier / out.depth.square())[0, 8:-8]
         assert least < float(own[:, 24:32].mean() / own[:, 8:16].mean()) < most
+
+
+@pytest.mark.parametrize("tier", [update, posterior_cpu.update], ids=["torch", "numba"])
+def test_a_region_whose_anchors_disagree_is_less_certain_than_one_whose_anchors_agree(tier):
+    """The anchors of the right half are off by 20 %, each its own, and those of the left half as stated."""
+    depth, rng, packed = np.full((56, 56), 2.0), np.random.default_rng(0), None
+    rows, cols = (x.ravel() for x in np.mgrid[1:56:3, 1:56:3])
+    for _ in range(8):
+        g = 2 * np.exp(np.where(cols < 28, 0.02, 0.2) * rng.normal(size=len(cols)))
+        packed, out = updated(depth, (np.stack([cols, rows], -1) + 0.0, g, (0.02 * g) ** 2), packed=packed, tier=tier)
+    own = (out.inlier / out.depth.square())[0]
+    assert float(own[:, 34:].mean()) > 4 * float(own[:, :22].mean())
+    assert float(out.outlier[0, :, 34:].mean()) > 4 * float(out.outlier[0, :, :22].mean())
 
 
 def wall(error):
@@ -262,7 +275,7 @@ def test_the_probability_of_another_surface_grows_with_the_distance_from_evidenc
     pixel = np.stack([np.tile([1.0, 3.0], 14), np.repeat(np.arange(0.0, 28, 2), 2)], -1)
     _, out = updated(depth, (pixel, np.full(28, 2.2), np.full(28, 1e-4)))
     p = out.outlier[0].mean(0)
-    assert float(p[1]) == pytest.approx(MODEL.wrong, abs=4e-3)
+    assert MODEL.wrong / 10 < float(p[1]) < MODEL.wrong  # the anchors agree
     assert bool((p.diff()[4:50] > 0).all())
     assert bool((out.inlier < out.variance).all())  # what another surface would add is in the latter alone
     assert float(p.max()) <= MODEL.wrong * (1 + MODEL.other)
@@ -280,7 +293,7 @@ def test_contradictory_anchors_and_depth_that_they_pull_near_are_less_certain():
         _, out = updated(depth, (pixel, 2.0 * factor * np.ones(len(pixel)), np.full(len(pixel), 1e-3)))
         result[name] = relative(out)[24:34, 34:46].mean()
     assert result["mixed"] > 2 * result["alike"]
-    assert result["nearer"] > 1.3 * result["farther"]
+    assert result["nearer"] > 1.1 * result["farther"]
 
 
 def test_far_from_evidence_the_variance_is_larger_and_never_below_what_ufm_star_claims():
@@ -295,10 +308,10 @@ def test_far_from_evidence_the_variance_is_larger_and_never_below_what_ufm_star_
 
 
 def test_another_surface_without_evidence_is_as_uncertain_as_before_the_first_anchor():
-    around, away = np.array([0.1, 0.1, 0.1, 3.0]), np.array([0.0, MODEL.radius / 2, 1.0, 0.0])
-    expected = [0.1, 0.1 + MODEL.prior_sigma**2 / 2, 0.1 + MODEL.prior_sigma**2, MODEL.widest]
-    np.testing.assert_allclose(posterior_scene_cpu.elsewhere_variance(MODEL, around, away), expected)
-    same = elsewhere_variance(MODEL, torch.from_numpy(around), torch.from_numpy(away))
+    around = np.array([0.0, 0.1, 3.0])
+    expected = [MODEL.prior_sigma**2, 0.1 + MODEL.prior_sigma**2, MODEL.widest]
+    np.testing.assert_allclose(posterior_scene_cpu.elsewhere_variance(MODEL, around), expected)
+    same = elsewhere_variance(MODEL, torch.from_numpy(around))
     np.testing.assert_allclose(same, expected)
 
 
@@ -350,7 +363,7 @@ def test_before_the_first_anchor_of_a_source_nothing_reads_as_certain():
     share = relative(out)[frame.valid[0]]
     assert float(share.min()) > MODEL.prior_sigma**2
     assert float(share.max()) < 2
-    assert 0.9 < float(share.median().sqrt()) < 1.1
+    assert 0.5 < float(share.median().sqrt()) < 1.1
 
 
 def test_a_frame_without_anchors_keeps_the_correction_learns_nothing_and_grows_less_certain():

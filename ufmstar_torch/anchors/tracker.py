@@ -461,6 +461,7 @@ class LandmarkTracker(SavedState):
         # Hopeless geometry can make the covariance indefinite.
         independent = np.maximum(residual, config.pixel_noise**2) * one_pixel
         fine &= (variance >= 0) & (independent <= np.square(config.max_relative_sigma * safe))
+        fine &= fine.mean() >= config.min_share  # few of many: those whose errors look like parallax
         pixel = self._pixel[chosen][fine, self._view]
         shared = self.shared(self.baseline) + self._refinement.shared
         variance = variance[fine] + shared * depth[fine] ** 4

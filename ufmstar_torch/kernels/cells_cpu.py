@@ -97,23 +97,23 @@ def read(
     u = (np.arange(width) + 0.5) / width
     between = (u * cols - 0.5).clip(0, cols - 1)
     before = np.minimum(between.astype(np.int64), max(cols - 2, 0))
-    lines = np.ascontiguousarray(nodes.reshape(rows, cols, 5).transpose(0, 2, 1))
+    lines = np.ascontiguousarray(nodes.reshape(rows, cols, 6).transpose(0, 2, 1))
     left, right = lines.take(before, 2), lines.take(np.minimum(before + 1, cols - 1), 2)
-    y, spread, inlier, share = (np.empty_like(logs) for _ in range(4))
+    y, spread, inlier, p = (np.empty_like(logs) for _ in range(4))
     base = coefficients[0] - coefficients[1] * mean + coefficients[2] * (2 * u - 1)
     slopes = coefficients[1], coefficients[3]
     limits = config.edge_contrast**2, LARGEST
-    _pixels(depth, valid, logs, claimed, left, right, between - before, base, slopes, limits, y, spread, inlier, share)
+    _pixels(depth, valid, logs, claimed, left, right, between - before, base, slopes, limits, y, spread, inlier, p)
     factor = np.exp(y, out=y)
     square = factor * factor
-    return depth * factor, spread * square, inlier * square, share
+    return depth * factor, spread * square, inlier * square, p
 
 
 @with_nan
-def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limits, y, spread, inlier, shares):
-    """y [H, W], the variances of d e^y over e^2y, and the share without evidence at every pixel; NaN where not valid.
+def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limits, y, spread, inlier, outlier):
+    """y [H, W], the variances of d e^y over e^2y, and p at every pixel; NaN where not valid.
 
-    ``left`` and ``right`` [R, 5, W] are the nodes before and after each column, ``across`` by how much the one after it
+    ``left`` and ``right`` [R, 6, W] are the nodes before and after each column, ``across`` by how much the one after it
     counts. The four weights s/(1 + D^2) have the quotients of s times the other three denominators.
     """
     height, rows = len(logs), len(left)
@@ -126,7 +126,7 @@ def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limi
         below, low = at - top, min(top + 1, rows - 1)
         n0, n1, n2, n3 = left[top], right[top], left[low], right[low]
         depths, used, gs, Vs = depth[i], valid[i], logs[i], claimed[i]
-        ys, out, inside, far = y[i], spread[i], inlier[i], shares[i]
+        ys, out, inside, other = y[i], spread[i], inlier[i], outlier[i]
         for j in range(len(across)):
             g, d, V, beside = np.float64(gs[j]), np.float64(depths[j]), np.float64(Vs[j]), across[j]
             a0, a1, a2, a3 = g - n0[0, j], g - n1[0, j], g - n2[0, j], g - n3[0, j]
@@ -137,9 +137,10 @@ def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limi
             offset = w0 * n0[1, j] + w1 * n1[1, j] + w2 * n2[1, j] + w3 * n3[1, j]
             own = w0 * n0[2, j] + w1 * n1[2, j] + w2 * n2[2, j] + w3 * n3[2, j]
             here = w0 * n0[3, j] + w1 * n1[3, j] + w2 * n2[3, j] + w3 * n3[3, j]
-            unseen = w0 * n0[4, j] + w1 * n1[4, j] + w2 * n2[4, j] + w3 * n3[4, j]
+            p = w0 * n0[4, j] + w1 * n1[4, j] + w2 * n2[4, j] + w3 * n3[4, j]
+            unseen = w0 * n0[5, j] + w1 * n1[5, j] + w2 * n2[5, j] + w3 * n3[5, j]
             value = base[j] + by_depth * g + by_row * (2 * v - 1) + offset * share
             ys[j] = min(max(value, -largest), largest) if used[j] else np.nan
-            far[j] = unseen * share if used[j] else np.nan
+            other[j] = p * share if used[j] else np.nan
             out[j] = max(own * d * d, unseen * (V if V == V else 0.0)) * share
             inside[j] = here * d * d * share

@@ -26,15 +26,17 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
     elsewhere_variance,
     fitted,
     inlier_factor,
+    local_scale,
     scene_of,
     second_moments,
     spread_around,
     steepness,
-    wrong,
+    wrong_factor,
 )
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.grid import SIDE
+from ufmstar_torch.posterior.scene import MOST_WRONG
 from ufmstar_torch.posterior.update import Posterior
 
 _NONE = AnchorRows(np.empty((0, 2)), np.empty(0, np.int64), *(np.empty(0) for _ in range(3)))
@@ -89,11 +91,11 @@ def _of_stream(
     x = features(grid.log_depth - grid.mean, (node % cols + 0.5) / cols, (node // cols + 0.5) / rows)
     mean, variance = at(field, node, x)
     b, now = field.coefficients, Running.of(kept, config)
-    share, offset = away / config.reach, mean - (x * b).sum(1)
+    offset, every = mean - (x * b).sum(1), np.ones(len(scene.noise), np.bool_)
     variance = inlier_factor(now, away) * (variance + now.ratios["roughness"] + away * now.ratios["unseen"])
-    variance = variance + steepness(grid, field.offset)
-    wide = elsewhere_variance(config, spread_around(scene, np.ones(len(scene.noise), np.bool_), b[0]), away)
-    variance, inlier = second_moments(config, variance, wrong(now, share), offset, wide)
-    nodes = np.stack([grid.log_depth, offset, variance, inlier, share], 1)
-    depth, spread, inlier, unseen = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
-    return kept, depth, spread, wrong(now, unseen).astype(unseen.dtype), inlier, now
+    scale, wide = local_scale(scene, left_out, every), elsewhere_variance(config, spread_around(scene, every, b[0]))
+    p = np.minimum(now.ratios["wrong"] * wrong_factor(config, away, scale), MOST_WRONG)
+    variance, inlier = second_moments(config, scale * (variance + steepness(grid, field.offset)), p, offset, wide)
+    nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
+    depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
+    return kept, depth, spread, p, inlier, now

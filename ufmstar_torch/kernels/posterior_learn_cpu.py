@@ -13,17 +13,19 @@ from ufmstar_torch.kernels.posterior_scene_cpu import (
     away_from,
     elsewhere_variance,
     inlier_factor,
+    local_scale,
     second_moments,
     spread_around,
     steepness,
-    wrong,
+    wrong_factor,
 )
 from ufmstar_torch.posterior.learn import APART, LEAST_REST, STEPS
+from ufmstar_torch.posterior.scene import MOST_WRONG
 
 
 def learnt(scene: Scene, field: Field, weight: Floats, left_out: LeftOut, running: Running) -> Floats:
     """Packed."""
-    above, below = running.added(_of_neighbours(scene, left_out, running) | _of_discs(scene, weight, running))
+    above, below = running.added(_of_neighbours(scene, left_out, running) | _of_discs(scene, weight, left_out, running))
     first = [running.frames + 1, scene.grid.mean]
     return np.concatenate([first, above, below, field.coefficients, field.covariance.ravel()])
 
@@ -40,7 +42,9 @@ def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[st
     return sums
 
 
-def _of_discs(scene: Scene, weight: Floats, running: Running) -> dict[str, tuple[float, float]]:
+def _of_discs(
+    scene: Scene, weight: Floats, left_out: LeftOut, running: Running
+) -> dict[str, tuple[float, float]]:  # fmt: skip
     held, config = _discs(scene, running.frames), scene.config
     rest = ~held
     held = held & (np.count_nonzero(rest) >= LEAST_REST)
@@ -51,15 +55,17 @@ def _of_discs(scene: Scene, weight: Floats, running: Running) -> dict[str, tuple
     error, offset = scene.observed.value[held] - mean, mean - (x * b).sum(1)
     believed = np.where(held, scene.believed(), 0.0)
     area = (believed / np.maximum(scene.counted(believed), 1e-12))[held]
-    share, wide = away / config.reach, elsewhere_variance(config, spread_around(scene, rest, b[0])[node], away)
-    p, factor = wrong(running, share), inlier_factor(running, away)
+    wide = elsewhere_variance(config, spread_around(scene, rest, b[0])[node])
+    scale, factor = local_scale(scene, left_out, rest)[node], inlier_factor(running, away)
     own = factor * (variance + noise + away * running.ratios["unseen"]) + steepness(scene.grid, field.offset)[node]
+    own, more_wrong = scale * own, wrong_factor(config, away, scale)
+    p = np.minimum(running.ratios["wrong"] * more_wrong, MOST_WRONG)
     z2 = error**2 / own - (error + offset) ** 2 / (noise + wide)
     with np.errstate(over="ignore", divide="ignore"):  # certainly on its own surface, or never on another
         elsewhere = 1 / (1 + np.exp(-np.log(p / (1 - p)) - (np.log(own / (noise + wide)) + z2) / 2))
     stated = second_moments(config, own, p, offset, wide)[0]
     sums = {
-        "wrong": (area * elsewhere, area * (1 + config.other * share)),
+        "wrong": (area * elsewhere, area * more_wrong),
         "inlier": (area * (1 - elsewhere) * factor * error**2 / own, area * (1 - elsewhere)),
         "calibration": (area * error**2 / stated, area),
     }

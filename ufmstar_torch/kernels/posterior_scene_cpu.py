@@ -13,7 +13,7 @@ from ufmstar_torch.kernels.field_cpu import Field, Floats, Observed, Prior, at, 
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.read import LARGEST
 from ufmstar_torch.posterior.running import FEATURES, RATIOS, ratios
-from ufmstar_torch.posterior.scene import LEAST_LEFT, MOST_WRONG
+from ufmstar_torch.posterior.scene import LEAST_LEFT
 
 
 class AnchorRows(NamedTuple):
@@ -171,25 +171,39 @@ def _with_weights(scene: Scene, weight: Floats) -> tuple[Field, LeftOut]:
 
 
 def spread_around(scene: Scene, used: NDArray[np.bool_], mean: float) -> Floats:
-    each = np.where(used, scene.believed() / scene.counted(np.ones(len(scene.noise))), 0.0)
-    grid, y, width = scene.grid, scene.observed.value, scene.config.radius
-    sums = [np.bincount(scene.observed.node, x, grid.rows * grid.cols) for x in (each, each * y, each * y**2)]
-    nodes = np.stack(sums).reshape(3, grid.rows, grid.cols)
-    weight, first, second = (_window(grid.rows, width) @ nodes @ _window(grid.cols, width)).reshape(3, -1)
+    y = scene.observed.value
+    weight, first, second = _around(scene, used, scene.config.radius, y, y**2)
     middle = (first + mean) / (weight + 1)
     moment = (second + mean**2 + scene.config.prior_sigma**2) / (weight + 1)
     spread: Floats = np.maximum(moment - middle**2, 0)
     return spread
 
 
-@functools.lru_cache(maxsize=4)  # the sizes of the grid hardly change
+def local_scale(scene: Scene, left_out: LeftOut, used: NDArray[np.bool_]) -> Floats:
+    z2 = np.minimum(left_out.residual**2 / left_out.total, scene.config.clip)
+    weight, first = _around(scene, used, scene.config.near, z2)
+    scale: Floats = (first + 1) / (weight + 1)
+    return scale
+
+
+def _around(scene: Scene, used: NDArray[np.bool_], width: float, *values: Floats) -> Floats:
+    each = np.where(used, scene.believed() / scene.counted(np.ones(len(scene.noise))), 0.0)
+    grid, rows = scene.grid, (each, *(each * x for x in values))
+    nodes = np.stack([np.bincount(scene.observed.node, x, grid.rows * grid.cols) for x in rows])
+    nodes = nodes.reshape(-1, grid.rows, grid.cols)
+    sums: Floats = (_window(grid.rows, width) @ nodes @ _window(grid.cols, width)).reshape(len(nodes), -1)
+    return sums
+
+
+@functools.lru_cache(maxsize=8)  # two widths; the sizes of the grid hardly change
 def _window(count: int, width: float) -> Floats:
     at_ = np.arange(count) / count
     return np.exp(-(((at_[:, None] - at_) / width) ** 2) / 2)
 
 
-def wrong(running: Running, share: NDArray[Any]) -> NDArray[Any]:
-    return np.minimum(running.ratios["wrong"] * (1 + running.config.other * share), MOST_WRONG)
+def wrong_factor(config: PosteriorConfig, away: Floats, scale: Floats) -> Floats:
+    factor: Floats = (1 + config.other * away / config.reach) * scale ** np.maximum(1 - away / config.radius, 0)
+    return factor
 
 
 def inlier_factor(running: Running, away: Floats) -> Floats:
@@ -201,9 +215,8 @@ def steepness(grid: Grid, f: Floats) -> Floats:
     return local_variance(f.reshape(grid.rows, grid.cols)).ravel()
 
 
-def elsewhere_variance(config: PosteriorConfig, around: Floats, away: Floats) -> Floats:
-    wide = around + config.prior_sigma**2 * np.minimum(away / config.radius, 1)
-    return np.minimum(wide, config.widest)
+def elsewhere_variance(config: PosteriorConfig, around: Floats) -> Floats:
+    return np.minimum(around + config.prior_sigma**2, config.widest)
 
 
 def second_moments(

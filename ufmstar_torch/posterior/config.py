@@ -32,9 +32,10 @@ class PosteriorConfig(Checked):
         reach: distance from the evidence from which on a node has none
         discs: discs of anchors that are held out in a frame
         radius: of a disc; standard deviation of the Gaussian that weighs the anchors around a node; distance from the
-            evidence from which on another surface is as uncertain as before the first anchor
+            evidence from which on the errors of anchors do not change the probability of another surface
         wrong: probability that the local correction does not hold, at evidence, before it is learnt
         other: by how much of itself it has grown from ``reach`` on, since another surface may begin
+        near: standard deviation of the Gaussian that weighs the errors of anchors around a node
         widest: variance of y from which on the variance of the depth grows no more
         edge_contrast: difference of log d at which a node counts half at a pixel
     """
@@ -42,13 +43,13 @@ class PosteriorConfig(Checked):
     link_variance: float = number(0.0015, "v_0", "1", 0.0, open_low=True)
     edge_variance: float = number(6.0, "v_1", "1", 0.0, open_low=True)
     precision: float = number(0.5, "kappa", "1", 0.0, open_low=True)
-    prior_sigma: float = number(0.5, "sigma_b", "1", 0.0, open_low=True)
+    prior_sigma: float = number(0.4, "sigma_b", "1", 0.0, open_low=True)
     tilt_sigma: float = number(0.2, "sigma_t", "1", 0.0, open_low=True)
     drift: float = number(0.05, "tau", "1/frame^.5", 0.0)
     degrees_of_freedom: float = number(2.0, "nu", "1", 0.0, open_low=True)
     alone: float = number(1.0, "sigma_1^2", "1", 0.0)
     roughness: float = number(0.05, "sigma_0", "1", 0.0, open_low=True)
-    unseen: float = number(0.1, "g", "1/width", 0.0)
+    unseen: float = number(0.06, "g", "1/width", 0.0)
     prior_weight: float = number(20.0, "n_0", "anchors", 0.0, open_low=True)
     half_life: float = number(20.0, "ln 2/ln(1/gamma)", "frames", 0.0, open_low=True)
     clip: float = number(9.0, "c", "1", 0.0, open_low=True)
@@ -56,8 +57,9 @@ class PosteriorConfig(Checked):
     reach: float = number(1.0, "l", "width", 0.0, open_low=True)
     discs: int = number(3, "", "1", 0, 16)
     radius: float = number(0.15, "r", "width", 0.0, open_low=True)
-    wrong: float = number(0.03, "p_0", "1", 0.0, 0.5)
+    wrong: float = number(0.02, "p_0", "1", 0.0, 0.5)
     other: float = number(6.0, "p_1", "1", 0.0)
+    near: float = number(0.05, "r_1", "width", 0.0, open_low=True)
     widest: float = number(2.0, "v_2", "1", 0.0, 4.0, open_low=True)
     edge_contrast: float = number(0.1, "delta", "1", 0.0, open_low=True)
 

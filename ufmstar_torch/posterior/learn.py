@@ -22,10 +22,12 @@ from ufmstar_torch.posterior.scene import (
     away_from,
     elsewhere_variance,
     inlier_factor,
+    local_scale,
     second_moments,
     spread_around,
     steepness,
     wrong,
+    wrong_factor,
 )
 
 # Variance of the difference between neighbouring nodes, over that of the link between them: on a square lattice the
@@ -39,7 +41,7 @@ STEPS = (0.7548776662466927, 0.5698402909980532)
 
 def learnt(scene: Scene, field: Field, weight: Tensor, left_out: LeftOut, running: Running) -> Running:
     """The memory after the frame."""
-    sums = _of_neighbours(scene, left_out, running) | _of_discs(scene, weight, running)
+    sums = _of_neighbours(scene, left_out, running) | _of_discs(scene, weight, left_out, running)
     added = {name: running.added(name, *sums[name]) for name in ratios(scene.config)}
     above, below = ({name: pair[i] for name, pair in added.items()} for i in range(2))
     after = running.frames + 1, scene.grid.mean, above, below, field.coefficients, field.covariance
@@ -60,7 +62,9 @@ def _of_neighbours(scene: Scene, left_out: LeftOut, running: Running) -> dict[st
     return sums
 
 
-def _of_discs(scene: Scene, weight: Tensor, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
+def _of_discs(
+    scene: Scene, weight: Tensor, left_out: LeftOut, running: Running
+) -> dict[str, tuple[Tensor, Tensor]]:  # fmt: skip
     """Sums for all else that is learnt, from anchors whose whole region is left out."""
     held = _discs(scene, running.frames) & scene.valid
     rest = scene.valid & ~held
@@ -71,17 +75,17 @@ def _of_discs(scene: Scene, weight: Tensor, running: Running) -> dict[str, tuple
     error, b = scene.observed.value - mean, field.coefficients
     believed = torch.where(held, scene.believed(), 0.0)
     area = believed / scene.counted(believed).clamp_min(1e-12)
-    share, offset = away / scene.config.reach, mean - (scene.observed.features * b[:, None]).sum(-1)
-    around, p = torch.gather(spread_around(scene, rest, b[:, 0]), 1, scene.observed.node), wrong(running, share)
-    factor = inlier_factor(running, away)
-    own = factor * (variance + scene.noise + away * running.ratio("unseen")[:, None])
-    own = own + torch.gather(steepness(scene.grid, field.offset), 1, scene.observed.node)
-    wide = elsewhere_variance(scene.config, around, away)
+    offset = mean - (scene.observed.features * b[:, None]).sum(-1)
+    nodes = spread_around(scene, rest, b[:, 0]), local_scale(scene, left_out, rest), steepness(scene.grid, field.offset)
+    around, scale, steep = (torch.gather(x, 1, scene.observed.node) for x in nodes)
+    factor, more_wrong = inlier_factor(running, away), wrong_factor(scene.config, away, scale)
+    own = scale * (factor * (variance + scene.noise + away * running.ratio("unseen")[:, None]) + steep)
+    p, wide = wrong(running, more_wrong), elsewhere_variance(scene.config, around)
     z2 = error.square() / own - (error + offset).square() / (scene.noise + wide)
     elsewhere = torch.sigmoid(p.logit() + ((own / (scene.noise + wide)).log() + z2) / 2)
     stated = second_moments(scene.config, own, p, offset, wide)[0]
     return _of_pairs(scene, held, torch.stack([error, variance, away, scene.noise]), running) | {
-        "wrong": (total(area * elsewhere, 1), total(area * (1 + scene.config.other * share), 1)),
+        "wrong": (total(area * elsewhere, 1), total(area * more_wrong, 1)),
         "inlier": (total(area * (1 - elsewhere) * factor * error.square() / own, 1), total(area * (1 - elsewhere), 1)),
         "calibration": (total(area * error.square() / stated, 1), total(area, 1)),
     }

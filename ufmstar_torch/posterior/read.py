@@ -18,7 +18,7 @@ def read(
     depth: Tensor, valid: Tensor, claimed: Tensor, nodes: Tensor, coefficients: Tensor, mean: Tensor,
     size: tuple[int, int], config: PosteriorConfig,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Depth, variances and the share without evidence at every pixel.
+    """Depth, variances and the probability of another surface at every pixel.
 
     The four nodes around it count by their bilinear weights and by 1/(1 + (D/edge_contrast)^2); D is the difference
     between the pixel's log d and the node's.
@@ -26,16 +26,16 @@ def read(
     Args:
         depth, valid: [B, H, W].
         claimed: [B, H, W] UfM*'s variance [m^2]; times the share without evidence, it bounds the variance from below.
-        nodes: [B, n, 5] log d, y less the coefficients' part, variance over the squared depth, the same on the surface
-            of the evidence, and share without evidence.
+        nodes: [B, n, 6] log d, y less the coefficients' part, variance over the squared depth, the same on the surface
+            of the evidence, probability of another surface, and share without evidence.
         coefficients: [B, 4] of 1, log d - m_0, u, v.
         mean: [B] m_0.
         size: R and C of the nodes.
         config: of the posterior.
 
     Returns:
-        Depth d e^y [m], its variance [m^2], that on the surface of the evidence, and the share, [B, H, W] in depth's
-        dtype, NaN where not valid.
+        Depth d e^y [m], its variance [m^2], that on the surface of the evidence, and the probability, [B, H, W] in
+        depth's dtype, NaN where not valid.
     """
     rows, cols = size
     b, height, width = depth.shape
@@ -44,22 +44,22 @@ def read(
     v, u = ((torch.arange(n, dtype=d.dtype, device=d.device) + 0.5) / n for n in (height, width))
     (top, below), (left, beside) = _between(v, rows), _between(u, cols)
     total = torch.zeros_like(d)
-    sums = torch.zeros(4, *d.shape, dtype=d.dtype, device=d.device)
+    sums = torch.zeros(5, *d.shape, dtype=d.dtype, device=d.device)
     for row, by_row in ((top, 1 - below), ((top + 1).clamp_max(rows - 1), below)):
         for column, by_column in ((left, 1 - beside), ((left + 1).clamp_max(cols - 1), beside)):
-            at = nodes[:, (row[:, None] * cols + column).flatten()].view(b, height, width, 5)
+            at = nodes[:, (row[:, None] * cols + column).flatten()].view(b, height, width, 6)
             alike = 1 / (1 + ((logs - at[..., 0]) / config.edge_contrast).square())
             weight = by_row[:, None] * by_column * alike
             total = total + weight
             sums = sums + weight * at[..., 1:].permute(3, 0, 1, 2)
-    offset, variance, inlier, unseen = sums / total
+    offset, variance, inlier, p, unseen = sums / total
     c = coefficients[:, None, None].expand(b, height, width, 4).unbind(-1)
     y = c[0] + c[1] * (logs - mean[:, None, None]) + c[2] * (2 * u - 1) + c[3] * (2 * v - 1)[:, None] + offset
     corrected = d * y.clamp(-LARGEST, LARGEST).exp()
     variance = torch.maximum(variance, unseen * claimed.double() / d.square())
-    maps = corrected, corrected.square() * variance, corrected.square() * inlier, unseen
-    corrected, variance, inlier, unseen = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in maps)
-    return corrected, variance, inlier, unseen
+    maps = corrected, corrected.square() * variance, corrected.square() * inlier, p
+    corrected, variance, inlier, p = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in maps)
+    return corrected, variance, inlier, p
 
 
 def _between(x: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -134,16 +134,30 @@ def _with_weights(scene: Scene, weight: Tensor) -> tuple[Field, LeftOut]:
 def spread_around(scene: Scene, used: Tensor, mean: Tensor) -> Tensor:
     """[B, n] variance of y among the anchors of the mask [B, N] around every node, and one anchor of the prior variance
     about ``mean`` [B]."""
-    each = torch.where(used, scene.believed() / scene.counted(torch.ones_like(scene.noise)).clamp_min(1), 0.0)
-    y, (rows, cols) = scene.observed.value, scene.grid.size
-    nodes = torch.zeros(3, *scene.grid.log_depth.shape, dtype=each.dtype, device=each.device)
-    values = torch.stack([each, each * y, each * y.square()])
-    nodes = nodes.scatter_add(2, scene.observed.node.expand(3, -1, -1), values).unflatten(2, (rows, cols))
-    width = scene.config.radius
-    weight, first, second = (_window(rows, width, mean) @ nodes @ _window(cols, width, mean)).flatten(2)
+    y = scene.observed.value
+    weight, first, second = _around(scene, used, scene.config.radius, y, y.square())
     centre, prior = mean[:, None], scene.config.prior_sigma**2
     middle = (first + centre) / (weight + 1)
     return ((second + centre.square() + prior) / (weight + 1) - middle.square()).clamp_min(0)
+
+
+def local_scale(scene: Scene, left_out: LeftOut, used: Tensor) -> Tensor:
+    """[B, n] by what factor errors around every node exceed what the field predicts: the mean z^2 of the anchors of the
+    mask [B, N], each predicted from the others, and of one anchor of z^2 = 1."""
+    z2 = (left_out.residual.square() / left_out.total).clamp_max(scene.config.clip)
+    weight, first = _around(scene, used, scene.config.near, z2)
+    return (first + 1) / (weight + 1)
+
+
+def _around(scene: Scene, used: Tensor, width: float, *values: Tensor) -> Tensor:
+    """[1 + k, B, n] sums of 1 and of the k values [B, N] over the anchors of the mask [B, N], weighted by a Gaussian
+    around every node; each cell and each certain anchor counts alike."""
+    each = torch.where(used, scene.believed() / scene.counted(torch.ones_like(scene.noise)).clamp_min(1), 0.0)
+    rows, cols = scene.grid.size
+    added = torch.stack([each, *(each * x for x in values)])
+    nodes = torch.zeros(len(added), *scene.grid.log_depth.shape, dtype=each.dtype, device=each.device)
+    nodes = nodes.scatter_add(2, scene.observed.node.expand_as(added), added).unflatten(2, (rows, cols))
+    return (_window(rows, width, each) @ nodes @ _window(cols, width, each)).flatten(2)
 
 
 def _window(count: int, width: float, like: Tensor) -> Tensor:
@@ -152,9 +166,15 @@ def _window(count: int, width: float, like: Tensor) -> Tensor:
     return (-((at[:, None] - at) / width).square() / 2).exp()
 
 
-def wrong(running: Running, share: Tensor) -> Tensor:
-    """[B, n] probability that the local correction does not hold, from the share [B, n] without evidence."""
-    return (running.ratio("wrong")[:, None] * (1 + running.config.other * share)).clamp_max(MOST_WRONG)
+def wrong_factor(config: PosteriorConfig, away: Tensor, scale: Tensor) -> Tensor:
+    """[B, n] by what the probability that the local correction does not hold is multiplied: it grows with the distance
+    ``away`` [B, n] from evidence and, near it, with the local ``scale`` [B, n] of errors."""
+    return (1 + config.other * away / config.reach) * scale ** (1 - away / config.radius).clamp_min(0)
+
+
+def wrong(running: Running, factor: Tensor) -> Tensor:
+    """[B, n] probability that the local correction does not hold, from :func:`wrong_factor`."""
+    return (running.ratio("wrong")[:, None] * factor).clamp_max(MOST_WRONG)
 
 
 def inlier_factor(running: Running, away: Tensor) -> Tensor:
@@ -171,11 +191,10 @@ def steepness(grid: Grid, f: Tensor) -> Tensor:
     return unfold(padded, 3).var(1, correction=0)
 
 
-def elsewhere_variance(config: PosteriorConfig, around: Tensor, away: Tensor) -> Tensor:
-    """Variance of y on another surface than the evidence's: from ``around``, that of the anchors' y, and, with the
-    distance ``away`` from the evidence, what it was before the first anchor. At most ``widest``."""
-    wide = around + config.prior_sigma**2 * (away / config.radius).clamp_max(1)
-    return wide.clamp_max(config.widest)
+def elsewhere_variance(config: PosteriorConfig, around: Tensor) -> Tensor:
+    """Variance of y on another surface than the evidence's: ``around``, that of the anchors' y, and what it was before
+    the first anchor. At most ``widest``."""
+    return (around + config.prior_sigma**2).clamp_max(config.widest)
 
 
 def second_moments(

@@ -15,12 +15,15 @@ anchor is distributed about the prediction of the others as Student's t. What (n
 prediction's variance, with z from the leave-one-out residual, is counted as its noise: this takes outliers out. The
 difference of f across a link is Student's t in the same way, so that f may jump where the anchors say so.
 
-Variance over the squared depth at a node, with v = h (the field's variance + roughness + unseen distance) + steepness,
-and share = min(1, distance/reach):
+Variance over the squared depth at a node, with v = s (h (the field's variance + roughness + unseen distance) +
+steepness), and share = min(1, distance/reach):
 
-    max((1 - p) m(v) + p tail, share V/d^2),      p = wrong (1 + other share),      m(v) = E[(e^n - 1)^2],  n ~ N(0, v),
+    max((1 - p) m(v) + p tail, share V/d^2),      m(v) = E[(e^n - 1)^2],  n ~ N(0, v),
+    p = wrong (1 + other share) s^max(0, 1 - distance/radius),
     h = 1 + (inlier - 1) max(0, 1 - distance/(2 radius)),
 
+with s the local scale: the mean z^2 of the anchors around, each predicted from the others, in a Gaussian window of the
+width ``near``, and of one of z^2 = 1. The network errs more in some regions than in others; s says where. All this
 with what was learnt up to this frame, its held-out anchors included. ``steepness`` is the variance of f among a node
 and its neighbours: an edge of depth may lie a node from where f has it. The error of the depth is log-normal, so m
 exceeds v where v is large. p is the probability that the depth is of another surface than its evidence: ``outlier``.
@@ -34,9 +37,9 @@ variance of the error grows in proportion to it. ``learn`` learns ``unseen``, ``
 wrong or lies on another surface. Then y - b . x is normal with the variance w, and the depth log-normal:
 
     tail = E[(e^(n - f) - 1)^2] = q^2 e^(2 w) - 2 q e^(w/2) + 1,      q = e^-f <= 100,      n ~ N(0, w),
-    w = s^2 + sigma_b^2 min(1, distance/radius),
+    w = a + sigma_b^2,
 
-with s^2 the variance of the anchors' y around, of a Gaussian window. Neither v nor w exceeds ``widest``. So no pixel is
+with a the variance of the anchors' y around, of a Gaussian window. Neither v nor w exceeds ``widest``. So no pixel is
 more certain than contradictory evidence allows, another surface that has no evidence is as uncertain as before the
 first anchor, and a depth that was pulled far below the global correction is less certain than one above it.
 
@@ -65,10 +68,12 @@ from ufmstar_torch.posterior.scene import (
     elsewhere_variance,
     fitted,
     inlier_factor,
+    local_scale,
     second_moments,
     spread_around,
     steepness,
     wrong,
+    wrong_factor,
 )
 
 
@@ -130,15 +135,16 @@ def update(
     now = Running.of(kept, config)
     features, b = grid.features(), field.coefficients
     mean, variance = field.at(torch.arange(features.shape[1], device=b.device).expand_as(away), features)
-    offset, share = mean - (features * b[:, None]).sum(-1), away / config.reach
+    offset = mean - (features * b[:, None]).sum(-1)
     variance = variance + now.ratio("roughness")[:, None] + away * now.ratio("unseen")[:, None]
-    wide = elsewhere_variance(config, spread_around(scene, anchors.valid, b[:, 0]), away)
-    variance = inlier_factor(now, away) * variance + steepness(grid, field.offset)
-    variance, inlier = second_moments(config, variance, wrong(now, share), offset, wide)
-    nodes = torch.stack([grid.log_depth, offset, variance, inlier, share], -1)
+    wide = elsewhere_variance(config, spread_around(scene, anchors.valid, b[:, 0]))
+    scale = local_scale(scene, left_out, anchors.valid)
+    variance = scale * (inlier_factor(now, away) * variance + steepness(grid, field.offset))
+    p = wrong(now, wrong_factor(config, away, scale))
+    variance, inlier = second_moments(config, variance, p, offset, wide)
+    nodes = torch.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], -1)
     maps = frame.depth, frame.valid, claimed.nan_to_num()
-    depth, spread, inlier, unseen = read(*maps, nodes, b, grid.mean, grid.size, config)
-    outlier = wrong(now, unseen.flatten(1)).view_as(unseen).to(unseen.dtype)
+    depth, spread, inlier, outlier = read(*maps, nodes, b, grid.mean, grid.size, config)
     known = (some | (running.frames > 0) | given)[:, None, None]
     plain = torch.where(frame.valid, frame.depth, torch.nan)
     calibration = torch.where(now.below["calibration"] > 0, now.ratio("calibration"), torch.nan)
