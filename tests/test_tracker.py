@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 import oracle_triangulate
 import pytest
@@ -14,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from ufmstar_torch.anchors.epipolar import off_lines
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.kernels.triangulate_cpu import triangulate
 
 HERE = np.array([1000.0, -500.0, 20.0])  # far from the world's origin
@@ -141,3 +144,17 @@ def test_matches_lie_on_the_part_of_the_line_where_points_of_the_scene_are(turne
     assert abs(off(then + np.array([0, 1.5]))[0] - 1.5) < 0.3, "across the line, nearly"
     assert off(2 * seen_from(1e9 * points, before[None])[:, 0] - then)[0] > 5, "the wrong way: a baseline of 7 to 30 px"
     assert off(seen_from(1e9 * points, before[None])[:, 0])[0] > 1.5, "no motion but the rotation's"
+
+
+def test_few_corners_of_a_camera_that_turns_are_none():
+    """With a baseline of 2 cm most corners show too little parallax; those that show more owe it to their errors."""
+    tracker, used = LandmarkTracker(), []
+    for frame in islice(open_sequence("tour:832?style=blank&pan=1&frames=30&size=240x320"), 18):
+        marks = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
+        u, v = np.rint(marks.pixel).astype(int).T
+        truth = frame.depth[v, u]
+        used.append(len(truth))
+        if len(truth):
+            assert abs(np.median(np.log(marks.depth / truth)[truth > 0])) < 0.3
+    assert used[:3] == [0, 0, 0]
+    assert max(used) > 20

@@ -50,6 +50,10 @@ _FOLLOWS, _MOVES, _STILL = 0.6, 1.0, 0.2
 # Least baseline of the corners, a median, over the depth of the scene: refined poses of a camera that stands or only
 # turns are as far apart as the given ones may err.
 _PARALLAX = 0.005
+# Least share of the corners whose parallax is clear. Where fewer have it, theirs is mostly their error, and they seem
+# too near: by a factor of 7 with a share of .05, of 1.2 with .3 (a camera that turns, on tours); where the camera moves
+# it is more than half.
+_CLEAR_SHARE = 1 / 3
 # Cells of the image, in a row, that count alike in what corners show of the poses.
 _CELLS = 6
 # The median of the absolute value of a standard normal variable.
@@ -461,7 +465,7 @@ class LandmarkTracker(SavedState):
         # Hopeless geometry can make the covariance indefinite.
         independent = np.maximum(residual, config.pixel_noise**2) * one_pixel
         fine &= (variance >= 0) & (independent <= np.square(config.max_relative_sigma * safe))
-        fine &= fine.mean() >= config.min_share  # few of many: those whose errors look like parallax
+        fine &= fine.mean() >= _CLEAR_SHARE
         pixel = self._pixel[chosen][fine, self._view]
         shared = self.shared(self.baseline) + self._refinement.shared
         variance = variance[fine] + shared * depth[fine] ** 4
