@@ -17,7 +17,7 @@ START = {
     "inlier": (1.0, 20.0, 0.05, 4.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
-PRIOR, DRIFT, MEMORY = np.array([0.4, 0.4, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
+PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
 REACH, RADIUS, NEAR, WEAK, CLIP, APART, OTHER = 1.0, 0.15, 0.05, 0.25**2, 9.0, 0.5, 6
 
 
@@ -222,7 +222,7 @@ def wrong_factor(share, scale):
 
 def y_variance(shape, node, y, noise, used, centre):
     """Variance over the used anchors around each node, each cell and certain anchor alike, weighted by a Gaussian of
-    ``RADIUS`` of the image, and of one of variance .16 about ``centre``."""
+    ``RADIUS`` of the image, and of one of variance .25 about ``centre``."""
     out, count = np.empty(shape), np.bincount(node, minlength=shape[0] * shape[1])
     for r in range(shape[0]):
         for c in range(shape[1]):
@@ -233,7 +233,7 @@ def y_variance(shape, node, y, noise, used, centre):
                     weights.append(math.exp(-far / RADIUS**2 / 2) / (1 + noise[k] / WEAK) / count[i])
                     values.append(y[k])
             middle = np.average(values, weights=weights)
-            out[r, c] = (np.average((np.array(values) - middle) ** 2, weights=weights)) + 0.16 / sum(weights)
+            out[r, c] = (np.average((np.array(values) - middle) ** 2, weights=weights)) + 0.25 / sum(weights)
     return out.ravel()
 
 
@@ -262,7 +262,7 @@ def inlier_factor(state, away):
 
 def elsewhere(around):
     """Variance of y on another surface."""
-    return min(around + 0.16, 2)
+    return min(around + 0.12, 2)
 
 
 def discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v):

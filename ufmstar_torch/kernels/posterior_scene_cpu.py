@@ -216,7 +216,7 @@ def steepness(grid: Grid, f: Floats) -> Floats:
 
 
 def elsewhere_variance(config: PosteriorConfig, around: Floats) -> Floats:
-    return np.minimum(around + config.prior_sigma**2, config.widest)
+    return np.minimum(around + config.elsewhere, config.widest)
 
 
 def second_moments(

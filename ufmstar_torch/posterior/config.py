@@ -35,6 +35,7 @@ class PosteriorConfig(Checked):
             evidence from which on the errors of anchors do not change the probability of another surface
         wrong: probability that the local correction does not hold, at evidence, before it is learnt
         other: by how much of itself it has grown from ``reach`` on, since another surface may begin
+        elsewhere: variance of y on another surface than the evidence's, beyond that of the anchors' y around
         near: standard deviation of the Gaussian that weighs the errors of anchors around a node
         widest: variance of y from which on the variance of the depth grows no more
         edge_contrast: difference of log d at which a node counts half at a pixel
@@ -43,7 +44,7 @@ class PosteriorConfig(Checked):
     link_variance: float = number(0.0015, "v_0", "1", 0.0, open_low=True)
     edge_variance: float = number(6.0, "v_1", "1", 0.0, open_low=True)
     precision: float = number(0.5, "kappa", "1", 0.0, open_low=True)
-    prior_sigma: float = number(0.4, "sigma_b", "1", 0.0, open_low=True)
+    prior_sigma: float = number(0.5, "sigma_b", "1", 0.0, open_low=True)
     tilt_sigma: float = number(0.2, "sigma_t", "1", 0.0, open_low=True)
     drift: float = number(0.05, "tau", "1/frame^.5", 0.0)
     degrees_of_freedom: float = number(2.0, "nu", "1", 0.0, open_low=True)
@@ -59,6 +60,7 @@ class PosteriorConfig(Checked):
     radius: float = number(0.15, "r", "width", 0.0, open_low=True)
     wrong: float = number(0.02, "p_0", "1", 0.0, 0.5)
     other: float = number(6.0, "p_1", "1", 0.0)
+    elsewhere: float = number(0.12, "v_3", "1", 0.0)
     near: float = number(0.05, "r_1", "width", 0.0, open_low=True)
     widest: float = number(2.0, "v_2", "1", 0.0, 4.0, open_low=True)
     edge_contrast: float = number(0.1, "delta", "1", 0.0, open_low=True)

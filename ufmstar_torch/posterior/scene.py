@@ -192,9 +192,9 @@ def steepness(grid: Grid, f: Tensor) -> Tensor:
 
 
 def elsewhere_variance(config: PosteriorConfig, around: Tensor) -> Tensor:
-    """Variance of y on another surface than the evidence's: ``around``, that of the anchors' y, and what it was before
-    the first anchor. At most ``widest``."""
-    return (around + config.prior_sigma**2).clamp_max(config.widest)
+    """Variance of y on another surface than the evidence's: that of the anchors' y ``around`` and
+    ``elsewhere``, at most ``widest``."""
+    return (around + config.elsewhere).clamp_max(config.widest)
 
 
 def second_moments(

@@ -37,11 +37,11 @@ variance of the error grows in proportion to it. ``learn`` learns ``unseen``, ``
 wrong or lies on another surface. Then y - b . x is normal with the variance w, and the depth log-normal:
 
     tail = E[(e^(n - f) - 1)^2] = q^2 e^(2 w) - 2 q e^(w/2) + 1,      q = e^-f <= 100,      n ~ N(0, w),
-    w = a + sigma_b^2,
+    w = a + elsewhere,
 
 with a the variance of the anchors' y around, of a Gaussian window. Neither v nor w exceeds ``widest``. So no pixel is
-more certain than contradictory evidence allows, another surface that has no evidence is as uncertain as before the
-first anchor, and a depth that was pulled far below the global correction is less certain than one above it.
+more certain than contradictory evidence allows, and a depth that was pulled far below the global correction is less
+certain than one above it.
 
 A stream that is given anchors of which none was valid so far has that variance without evidence, about the network's
 depth: nothing was measured, and nothing reads as certain. A stream without anchors is UfM*'s.
