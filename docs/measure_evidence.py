@@ -9,8 +9,8 @@ error; and the processor time of a frame [ms].
     python docs/measure_evidence.py --weights fastdepth_nyu.onnx --frames 30 SEQUENCE ...
 
 prints for each defect and sequence, of FastDepth with the posterior from dense evidence: RMSE over the network's /
-root mean square z / percent of pixels beyond 3 sigma / ``calibration`` / the median ``pose_error`` [px]. The first
-frames, in which nothing has parallax, do not count.
+root mean square z / the same within .05 image widths of an anchor / percent of pixels beyond 3 sigma / ``calibration``
+/ the median ``pose_error`` [px]. The first frames, in which nothing has parallax, do not count.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
-from ufmstar_torch.anchors import landmark_source
+from ufmstar_torch.anchors import Anchors, landmark_source
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed, rotation
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.sequences.frame import Frame
@@ -41,6 +41,7 @@ from ufmstar_torch.models.network import DepthNetwork
 
 GRID, NORMAL = 28, 0.674  # the median of |z| of a standard normal variable
 FIRST, STRIDE = 5, 4  # judged are every fourth pixel of every fourth row from the sixth frame on
+NEAR = 0.05  # image widths from an anchor
 Frames = list[Frame]
 
 
@@ -156,7 +157,8 @@ def predicted(frame: Frame, network: DepthNetwork) -> tuple[Tensor, Tensor, NDAr
 def judged(frames: Frames, predictions: list[tuple[Tensor, Tensor, NDArray[np.float32]]]) -> str:
     """A cell of the second table."""
     config = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
-    ufm, source, network, z, errors, calibration, pose = UfMStar(config), landmark_source("dense"), [], [], [], [], []
+    ufm, source, network, z, near, errors = UfMStar(config), landmark_source("dense"), [], [], [], []
+    calibration, pose = [], []
     for i, (frame, (depth, K, truth)) in enumerate(zip(frames, predictions, strict=True)):
         marks = source.update(frame.image, frame.T_world_cam, frame.intrinsics).anchors(frame.intrinsics, K)
         out = ufm(depth, torch.from_numpy(frame.T_world_cam)[None], K, anchors=marks)
@@ -168,13 +170,25 @@ def judged(frames: Frames, predictions: list[tuple[Tensor, Tensor, NDArray[np.fl
         network.append(np.square(d - t)[known])
         errors.append(np.square(g - t)[known])
         z.append((np.square(g - t) / V)[known])
+        near.append(close(marks, depth)[::STRIDE, ::STRIDE].ravel()[known])
         calibration.append(float(out.statistics.calibration[0]))
         pose.append(float(out.statistics.pose_error[0]))
     squares = np.concatenate(z)
     ratio = (np.concatenate(errors).mean() / np.concatenate(network).mean()) ** 0.5
     shown = [x[np.isfinite(x)] for x in (np.array(calibration[-10:]), np.array(pose))]
     rest = [f"{np.median(x):.1f}" if len(x) else "–" for x in shown]
-    return " / ".join([f"{ratio:.2f}", f"{squares.mean() ** 0.5:.1f}", f"{100 * (squares > 9).mean():.0f}", *rest])
+    beside = squares[np.concatenate(near)]
+    rms = [f"{x.mean() ** 0.5:.1f}" if len(x) else "–" for x in (squares, beside)]
+    return " / ".join([f"{ratio:.2f}", *rms, f"{100 * (squares > 9).mean():.0f}", *rest])
+
+
+def close(marks: Anchors, depth: Tensor) -> NDArray[np.bool_]:
+    """Pixels [h, w] of a depth map [1, h, w] that have an anchor nearby."""
+    height, width = depth.shape[1:]
+    u, v = np.rint(marks.pixel[0][marks.valid[0]].numpy()).astype(int).T if marks.valid is not None else ([], [])
+    free = np.full((height, width), 1, np.uint8)
+    free[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)] = 0
+    return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, 5) < NEAR * width) & bool((free == 0).any())
 
 
 def main() -> None:

@@ -383,16 +383,22 @@ def test_a_frame_without_anchors_keeps_the_correction_learns_nothing_and_grows_l
 
 
 def test_poses_that_contradict_the_images_make_a_stream_forget():
-    """Of two streams, the poses of the second contradict its images: its depth is the network's again."""
+    """Of two streams, the poses of the second contradict its images: its depth is the network's again, as uncertain as
+    at the start, and how far the network errs remains known."""
     ufm = UfMStar(CONFIG)
     for depth, T, anchors in ufm_frames(streams=2):
         ufm(depth, T, K, anchors=anchors)
+    before = Running.of(ufm.posterior, MODEL)
     shared, none = torch.tensor([0.0, torch.inf]), torch.zeros(anchors.depth.shape, dtype=torch.bool)
     out = ufm(depth, T, K, anchors=dataclasses.replace(anchors, valid=none, shared=shared))
     kept, forgotten = ((out.posterior()[0][i] / depth[i])[out.valid[i]] for i in range(2))
     assert 1.1 < float(kept.median()) < 2
     torch.testing.assert_close(forgotten, torch.ones_like(forgotten))
-    assert ufm.posterior.any(1).tolist() == [True, False]
+    after = Running.of(ufm.posterior, MODEL)
+    assert after.coefficients.any(1).tolist() == [True, False]
+    torch.testing.assert_close(after.covariance[1].diag(), torch.tensor(MODEL.prior_variance, dtype=torch.float64))
+    assert all(torch.equal(after.ratio(name), before.ratio(name)) for name in before.above)
+    assert bool((out.posterior()[1][1].nanmean().sqrt() > 0.5 * depth.mean()).all())
 
 
 def test_state_saved_and_loaded_goes_on_to_the_bit():

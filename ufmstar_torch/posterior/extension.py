@@ -15,7 +15,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.extension import Extension, FrameExtension, Tensors, Total
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.output import StepOutput
-from ufmstar_torch.posterior.running import SIZE, Running
+from ufmstar_torch.posterior.running import SIZE, Running, restarted
 from ufmstar_torch.posterior.update import Posterior, PosteriorUpdate
 from ufmstar_torch.state import UfMStarState
 
@@ -39,7 +39,8 @@ class PosteriorFrame(FrameExtension):
         claimed = total(out.disagreement).detach()
         frame, anchors, packed = self._anchors.frame, self._anchors.anchors, state.by_stream["posterior"]
         if anchors is not None and anchors.shared is not None:  # the poses contradict the images, for an unknown time
-            packed = packed.masked_fill(anchors.shared.isinf()[:, None], 0)
+            start = restarted(packed, self._config.posterior)
+            packed = torch.where(anchors.shared.isinf()[:, None], start, packed)
         learnt, posterior = self._update(packed, frame, anchors, claimed, self._config.posterior)
         more = torch.zeros_like(posterior.variance)
         if anchors is not None and anchors.contradiction is not None:  # most are off by more than a factor of 100

@@ -52,6 +52,14 @@ RATIOS = len(ratios(PosteriorConfig()))
 SIZE = 2 + 2 * RATIOS + FEATURES + _MATRIX
 
 
+def restarted(packed: Tensor, config: PosteriorConfig) -> Tensor:
+    """Memory [B, SIZE] with the coefficients of the start: where poses were wrong, the coefficients may be. The ratios
+    remain: they depend on network and scene. Zeros before the first anchor."""
+    P = torch.diag(packed.new_tensor(config.prior_variance)).flatten()
+    start = torch.cat([packed.new_zeros(FEATURES), P]) * (packed[:, :1] > 0)
+    return torch.cat([packed[:, : -FEATURES - _MATRIX], start], 1)
+
+
 @dataclass(frozen=True)
 class Running:
     """The posterior's memory of B streams.
