@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numba
@@ -20,6 +20,7 @@ from ufmstar_torch import UfMStar, UfMStarConfig, gaussian
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.frame import CheckKernel
 from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, regress_cpu, rigid_cpu, segment_cpu
+from ufmstar_torch.kernels.host import moved
 from ufmstar_torch.kernels.select import select_check, select_kernels
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput
@@ -83,17 +84,6 @@ def make_backend(name: str) -> Backend:
 def compiled(part: Callable[..., Any]) -> Callable[..., Any]:
     """A part of compiled kernels as a function that Python calls."""
     return numba.njit(lambda *arguments: part(*arguments))
-
-
-def moved(value: Any, device: str) -> Any:
-    """Tensors, and dataclasses and tuples of them, on a device."""
-    if isinstance(value, torch.Tensor):
-        return value.to(device)
-    if isinstance(value, tuple):
-        return tuple(moved(part, device) for part in value)
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{f.name: moved(getattr(value, f.name), device) for f in fields(value)})
-    return value
 
 
 def _on(device: str, kernel: Callable[..., Any]) -> Any:

@@ -13,8 +13,10 @@ from modules import same
 from walks import SPGF, walks
 
 import scenes
-from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.capture import Captured
+from ufmstar_torch.stream_warnings import EVERY
 
 pytestmark = [
     pytest.mark.gpu,
@@ -31,17 +33,18 @@ def frames(streams: int, count: int):
     return [present[i % len(present)] for i in range(count)]
 
 
+@pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype:UserWarning")
 @pytest.mark.parametrize("growing", [False, True])
-def test_a_thousand_frames_without_a_synchronisation_and_with_flat_memory(growing):
+def test_a_thousand_frames_with_flat_memory_and_no_synchronisation_but_of_the_warnings(growing):
     settings = {"on_bad_frame": "skip", "initial_capacity": 8} if growing else FIXED
     ufm, given = UfMStar(UfMStarConfig(segment=SPGF, **settings)), frames(2, 16)
     for frame in given:
         ufm(*frame)
     torch.cuda.synchronize()
     before = torch.cuda.memory_allocated()
-    torch.cuda.set_sync_debug_mode("error")
     try:
-        for i in range(1000):
+        for i in range(16, 1016):
+            torch.cuda.set_sync_debug_mode("default" if (i + 1) % EVERY == 0 else "error")
             ufm(*given[i % 16])
     finally:
         torch.cuda.set_sync_debug_mode("default")
@@ -68,6 +71,8 @@ def test_256_streams_equal_themselves_alone_and_leave_each_other_alone():
 
 def test_the_graph_equals_the_step():
     ufm, given = UfMStar(UfMStarConfig(segment=SPGF, **FIXED)), frames(2, 12)
+    for _ in range(EVERY - 1):  # the capture is the frame in which the warnings look
+        ufm(*given[0])
     plain = copy.deepcopy(ufm)
     captured = Captured(ufm, *given[0])
     for i, frame in enumerate(given):
@@ -90,6 +95,26 @@ def test_large_images(size):
         a, b = gpu(*(v.cuda() for v in given)), cpu(*given)
         torch.testing.assert_close(a.variance.cpu(), b.variance, rtol=1e-3, atol=1e-6, equal_nan=True)
     assert a.variance.shape == (1, *size)
+
+
+def test_the_posterior_equals_the_cpu_s():
+    """It runs on the host; the evidence of anchors, which it needs, does not."""
+    config = UfMStarConfig(segment=SPGF, anchors=AnchorConfig(), posterior=PosteriorConfig())
+    gpu, cpu = UfMStar(config), UfMStar(config)
+    generator = torch.Generator().manual_seed(0)
+    for depth, pose, K in [f[:3] for f in walks(2, 5)]:
+        v, u = (torch.randint(0, size, (2, 40), generator=generator) for size in depth.shape[1:])
+        z = torch.stack([one[row, column] for one, row, column in zip(depth, v, u, strict=True)]) * 1.2
+        anchors = Anchors(torch.stack([u, v], -1).to(depth), z, 1e-3 * z.square())
+        a, b = (
+            gpu(depth.cuda(), pose.cuda(), K.cuda(), anchors=anchors.to("cuda")),
+            cpu(depth, pose, K, anchors=anchors),
+        )
+        for name in ("posterior_depth", "posterior_variance", "posterior_outlier"):
+            found = getattr(a, name)
+            assert found.is_cuda
+            torch.testing.assert_close(found.cpu(), getattr(b, name), rtol=1e-3, atol=1e-5, equal_nan=True)
+    assert (b.posterior_depth / depth).nanmedian() > 1.1
 
 
 def test_networks_on_the_gpu_and_ufmstar_on_the_cpu():

@@ -50,7 +50,8 @@ def test_seam():
     assert select.select_step("auto", "cpu") is compiled is step_cpu.step
     assert select.select_check("auto", "cpu") is check_cpu.check_values
     assert select.select_posterior("auto", "cpu") is posterior_cpu.update
-    assert select.select_posterior("torch", "cpu") is select.select_posterior("auto", "cuda") is update_posterior
+    assert select.select_posterior("torch", "cpu") is select.select_posterior("torch", "cuda") is update_posterior
+    assert select.select_posterior("auto", "cuda") not in (update_posterior, posterior_cpu.update), "on the host"
     for device in ("cpu", "cuda"):
         assert select.select_kernels("torch", device) is select.select_step("torch", device).keywords["kernels"]
         assert select.select_kernels("torch", device) is REFERENCE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -105,7 +106,7 @@ def test_a_walk_agrees_with_the_oracle(backend, variant):
 
 CONFIGS = {
     "default": UfMStarConfig(segment=SMALL),
-    "paper": UfMStarConfig.paper().replace(segment=SMALL),
+    "paper": UfMStarConfig.paper().replace(segment=replace(SMALL, slope_focal="camera")),
     "overlap": UfMStarConfig(segment=SMALL, disagreement="overlap", overlap_weighted=True, unmeasured="relative"),
     "full": UfMStarConfig(segment=SMALL, features=2, max_components=12, initial_capacity=3, unmeasured="nan"),
     "anchored": UfMStarConfig(segment=SMALL, anchors=AnchorConfig(), unmeasured="nan", prior_mean=0.2),

@@ -225,7 +225,8 @@ def test_the_cap_holds_and_covariances_stay_positive(cap, seed):
         assert torch.linalg.eigvalsh(cloud.covariance).min() > -1e-12
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device, torch sees none")
 def test_gpu_equals_cpu():
     maps = variances()
     a, b = UfM(CAP, dtype=torch.float64), UfM(CAP, dtype=torch.float64)

@@ -134,15 +134,19 @@ class SPGFConfig(Checked):
             reference_width=width,
         )
 
+    @property
+    def fixed_slope(self) -> bool:
+        """Whether :meth:`slope` is the same for every camera."""
+        return self.scale_with_image and self.slope_focal == "reference"
+
     def slope(self, focal: Any) -> Any:
         """a/f [1/m], the factor of z^2 in t = a z^2 / f, of a config for this image (:meth:`scaled_to`).
 
         Args:
-            focal: min(fx, fy) of the image [px], a number or a tensor. With ``scale_with_image`` and ``slope_focal ==
-                "reference"`` the quotient is a/f_ref whatever it is.
+            focal: min(fx, fy) of the image [px], a number or a tensor; with :attr:`fixed_slope` the quotient is a/f_ref
+                whatever it is.
         """
-        fixed = self.scale_with_image and self.slope_focal == "reference"
-        scale = focal / self.reference_focal if fixed else 1.0
+        scale = focal / self.reference_focal if self.fixed_slope else 1.0
         return self.adaptive_thresh_scale * scale / focal
 
 

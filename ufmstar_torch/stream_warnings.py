@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
@@ -26,8 +27,8 @@ _OUTSIDE, _WIDE = 0.1, 10.0
 _ZOOM, _JUMP, _AWAY, _CHANGE = 1.2, 10.0, 2.0, 0.1
 # Of the depth maps every so many rows are looked at.
 _ROWS = 8
-# On an accelerator reading the counts waits: every so many frames.
-_EVERY = 64
+# On an accelerator reading the counts waits for it: every so many frames, and not while a graph is recorded.
+EVERY = 64
 LOGGER = logging.getLogger("ufmstar_torch")
 _CAUSES = (
     "Likely causes: poses or depth in another unit (millimetres, a scale of their own), world-to-camera poses, axes of "
@@ -132,11 +133,11 @@ class StreamWarnings:
         anchors that do not go together; ``frames`` [B] counts those used."""
         device = frame.depth.device.type
         self._calls += 1
-        if device == "meta" or (device != "cpu" and self._calls % _EVERY):
+        if device == "meta" or (device != "cpu" and (self._calls % EVERY or torch.cuda.is_current_stream_capturing())):
             return
         for b, kind, text in (
             *_left_out(frame, statistics, frames, config),
-            *(_wide(frame) if self._calls % _EVERY in (0, 1) else ()),
+            *(_wide(frame) if self._calls % EVERY in (0, 1) else ()),
             *_alone(statistics, frames),
             *self._tracked(frame, statistics),
         ):

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import functools
 import warnings
-from dataclasses import fields, replace
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import replace
+from typing import Protocol, runtime_checkable
 
 import torch
-from torch import Tensor
 
 from ufmstar_torch.anchors.extension import REFERENCE as ANCHOR_REFERENCE
 from ufmstar_torch.anchors.extension import AnchorKernels
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import CheckKernel, check_values
-from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.kernels.host import on_host
 from ufmstar_torch.posterior.update import PosteriorUpdate
 from ufmstar_torch.posterior.update import update as update_posterior
-from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import Step, step
-from ufmstar_torch.step_parts import REFERENCE, Kernels, SegmentKernel
+from ufmstar_torch.step_parts import REFERENCE, Kernels
 
 _TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
 _LEAST_CAPABILITY = (8, 0)  # of an NVIDIA GPU that triton supports
@@ -91,7 +89,7 @@ def select_kernels(name: str, device_type: str) -> Kernels:
         return REFERENCE
     from ufmstar_torch.kernels import segment_cpu
 
-    return replace(REFERENCE, spgf=_on_host(segment_cpu.segment))
+    return replace(REFERENCE, spgf=on_host(segment_cpu.segment))
 
 
 def _compiled(name: str, device_type: str) -> bool:
@@ -117,13 +115,14 @@ def _on_gpu(name: str, device_type: str) -> bool:
 
 
 def select_posterior(name: str, device_type: str) -> PosteriorUpdate:
-    """The posterior's update for a device; arguments and errors as :func:`select_step`. An accelerator takes the
-    reference."""
-    if not _compiled(name, device_type):
+    """The posterior's update for a device; arguments and errors as :func:`select_step`. For tensors of an accelerator
+    it runs on the host, where numba can be imported."""
+    compiled = _compiled(name, device_type)
+    if not compiled and (name == "torch" or device_type in ("cpu", "meta") or not has_numba()):
         return update_posterior
     from ufmstar_torch.kernels import posterior_cpu
 
-    return posterior_cpu.update
+    return posterior_cpu.update if compiled else on_host(posterior_cpu.update)
 
 
 @functools.cache
@@ -173,15 +172,3 @@ def compile_triangulation() -> None:
     poses = np.stack([np.eye(4)] * 2)
     poses[1, 0, 3] = 1.0
     triangulate(np.array([[[0.5, 0.0], [-0.5, 0.0]]]), np.ones((1, 2), np.bool_), poses, np.eye(3))
-
-
-def _on_host(kernel: SegmentKernel) -> SegmentKernel:
-    """A CPU segmentation for tensors of another device."""
-
-    def moved(given: SegmentInput) -> tuple[GaussianMixture, Tensor]:
-        tensors = {f.name: getattr(given, f.name) for f in fields(given)}
-        on_host: dict[str, Any] = {n: v.cpu() if isinstance(v, Tensor) else v for n, v in tensors.items()}
-        mixture, labels = kernel(SegmentInput(**on_host))
-        return mixture.to(given.depth.device), labels.to(given.depth.device)
-
-    return moved

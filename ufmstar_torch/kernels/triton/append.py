@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
-from ufmstar_torch.kernels.triton.matrices import load_symmetric, moved, store_symmetric, turned
+from ufmstar_torch.kernels.triton.matrices import exact, load_symmetric, moved, store_symmetric, turned
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.state import UfMStarState
 
@@ -156,8 +156,8 @@ def _append(
         if again:
             new = valid & flag
         else:
-            new = valid & (z > near_plane) & ~flag
-            dropped += tl.sum((valid & (z <= near_plane)).to(tl.int32), 0)
+            new = valid & (z > exact(near_plane, z)) & ~flag
+            dropped += tl.sum((valid & (z <= exact(near_plane, z))).to(tl.int32), 0)
             matched += tl.sum((valid & flag).to(tl.int32), 0)
         segments += tl.sum(valid.to(tl.int32), 0)
         slot = n + tl.cumsum(new.to(tl.int32), 0) - 1

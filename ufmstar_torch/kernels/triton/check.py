@@ -19,6 +19,7 @@ from ufmstar_torch.frame import (
     pose_fault,
 )
 from ufmstar_torch.kernels.triton.launch import launch
+from ufmstar_torch.kernels.triton.matrices import exact
 
 
 def check_values(
@@ -109,13 +110,13 @@ def _camera(
     fault = 0
     # From the last check to the first: the first that fails is the fault.
     fault = tl.where((tl.minimum(cx, cy) < -0.5) | (cx > width - 0.5) | (cy > height - 0.5), 9, fault)
-    fault = tl.where((least < shortest) | (most > longest), 8, fault)
+    fault = tl.where((least < exact(shortest, least)) | (most > exact(longest, most)), 8, fault)
     fault = tl.where(_some(zeros & (k != 0)) | (tl.load(K + 8) != 1) | (focal_x <= 0) | (focal_y <= 0), 6, fault)
     fault = tl.where(_some(k - k != 0), 5, fault)
-    fault = tl.where(_some(shift & (tl.abs(t) > farthest)), 7, fault)
+    fault = tl.where(_some(shift & (tl.abs(t) > exact(farthest, t))), 7, fault)
     fault = tl.where(determinant < 0, 4, fault)
-    fault = tl.where(apart > tolerance, 3, fault)
-    fault = tl.where(_some((entry >= 12) & (last > tolerance)), 2, fault)
+    fault = tl.where(apart > exact(tolerance, apart), 3, fault)
+    fault = tl.where(_some((entry >= 12) & (last > exact(tolerance, last))), 2, fault)
     fault = tl.where(_some(t - t != 0), 1, fault)
     tl.store(faults + stream, fault)
 
@@ -158,18 +159,18 @@ def _maps(
     given = inside & (z > 0) & (z < float("inf")) & (tl.load(faults + b) == 0)
     if masked:
         given = given & (tl.load(mask + at, mask=inside, other=0) != 0)
-    beyond = given & (z > max_depth)
-    near = given & (z <= max_depth)
-    use = near & (z >= nearest) & (z <= deepest)
+    beyond = given & (z > exact(max_depth, z))
+    near = given & ~beyond
+    use = near & (z >= exact(nearest, z)) & (z <= exact(deepest, z))
     if a_given:
         own = tl.load(aleatoric + at, mask=inside, other=0.0)
-        use = use & (own >= 0) & (own <= largest)
+        use = use & (own >= 0) & (own <= exact(largest, own))
     if e_given:
         own = tl.load(epistemic + at, mask=inside, other=0.0)
-        use = use & (own >= 0) & (own <= largest)
+        use = use & (own >= 0) & (own <= exact(largest, own))
     for channel in tl.static_range(channels):
         value = tl.load(features + (b * channels + channel) * pixels + i, mask=inside, other=0.0)
-        use = use & (tl.abs(value) <= largest)
+        use = use & (tl.abs(value) <= exact(largest, value))
     tl.store(safe + at, tl.where(use, z, 0.0), mask=inside)
     tl.store(valid + at, use, mask=inside)
     tl.atomic_add(counts + b, tl.sum(beyond.to(tl.int32), 0))

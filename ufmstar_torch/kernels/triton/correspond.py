@@ -18,7 +18,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.triton.launch import launch
-from ufmstar_torch.kernels.triton.matrices import load_symmetric, lowest_bit, moved, turned
+from ufmstar_torch.kernels.triton.matrices import exact, load_symmetric, lowest_bit, moved, turned
 from ufmstar_torch.mixture import GaussianMixture
 
 WORD = 32  # candidates c in one entry of ``Pairs.bits``
@@ -164,7 +164,7 @@ def _project_listed(
         if turn:
             x, y, z = moved(R, t, x, y, z)
             xx, xy, xz, yy, yz, zz = turned(R, xx, xy, xz, yy, yz, zz)
-        there = there & (z > near_plane)
+        there = there & (z > exact(near_plane, z))
         z = tl.where(there, z, 1.0)
         u, v = fx * x / z + cx, fy * y / z + cy
         seen = there & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
@@ -245,7 +245,7 @@ def _match(
             there = first + lane < n_c
             u_c, v_c, xx_c, xy_c, yy_c = _listed(image_c, many_c, first + lane, there)
             beta = _overlap(u_c, v_c, xx_c, xy_c, yy_c, u, v, xx, xy, yy)
-            member = there & (beta >= eta)
+            member = there & (beta >= exact(eta, beta))
             if tl.sum(member.to(tl.int32), 0) > 0:
                 hidden = lane < 0
                 for start in range(0, n_k, chunk):
@@ -253,13 +253,14 @@ def _match(
                     u_h, v_h, xx_h, xy_h, yy_h = _listed(image_k, many_k, start + lane, some)
                     z_h = tl.load(image_k + 5 * many_k + start + lane, mask=some, other=0.0)
                     hides = some & (z_h < z)
-                    hides = hides & (_overlap(u_h, v_h, xx_h, xy_h, yy_h, u, v, xx, xy, yy) > eta_occlusion)
+                    over = _overlap(u_h, v_h, xx_h, xy_h, yy_h, u, v, xx, xy, yy)
+                    hides = hides & (over > exact(eta_occlusion, over))
                     left = tl.sum(tl.where(hides, one << lane.to(tl.int64), 0), 0)
                     while left != 0:
                         bit, left = lowest_bit(left)
                         u_o, v_o, xx_o, xy_o, yy_o = _listed(image_k, many_k, start + bit, True)
                         other = _overlap(u_c, v_c, xx_c, xy_c, yy_c, u_o, v_o, xx_o, xy_o, yy_o)
-                        hidden = hidden | (other >= eta)
+                        hidden = hidden | (other >= exact(eta, other))
                 member = member & ~hidden
             found += tl.sum(member.to(tl.int32), 0)
             c = tl.load(index_c + b * many_c + first + lane, mask=there, other=0)

@@ -13,6 +13,12 @@ _SWEEPS = tl.constexpr(6)  # of cyclic Jacobi; gaussian._SWEEPS is enough, one m
 
 
 @triton.jit
+def exact(number: tl.constexpr, like):
+    """A constant in the precision of another value. Triton 3.6 rounds it to float32 in a comparison or a maximum."""
+    return tl.full([], number, like.dtype)
+
+
+@triton.jit
 def lowest_bit(mask):
     """The number of the lowest bit set in int64 ``mask`` (of bits 0 to 62, not 0), and the mask without it."""
     low = mask & -mask

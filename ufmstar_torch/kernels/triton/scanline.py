@@ -14,9 +14,10 @@ import triton.language as tl
 from torch import Tensor
 
 from ufmstar_torch.kernels.triton.launch import interpreted, launch, power_of_two
+from ufmstar_torch.kernels.triton.matrices import exact
 from ufmstar_torch.segment_input import SegmentInput
 
-MOMENTS, WHOLE = 7, 4  # of a finished segment: mean x, z; scatter xx, xz, zz; line x, z | N, nearest bin, interval
+MOMENTS, WHOLE = 8, 3  # of a finished segment: mean x, z; scatter xx, xz, zz; line x, z; length^2 | N, interval
 
 
 @dataclass(frozen=True)
@@ -25,16 +26,14 @@ class Rows:
 
     Attributes:
         camera: [B, 3, 3] float64 [px].
-        lengths2: [B, bins] float64, squared length of every depth bin [m^2].
-        moments: [B H, M, 7] float64.
-        whole: [B H, M, 4] int32.
+        moments: [B H, M, 8] float64.
+        whole: [B H, M, 3] int32.
         count: [B H] int32.
         owner: [B H, W] int32, which of the row's starts a pixel belongs to, -1 = none (int16 where it holds W).
         place: [B H, W] int32, the finished segment of every start, -1 = too sparse; likewise.
     """
 
     camera: Tensor
-    lengths2: Tensor
     moments: Tensor
     whole: Tensor
     count: Tensor
@@ -62,7 +61,7 @@ def scanlines(given: SegmentInput) -> Rows:
     narrow = torch.int16 if width < 2**15 else torch.int32
     moments = torch.empty(rows, most, MOMENTS, dtype=torch.float64, device=device)
     found = Rows(
-        camera, lengths2, moments, whole(rows, most, WHOLE), whole(rows),
+        camera, moments, whole(rows, most, WHOLE), whole(rows),
         whole(rows, width, dtype=narrow), whole(rows, width, dtype=narrow),
     )  # fmt: skip
     lanes = min(power_of_two(rows), 256) if interpreted() else 32  # the interpreter takes as long for one as for many
@@ -71,7 +70,7 @@ def scanlines(given: SegmentInput) -> Rows:
         found.moments, found.whole, found.count, found.owner, found.place, rows, height, width,
         most,
         scale=float(limits.adaptive_thresh_scale), reference=float(limits.reference_focal),
-        scaled=limits.scale_with_image, noise_floor=float(limits.noise_floor), noise_thresh=float(limits.noise_thresh),
+        scaled=limits.fixed_slope, noise_floor=float(limits.noise_floor), noise_thresh=float(limits.noise_thresh),
         line_thresh=float(limits.line_thresh), max_depth=float(limits.depth_limit), gap=limits.occlusion_gap,
         n_check=limits.n_check, sparse=limits.sparse, max_open=limits.max_open, places=power_of_two(limits.max_open),
         number=given.depth_bins, lanes=lanes, warps=1,
@@ -105,20 +104,20 @@ def _bins(
         if tl.program_id(0) == 0:
             tl.store(lengths2 + b * number + j, length * length)
         k += (edge < z).to(tl.int32)
-        length = tl.minimum(tl.maximum(s * edge, shortest), longest)
+        length = tl.minimum(tl.maximum(s * edge, exact(shortest, s)), exact(longest, s))
     tl.store(bins + b * height * width + i, tl.minimum(k, number - 1).to(tl.int16), mask=inside)
 
 
 @triton.jit
 def _finish(
-    done, n, u_left, u_right, nearest, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole, place, count, r,
+    done, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole, place, count, r,
     most, width, sparse: tl.constexpr,
 ):  # fmt: skip
     """Write the segments of the mask ``done`` [R, Q], one a row; returns the new number of the rows' segments."""
     keep = done & (n > sparse)
     pixels = tl.maximum(n, 1).to(tl.float64)
     at = r[:, None] * most + count[:, None] + n * 0
-    out = moments + 7 * at
+    out = moments + 8 * at
     tl.store(out, x_left + dx / pixels, mask=keep)
     tl.store(out + 1, z_left + dz / pixels, mask=keep)
     tl.store(out + 2, dxx - dx * dx / pixels, mask=keep)
@@ -126,11 +125,11 @@ def _finish(
     tl.store(out + 4, dzz - dz * dz / pixels, mask=keep)
     tl.store(out + 5, dx, mask=keep)
     tl.store(out + 6, dz, mask=keep)
-    out = whole + 4 * at
+    tl.store(out + 7, reach, mask=keep)
+    out = whole + 3 * at
     tl.store(out, n, mask=keep)
-    tl.store(out + 1, nearest, mask=keep)
-    tl.store(out + 2, u_left, mask=keep)
-    tl.store(out + 3, u_right, mask=keep)
+    tl.store(out + 1, u_left, mask=keep)
+    tl.store(out + 2, u_right, mask=keep)
     tl.store(place + r[:, None] * width + born, tl.where(keep, count[:, None], -1), mask=done)
     return count + tl.sum(keep.to(tl.int32), 1)
 
@@ -158,24 +157,24 @@ def _scanline(
     q = tl.arange(0, places)[None, :]
     empty = tl.zeros([lanes, places], tl.float64)
     x_left, z_left, x_right, z_right, w2 = empty, empty, empty, empty, empty
-    dx, dz, dxx, dxz, dzz = empty, empty, empty, empty, empty
+    dx, dz, dxx, dxz, dzz, reach = empty, empty, empty, empty, empty, empty
     n = tl.zeros([lanes, places], tl.int32)
-    u_left, u_right, nearest, born = n, n, n, n
+    u_left, u_right, born = n, n, n
     started, count = tl.zeros([lanes], tl.int32), tl.zeros([lanes], tl.int32)
     for u in range(width):
         at = r * width + u
         z = tl.load(depth + at, mask=real_row, other=0.0).to(tl.float64)
-        use = (z > 0) & (z <= max_depth)
+        use = (z > 0) & (z <= exact(max_depth, z))
         z = tl.where(use, z, 0.0)
         x = (u - cx) / fx * z
         k = tl.load(bins + at, mask=use, other=0).to(tl.int32)
-        length2 = tl.load(lengths2 + b * number + k, mask=use, other=0.0)
+        length2 = tl.load(lengths2 + b * number + k, mask=use, other=0.0)[:, None]
         t = slope * z * z
-        tau_z = tl.minimum(tl.maximum(6.0 * t, noise_floor), noise_thresh)[:, None]
-        tau_x = tl.minimum(tl.maximum(t, noise_floor), line_thresh)[:, None]
-        x, z, k, taken = x[:, None], z[:, None], k[:, None], use[:, None]
+        tau_z = tl.minimum(tl.maximum(6.0 * t, exact(noise_floor, t)), exact(noise_thresh, t))[:, None]
+        tau_x = tl.minimum(tl.maximum(t, exact(noise_floor, t)), exact(line_thresh, t))[:, None]
+        x, z, taken = x[:, None], z[:, None], use[:, None]
 
-        near = (n > 0) & (u - u_right <= gap) & (w2 < length2[:, None])
+        near = (n > 0) & (u - u_right <= gap) & (w2 < length2)
         close = (tl.abs(z - z_right) < tau_z) & (tl.abs(x - x_right) < tau_x)
         flat = dx == 0
         line = z_left + dz * (x - x_left) / tl.where(flat, 1.0, dx)
@@ -189,11 +188,11 @@ def _scanline(
         pushed = opened & (n > 0)
         if tl.max(tl.max(pushed.to(tl.int32), 1), 0) > 0:
             count = _finish(
-                pushed, n, u_left, u_right, nearest, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole,
+                pushed, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole,
                 place, count, r, most, width, sparse,
             )  # fmt: skip
         target = opened | (fits & (born == newest[:, None]))
-        n, u_left, nearest = tl.where(opened, 0, n), tl.where(opened, u, u_left), tl.where(opened, k, nearest)
+        n, u_left, reach = tl.where(opened, 0, n), tl.where(opened, u, u_left), tl.where(opened, length2, reach)
         born = tl.where(opened, started[:, None], born)
         x_left, z_left = tl.where(opened, x, x_left), tl.where(opened, z, z_left)
         dx, dz = tl.where(opened, 0.0, dx), tl.where(opened, 0.0, dz)
@@ -203,7 +202,7 @@ def _scanline(
         ex, ez = x - x_left, z - z_left
         xx, xz, zz = dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
         n, u_right = tl.where(target, n + 1, n), tl.where(target, u, u_right)
-        nearest = tl.where(target, tl.minimum(nearest, k), nearest)
+        reach = tl.where(target, tl.minimum(reach, length2), reach)
         x_right, z_right = tl.where(target, x, x_right), tl.where(target, z, z_right)
         w2 = tl.where(target, ex * ex + y_factor * (ez * ez), w2)
         dx, dz = tl.where(target, dx + ex, dx), tl.where(target, dz + ez, dz)
@@ -214,7 +213,7 @@ def _scanline(
         newest = tl.max(tl.where(n > 0, born, -1), 1)
         last = (n > 0) & (born == newest[:, None])
         count = _finish(
-            last, n, u_left, u_right, nearest, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole,
+            last, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole,
             place, count, r, most, width, sparse,
         )  # fmt: skip
         n = tl.where(last, 0, n)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
-from ufmstar_torch.kernels.triton.matrices import floored, store_symmetric
+from ufmstar_torch.kernels.triton.matrices import exact, floored, store_symmetric
 from ufmstar_torch.kernels.triton.scanline import Rows, scanlines, slope_of
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment import most_kept
@@ -71,12 +71,12 @@ def fit(given: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMix
     lanes = power_of_two(2 * most)
     launch(
         _join, (b,),
-        rows.camera, rows.lengths2, rows.moments, rows.whole, rows.count,
+        rows.camera, rows.moments, rows.whole, rows.count,
         mixture.mean, mixture.covariance, mixture.weight, mixture.count, member, slot_of, height, most, capacity, total,
         rounded=given.depth.dtype == torch.float32, scale=float(limits.adaptive_thresh_scale),
-        reference=float(limits.reference_focal), scaled=limits.scale_with_image, noise_floor=float(limits.noise_floor),
+        reference=float(limits.reference_focal), scaled=limits.fixed_slope, noise_floor=float(limits.noise_floor),
         angle2=float(limits.angle_cosine) ** 2, min_pixels=limits.min_pixels, min_rows=limits.min_rows,
-        prune=_PRUNE[limits.prune], number=given.depth_bins, lifted=floor is not None,
+        prune=_PRUNE[limits.prune], lifted=floor is not None,
         near_plane=floor.near_plane if floor else 0.0, epsilon=floor.epsilon if floor else 0.0,
         pixel_variance=PIXEL_VARIANCE, lanes=lanes, warps=max(1, min(8, lanes // 32)),
     )  # fmt: skip
@@ -143,12 +143,22 @@ def _stored(x, single: tl.constexpr):
 
 
 @triton.jit
+def _loaded(moments, whole, at):
+    """What a row's segment has in memory."""
+    m, w = moments + 8 * at, whole + 3 * at
+    return (
+        tl.load(m), tl.load(m + 1), tl.load(m + 2), tl.load(m + 3), tl.load(m + 4), tl.load(m + 5), tl.load(m + 6),
+        tl.load(m + 7), tl.load(w), tl.load(w + 1), tl.load(w + 2),
+    )  # fmt: skip
+
+
+@triton.jit
 def _join(
-    camera, lengths2, moments, whole, counts, mean_o, covariance_o, weight_o, count_o, member, slot_of,
+    camera, moments, whole, counts, mean_o, covariance_o, weight_o, count_o, member, slot_of,
     height, most, capacity, total,
     rounded: tl.constexpr, scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr,
     noise_floor: tl.constexpr, angle2: tl.constexpr, min_pixels: tl.constexpr, min_rows: tl.constexpr,
-    prune: tl.constexpr, number: tl.constexpr, lifted: tl.constexpr, near_plane: tl.constexpr, epsilon: tl.constexpr,
+    prune: tl.constexpr, lifted: tl.constexpr, near_plane: tl.constexpr, epsilon: tl.constexpr,
     pixel_variance: tl.constexpr, lanes: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(0).to(tl.int64)
@@ -160,21 +170,22 @@ def _join(
     mx, my, mz, sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero, zero, zero, zero
     lx, ly, lz, ox, oy, oz, px, py, pz, p2, reach = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
     n = tl.zeros([lanes], tl.int32)
-    merged, nearest, u_left, u_right, since, last = n, n, n, n, n, n
+    merged, u_left, u_right, since, last = n, n, n, n, n
     born = n - 1  # a lane without a Gaussian
     created, kept = 0, 0
+    ahead = _loaded(moments, whole, b * height * most)
     for v in range(height):
         row = b * height + v
         ry = (v - cy) / fy
-        for j in range(tl.load(counts + row)):
-            at = moments + 7 * (row * most + j)
-            hx, hz = tl.load(at), tl.load(at + 1)
-            hxx, hxz, hzz = tl.load(at + 2), tl.load(at + 3), tl.load(at + 4)
-            hlx, hlz = tl.load(at + 5), tl.load(at + 6)
-            at = whole + 4 * (row * most + j)
-            hn, h_bin, h_left, h_right = tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3)
+        following = (b * height + tl.minimum(v + 1, height - 1)) * most
+        found = tl.load(counts + row)
+        if found == 0:
+            ahead = _loaded(moments, whole, following)
+        for j in range(found):
+            hx, hz, hxx, hxz, hzz, hlx, hlz, h_reach, hn, h_left, h_right = ahead
+            # The next one is on its way while this one is tested.
+            ahead = _loaded(moments, whole, tl.where(j + 1 < found, row * most + j + 1, following))
             hy, hly = ry * hz, ry * hlz
-            h_reach = tl.load(lengths2 + b * number + h_bin)
 
             shared = tl.minimum(u_right, h_right) - tl.maximum(u_left, h_left)
             span = tl.maximum(u_right, h_right) - tl.minimum(u_left, h_left)
@@ -218,8 +229,7 @@ def _join(
                 merged = tl.where(join, merged + 1, merged)
                 u_left = tl.where(join, (u_left + h_left) // 2, u_left)
                 u_right = tl.where(join, (u_right + h_right) // 2, u_right)
-                reach = tl.where(join & (h_bin < nearest), h_reach, reach)
-                nearest = tl.where(join, tl.minimum(nearest, h_bin), nearest)
+                reach = tl.where(join, tl.minimum(reach, h_reach), reach)
                 last = tl.where(join, v, last)
                 tl.store(member + row * most + j, oldest)
             else:
@@ -232,7 +242,7 @@ def _join(
                 ox, oy, oz = tl.where(own, 0.0, ox), tl.where(own, 0.0, oy), tl.where(own, 0.0, oz)
                 px, py, pz = tl.where(own, 0.0, px), tl.where(own, 0.0, py), tl.where(own, 0.0, pz)
                 p2, reach = tl.where(own, 0.0, p2), tl.where(own, h_reach, reach)
-                n, merged, nearest = tl.where(own, hn, n), tl.where(own, 1, merged), tl.where(own, h_bin, nearest)
+                n, merged = tl.where(own, hn, n), tl.where(own, 1, merged)
                 u_left, u_right = tl.where(own, h_left, u_left), tl.where(own, h_right, u_right)
                 since, last, born = tl.where(own, v, since), tl.where(own, v, last), tl.where(own, created, born)
                 tl.store(member + row * most + j, created)
@@ -267,7 +277,7 @@ def _join(
                 ax, ay, az = _stored(ax, rounded), _stored(ay, rounded), _stored(az, rounded)
                 cxx, cxy, cxz = _stored(cxx, rounded), _stored(cxy, rounded), _stored(cxz, rounded)
                 cyy, cyz, czz = _stored(cyy, rounded), _stored(cyz, rounded), _stored(czz, rounded)
-                across = tl.maximum(az, near_plane) / focal
+                across = tl.maximum(az, exact(near_plane, az)) / focal
                 least = tl.maximum(across * across * pixel_variance, epsilon * (cxx + cyy + czz))
                 cxx, cxy, cxz, cyy, cyz, czz = floored(cxx, cxy, cxz, cyy, cyz, czz, least)
             tl.store(mean_o + 3 * out, ax, mask=keep)

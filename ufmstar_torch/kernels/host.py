@@ -1,0 +1,43 @@
+"""Compiled CPU kernels for the tensors of an accelerator, on which the work would be a long chain of tiny steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+Value = TypeVar("Value")
+
+
+def moved(value: Value, device: torch.device | str) -> Value:
+    """The same value with its tensors on a device: a tensor, a tuple, or a dataclass with tensors in its fields."""
+    if isinstance(value, Tensor):
+        return value.to(device)  # type: ignore[return-value]
+    if isinstance(value, tuple):
+        return tuple(moved(part, device) for part in value)  # type: ignore[return-value]
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    before = {f.name: getattr(value, f.name) for f in fields(value)}
+    after = {name: moved(part, device) for name, part in before.items()}
+    changed = any(after[name] is not part for name, part in before.items())
+    return replace(value, **after) if changed else value
+
+
+def on_host(kernel: Callable[..., Value]) -> Callable[..., Value]:
+    """The kernel for the tensors of a device, for which it waits; the results lie on the first tensor's device."""
+
+    def call(*arguments: Any) -> Value:
+        return moved(kernel(*moved(arguments, "cpu")), _first(arguments).device)
+
+    return call
+
+
+def _first(value: Any) -> Any:
+    """The first tensor in a value, or None."""
+    if isinstance(value, Tensor):
+        return value
+    parts = value if isinstance(value, tuple) else vars(value).values() if is_dataclass(value) else ()
+    return next((tensor for part in parts if (tensor := _first(part)) is not None), None)
