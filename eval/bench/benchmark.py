@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.parts import MULTIVIEW
+from ufmstar_torch.eval.bench.streams import time_streams
 from ufmstar_torch.eval.bench.timing import most_threads
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import BASES, Method
@@ -53,6 +54,7 @@ class BenchSettings:
         history: number of frames before them
         threads: number of CPU threads; default: the cores of this process
         device: cpu, cuda or cuda:N, for network and UfM*
+        streams: numbers of streams at once on which UfM* alone is timed as well
         json: file for the report
     """
 
@@ -67,11 +69,14 @@ class BenchSettings:
     history: int = field(default=60, metadata={"least": 1})
     threads: int | None = None
     device: str = "cpu"
+    streams: tuple[int, ...] = ()
     json: Path | None = None
 
     def __post_init__(self) -> None:
         if self.weights is None and self.model not in ARCHITECTURES:
             raise ValueError(f"--model {self.model} needs --weights; without, it is one of {', '.join(ARCHITECTURES)}")
+        if any(count < 1 for count in self.streams):
+            raise ValueError(f"--streams must be positive, got {list(self.streams)}")
         if not self.sizes or any(size < 64 or size % 32 for size in self.sizes):
             raise ValueError(f"--sizes must be multiples of 32 from 64 on [px], got {list(self.sizes)}")
 
@@ -97,7 +102,9 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
         sequence = open_sequence(name if options.sequence == TOUR else options.sequence)
         rows = [Row(Method.parse(name), setting) for name, setting in _rows(network.base, options.backends)]
         how: dict[str, Any] = {"device": device, "multiview_device": device, "plan": plan}
-        results.append(measure(rows, {network.base: network}, sequence, **how))
+        result = measure(rows, {network.base: network}, sequence, **how)
+        result["streams"] = time_streams(network, sequence, options.streams, device=device, plan=plan)
+        results.append(result)
     used = {name: str(value) for name, value in vars(options).items() if value is not None}
     return {"schema": 2, "date": datetime.now(UTC).isoformat(timespec="seconds"), "options": used, "results": results}
 
@@ -179,4 +186,7 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
         if row["stages"] is not None:
             stages = row["stages"]["stages"].items()
             lines.append(f"stages of {row['row']}: " + ", ".join(f"{n} {t['median_ms']:.2f}" for n, t in stages))
+    for line in result["streams"]:
+        forms = (f"{name} {line[name]['median_ms']:.2f} ms" for name in ("step", "graph") if name in line)
+        lines.append(f"{line['streams']} streams at once: {', '.join(forms)}")
     return [*lines, *(f"no energy of the {unit}: {why}" for unit, why in result["power"]["missing"].items())]
