@@ -111,8 +111,8 @@ class UncertainDepth(NetworksInTurn):
             :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a list with one for
             each. Saved and reset with the state. None: those given with an image, if any.
         recalibration: a map of V, after everything else (``Recalibration.from_json(FILE)``); None = V as it is.
-        multiview_device: of UfM* and of the results, whatever the networks' is: "cpu" for the paper's split. None = the
-            networks'. :meth:`stream` runs both at the same time.
+        multiview_device: of UfM* and of the results, whatever the networks' is. "cpu" is faster for one camera with the
+            networks on a GPU, and the paper's split; None = the networks'. :meth:`stream` runs both at the same time.
 
     The networks are put into eval mode here and run without gradients. A stochastic network decides itself
     to sample in eval mode, as decoder dropout at test time does.

@@ -78,8 +78,8 @@ def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: R
     way = tour_sequence(seed, frames=_PATH, size=_SIZES.get((h, w), _HALF_VGA), style="scales")
     part = replace(way, entries=way.entries[:_WALKED])
     sequence = in_memory(part, lambda done: progress(Progress("rooms", done, _WALKED)))
-    config, cpu = UfMStarConfig(on_bad_frame="skip"), torch.device("cpu")
-    warm_up_command(config, cpu, progress)
+    config = UfMStarConfig(on_bad_frame="skip")
+    warm_up_command(config, progress)
     model = UncertainDepth(network, config)
     summary = {"network": about, "realtime": _live(model, sequence, seconds, progress), "load_average": load_average()}
     contrasts = _contrasts(UncertainDepth(network, config), sequence)

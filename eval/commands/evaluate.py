@@ -205,7 +205,7 @@ def _evaluate(options: EvalOptions) -> int:
             anchors = {row.setting.anchors for row in rows}
             posterior = any(row.setting.posterior for row in rows)
             config = started(DEFAULTS, anchors=anchors != {""}, posterior=posterior)
-            warm_up_command(config, torch.device("cpu"), bars.show, dense=DENSE in anchors)
+            warm_up_command(config, bars.show, dense=DENSE in anchors)
         if sys.stderr.isatty():
             how["progress"] = bars.show
         outcome = evaluate_suite(job, shard=options.part, **how, stop=stop, report=bars.say)

@@ -205,10 +205,11 @@ def _model(options: LiveOptions) -> UncertainDepth:
         samples=source.passes if len(source.networks) == 1 and chosen.mode == "full" else None,
         anchors=None if anchors is False else landmarks_of(anchors, None),
         recalibration=options.uncertainty.load_recalibration(config, chosen.weights, source),
+        multiview_device="cpu",  # for one camera faster than a GPU
     ).to(options.device)
     with Bars() as bars:
         dense = config.anchors is not None and anchors in (False, "dense")
-        warm_up_command(model.ufm.config, torch.device(options.device), bars.show, dense=dense)
+        warm_up_command(model.ufm.config, bars.show, dense=dense)
     if options.state is not None and options.state.exists():
         try:
             with options.state.open("rb") as file:

@@ -54,7 +54,7 @@ class MachineOptions:
     """Options that many commands have, at the end of their own.
 
     Attributes:
-        device: cpu, cuda or cuda:N
+        device: of the networks, cpu, cuda or cuda:N; UfM* runs on the CPU
         threads: number of CPU threads of network and step; default: all cores but one
     """
 

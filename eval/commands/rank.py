@@ -98,7 +98,7 @@ def _scores(options: RankOptions) -> ImageScores:
             source, scores.sequence = job.source, path
             if job.image_fit is not None and job.image_fit.problem:
                 LOGGER.warning("%s: %s", path, job.image_fit.problem)
-            stream = FrameStream(job.sequence, job.indices, [job.row(Checkpoint())], device=job.device)
+            stream = FrameStream(job.sequence, job.indices, [job.row(Checkpoint())])
             try:
                 stream.drive([scores, ProgressSink(bars.show)], stop=stop)
             except Stopped:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import torch
 
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.config import UfMStarConfig
@@ -17,11 +16,9 @@ _WALL, _FOCAL = (96, 128), 100.0  # [px] of the images of a wall
 _STEP, _FRAMES = 4, 8  # the wall moves by so many pixels a frame
 
 
-def warm_up_command(
-    config: UfMStarConfig, device: torch.device, show: Callable[[Progress], object], *, dense: bool = False
-) -> None:
+def warm_up_command(config: UfMStarConfig, show: Callable[[Progress], object], *, dense: bool = False) -> None:
     """Compile UfM* and, if ``dense``, the search of :class:`DenseEvidence`, or load them from disk."""
-    also, ufm = [dense_anchors] if dense else [], UfMStar(config, device=device)
+    also, ufm = [dense_anchors] if dense else [], UfMStar(config)
     warm_up(ufm, (32, 32), 1, lambda done, total: show(Progress("kernels", done, total)), also)
 
 

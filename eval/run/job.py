@@ -48,7 +48,7 @@ class RunJob:
     indices: range  # which of them, in order
     source: DepthSource  # of the depth
     config: UfMStarConfig  # of UfM*
-    device: torch.device  # of UfM*
+    device: torch.device  # of the networks; UfM* runs on the CPU, which for one stream is faster than a GPU
     settings: Mapping[str, Any]  # everything the user chose, as plain values, for the summary
     recalibration: Recalibration | None = None  # of the variance
     every: bool = False  # all members predict on every image, instead of one in turn
@@ -73,7 +73,7 @@ class RunJob:
 
     def row(self, checkpoint: Checkpoint) -> RowRunner:
         """UfM* on the source, in the state of a checkpoint."""
-        estimator = Gaussians(self.config, self.device, recalibration=self.recalibration)
+        estimator = Gaussians(self.config, torch.device("cpu"), recalibration=self.recalibration)
         anchors = None
         if self.config.anchors is not None:
             anchors = AnchorSource(Setting(anchors=CORNERS), Tracks(landmark_source(self.landmarks)))

@@ -107,7 +107,9 @@ def require_part(job: RunJob, by: str) -> None:
         raise ValueError("--by anchored needs --anchors or --posterior")
     for index in job.indices if by in ("aleatoric", "epistemic") else ():
         try:
-            prediction = FramePredictions(job.sequence[index], job.device, None, "").of(job.source, 0, job.every)
+            prediction = FramePredictions(job.sequence[index], torch.device("cpu"), None, "").of(
+                job.source, 0, job.every
+            )
         except FrameError:
             continue
         if {"aleatoric": prediction.aleatoric_variance, "epistemic": prediction.epistemic_variance}[by] is None:

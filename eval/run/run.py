@@ -76,7 +76,7 @@ def _frames(folder: RunFolder, progress: Show, stop: Stop) -> None:
     job = folder.job
     warm_up_job(job, progress)
     row, position = job.row(folder.checkpoint), folder.checkpoint.position
-    stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=position)
+    stream = FrameStream(job.sequence, job.indices, [row], start=position)
     with WriterThread([folder.metrics, folder]) as writer:
         stream.drive([writer, ProgressSink(progress, _skipped(folder))], stop=stop)
 
@@ -84,7 +84,7 @@ def _frames(folder: RunFolder, progress: Show, stop: Stop) -> None:
 def warm_up_job(job: RunJob, progress: Show) -> None:
     """Compile what a job needs before its first frame."""
     dense = job.config.anchors is not None and job.landmarks == DENSE
-    warm_up_command(job.config, job.device, progress, dense=dense)
+    warm_up_command(job.config, progress, dense=dense)
 
 
 def _ending(folder: RunFolder) -> tuple[str, str]:
