@@ -13,12 +13,12 @@ START = {
     "roughness": (0.0025, 20.0, 1e-4, 0.04),
     "noise": (1.0, 20.0, 0.25, 16.0),
     "unseen": (0.06, 20.0, 0.0, 16.0),
-    "wrong": (0.02, 20.0, 0.002, 0.2),
+    "wrong": (0.015, 20.0, 0.0015, 0.15),
     "inlier": (1.0, 20.0, 0.05, 4.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
 PRIOR, DRIFT, MEMORY = np.array([0.5, 0.5, 0.2, 0.2]) ** 2, 0.05**2, 0.5 ** (1 / 20)
-REACH, RADIUS, NEAR, WEAK, CLIP, APART, OTHER = 1.0, 0.15, 0.05, 0.25**2, 9.0, 0.5, 6
+REACH, RADIUS, NEAR, WEAK, CLIP, APART = 1.0, 0.15, 0.05, 0.25**2, 9.0, 0.5
 
 
 def start():
@@ -192,8 +192,9 @@ def update(state, depth, claimed, pixel, g, variance):
     offset, share = HX[:, 4:] @ mean[4:], away / REACH
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
     p = np.minimum(ratio(after, "wrong") * wrong_factor(share, scale), 0.5)
-    alone = [second_moment(0.0, *each) for each in zip(spread, offset, around, strict=True)]
-    spread = [second_moment(*each) for each in zip(p, spread, offset, around, strict=True)]
+    wide = [elsewhere(*each) for each in zip(around, away * ratio(after, "unseen"), strict=True)]
+    alone = [second_moment(0.0, *each) for each in zip(spread, offset, wide, strict=True)]
+    spread = [second_moment(*each) for each in zip(p, spread, offset, wide, strict=True)]
     posterior, variance, outlier = read(depth, np.nan_to_num(claimed), logs, mean[:4], offset, spread, p, share)
     _, inlier, _ = read(depth, 0 * depth, logs, mean[:4], offset, alone, p, share)
     return after, posterior, variance, inlier, outlier
@@ -217,7 +218,7 @@ def local_scale(shape, node, z2, noise, used):
 
 def wrong_factor(share, scale):
     """By what another surface is more probable; share = distance."""
-    return (1 + OTHER * share) * scale ** np.maximum(1 - share / RADIUS, 0)
+    return scale ** np.maximum(1 - share / RADIUS, 0)
 
 
 def y_variance(shape, node, y, noise, used, centre):
@@ -237,10 +238,10 @@ def y_variance(shape, node, y, noise, used, centre):
     return out.ravel()
 
 
-def second_moment(p, variance, offset, around):
+def second_moment(p, variance, offset, wide):
     """E[(e^n - 1)^2], n normal, or with the probability p of n - offset; e^-offset at most 100."""
     moments = []
-    for v, q in ((min(variance, 2), 1), (elsewhere(around), min(math.exp(-offset), 100))):
+    for v, q in ((min(variance, 2), 1), (wide, min(math.exp(-offset), 100))):
         moments.append(q * q * math.exp(2 * v) - 2 * q * math.exp(v / 2) + 1)
     return (1 - p) * moments[0] + p * moments[1]
 
@@ -260,9 +261,9 @@ def inlier_factor(state, away):
     return 1 + (ratio(state, "inlier") - 1) * np.maximum(1 - away / (2 * RADIUS), 0)
 
 
-def elsewhere(around):
+def elsewhere(around, unseen):
     """Variance of y on another surface."""
-    return min(around + 0.12, 2)
+    return min(around + 12 * unseen, 2)
 
 
 def discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v):
@@ -286,9 +287,10 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v):
     scale = local_scale(logs.shape, node, z2, noise, rest)[node]
     own = factor * (var + noise + away * ratio(state, "unseen")) + steepness(logs.shape, mean[FEATURES:])[node]
     own, more_wrong = scale * own, wrong_factor(share, scale)
-    wide = noise + [elsewhere(x) for x in around]
+    beyond = np.array([elsewhere(*each) for each in zip(around, away * ratio(state, "unseen"), strict=True)])
+    wide = noise + beyond
     p = np.minimum(ratio(state, "wrong") * more_wrong, 0.5)
-    final = [second_moment(*each) for each in zip(p, own, offset, around, strict=True)]
+    final = [second_moment(*each) for each in zip(p, own, offset, beyond, strict=True)]
     here, other = (1 - p) * normal(error, own), p * normal(error + offset, wide)
     here, other = here / (here + other), other / (here + other)
     return pairs(state, logs, held, node, error, var, away, noise) | {

@@ -92,8 +92,10 @@ def _of_stream(
     mean, variance = at(field, node, x)
     b, now = field.coefficients, Running.of(kept, config)
     offset, every = mean - (x * b).sum(1), np.ones(len(scene.noise), np.bool_)
-    variance = inlier_factor(now, away) * (variance + now.ratios["roughness"] + away * now.ratios["unseen"])
-    scale, wide = local_scale(scene, left_out, every), elsewhere_variance(config, spread_around(scene, every, b[0]))
+    unseen = away * now.ratios["unseen"]
+    variance = inlier_factor(now, away) * (variance + now.ratios["roughness"] + unseen)
+    wide = elsewhere_variance(config, spread_around(scene, every, b[0]), unseen)
+    scale = local_scale(scene, left_out, every)
     p = np.minimum(now.ratios["wrong"] * wrong_factor(config, away, scale), MOST_WRONG)
     variance, inlier = second_moments(config, scale * (variance + steepness(grid, field.offset)), p, offset, wide)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)

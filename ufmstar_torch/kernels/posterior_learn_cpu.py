@@ -55,9 +55,10 @@ def _of_discs(
     error, offset = scene.observed.value[held] - mean, mean - (x * b).sum(1)
     believed = np.where(held, scene.believed(), 0.0)
     area = (believed / np.maximum(scene.counted(believed), 1e-12))[held]
-    wide = elsewhere_variance(config, spread_around(scene, rest, b[0])[node])
+    unseen = away * running.ratios["unseen"]
+    wide = elsewhere_variance(config, spread_around(scene, rest, b[0])[node], unseen)
     scale, factor = local_scale(scene, left_out, rest)[node], inlier_factor(running, away)
-    own = factor * (variance + noise + away * running.ratios["unseen"]) + steepness(scene.grid, field.offset)[node]
+    own = factor * (variance + noise + unseen) + steepness(scene.grid, field.offset)[node]
     own, more_wrong = scale * own, wrong_factor(config, away, scale)
     p = np.minimum(running.ratios["wrong"] * more_wrong, MOST_WRONG)
     z2 = error**2 / own - (error + offset) ** 2 / (noise + wide)

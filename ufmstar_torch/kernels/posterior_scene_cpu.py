@@ -202,7 +202,7 @@ def _window(count: int, width: float) -> Floats:
 
 
 def wrong_factor(config: PosteriorConfig, away: Floats, scale: Floats) -> Floats:
-    factor: Floats = (1 + config.other * away / config.reach) * scale ** np.maximum(1 - away / config.radius, 0)
+    factor: Floats = scale ** np.maximum(1 - away / config.radius, 0)
     return factor
 
 
@@ -215,8 +215,8 @@ def steepness(grid: Grid, f: Floats) -> Floats:
     return local_variance(f.reshape(grid.rows, grid.cols)).ravel()
 
 
-def elsewhere_variance(config: PosteriorConfig, around: Floats) -> Floats:
-    return np.minimum(around + config.elsewhere, config.widest)
+def elsewhere_variance(config: PosteriorConfig, around: Floats, unseen: Floats) -> Floats:
+    return np.minimum(around + config.elsewhere * unseen, config.widest)
 
 
 def second_moments(

@@ -34,8 +34,7 @@ class PosteriorConfig(Checked):
         radius: of a disc; standard deviation of the Gaussian that weighs the anchors around a node; distance from the
             evidence from which on the errors of anchors do not change the probability of another surface
         wrong: probability that the local correction does not hold, at evidence, before it is learnt
-        other: by how much of itself it has grown from ``reach`` on, since another surface may begin
-        elsewhere: variance of y on another surface than the evidence's, beyond that of the anchors' y around
+        elsewhere: how many times as fast the variance of y grows with the distance from evidence if it does not hold
         near: standard deviation of the Gaussian that weighs the errors of anchors around a node
         widest: variance of y from which on the variance of the depth grows no more
         edge_contrast: difference of log d at which a node counts half at a pixel
@@ -58,9 +57,8 @@ class PosteriorConfig(Checked):
     reach: float = number(1.0, "l", "width", 0.0, open_low=True)
     discs: int = number(3, "", "1", 0, 16)
     radius: float = number(0.15, "r", "width", 0.0, open_low=True)
-    wrong: float = number(0.02, "p_0", "1", 0.0, 0.5)
-    other: float = number(6.0, "p_1", "1", 0.0)
-    elsewhere: float = number(0.12, "v_3", "1", 0.0)
+    wrong: float = number(0.015, "p_0", "1", 0.0, 0.5)
+    elsewhere: float = number(12.0, "v_3", "1", 0.0)
     near: float = number(0.05, "r_1", "width", 0.0, open_low=True)
     widest: float = number(2.0, "v_2", "1", 0.0, 4.0, open_low=True)
     edge_contrast: float = number(0.1, "delta", "1", 0.0, open_low=True)

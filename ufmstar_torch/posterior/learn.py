@@ -79,8 +79,9 @@ def _of_discs(
     nodes = spread_around(scene, rest, b[:, 0]), local_scale(scene, left_out, rest), steepness(scene.grid, field.offset)
     around, scale, steep = (torch.gather(x, 1, scene.observed.node) for x in nodes)
     factor, more_wrong = inlier_factor(running, away), wrong_factor(scene.config, away, scale)
-    own = scale * (factor * (variance + scene.noise + away * running.ratio("unseen")[:, None]) + steep)
-    p, wide = wrong(running, more_wrong), elsewhere_variance(scene.config, around)
+    unseen = away * running.ratio("unseen")[:, None]
+    own = scale * (factor * (variance + scene.noise + unseen) + steep)
+    p, wide = wrong(running, more_wrong), elsewhere_variance(scene.config, around, unseen)
     z2 = error.square() / own - (error + offset).square() / (scene.noise + wide)
     elsewhere = torch.sigmoid(p.logit() + ((own / (scene.noise + wide)).log() + z2) / 2)
     stated = second_moments(scene.config, own, p, offset, wide)[0]

@@ -167,9 +167,9 @@ def _window(count: int, width: float, like: Tensor) -> Tensor:
 
 
 def wrong_factor(config: PosteriorConfig, away: Tensor, scale: Tensor) -> Tensor:
-    """[B, n] by what the probability that the local correction does not hold is multiplied: it grows with the distance
-    ``away`` [B, n] from evidence and, near it, with the local ``scale`` [B, n] of errors."""
-    return (1 + config.other * away / config.reach) * scale ** (1 - away / config.radius).clamp_min(0)
+    """[B, n] by what the probability that the local correction does not hold is multiplied: near evidence, at a small
+    distance ``away`` [B, n], the local ``scale`` [B, n] of errors."""
+    return scale ** (1 - away / config.radius).clamp_min(0)
 
 
 def wrong(running: Running, factor: Tensor) -> Tensor:
@@ -191,10 +191,10 @@ def steepness(grid: Grid, f: Tensor) -> Tensor:
     return unfold(padded, 3).var(1, correction=0)
 
 
-def elsewhere_variance(config: PosteriorConfig, around: Tensor) -> Tensor:
-    """Variance of y on another surface than the evidence's: that of the anchors' y ``around`` and
-    ``elsewhere``, at most ``widest``."""
-    return (around + config.elsewhere).clamp_max(config.widest)
+def elsewhere_variance(config: PosteriorConfig, around: Tensor, unseen: Tensor) -> Tensor:
+    """Variance of y on another surface than the evidence's: that of the anchors' y ``around`` and ``elsewhere`` times
+    what the distance adds on their own surface, ``unseen``; at most ``widest``."""
+    return (around + config.elsewhere * unseen).clamp_max(config.widest)
 
 
 def second_moments(

@@ -19,7 +19,7 @@ Variance over the squared depth at a node, with v = s (h (the field's variance +
 steepness), and share = min(1, distance/reach):
 
     max((1 - p) m(v) + p tail, share V/d^2),      m(v) = E[(e^n - 1)^2],  n ~ N(0, v),
-    p = wrong (1 + other share) s^max(0, 1 - distance/radius),
+    p = wrong s^max(0, 1 - distance/radius),
     h = 1 + (inlier - 1) max(0, 1 - distance/(2 radius)),
 
 with s the local scale: the mean z^2 of the anchors around, each predicted from the others, in a Gaussian window of the
@@ -37,9 +37,10 @@ variance of the error grows in proportion to it. ``learn`` learns ``unseen``, ``
 wrong or lies on another surface. Then y - b . x is normal with the variance w, and the depth log-normal:
 
     tail = E[(e^(n - f) - 1)^2] = q^2 e^(2 w) - 2 q e^(w/2) + 1,      q = e^-f <= 100,      n ~ N(0, w),
-    w = a + elsewhere,
+    w = a + elsewhere unseen distance,
 
-with a the variance of the anchors' y around, of a Gaussian window. Neither v nor w exceeds ``widest``. So no pixel is
+with a the variance of the anchors' y around, of a Gaussian window: surfaces differ more from each other than one does
+within, and the farther the evidence, the more surfaces lie between. Neither v nor w exceeds ``widest``. So no pixel is
 more certain than contradictory evidence allows, and a depth that was pulled far below the global correction is less
 certain than one above it.
 
@@ -136,8 +137,9 @@ def update(
     features, b = grid.features(), field.coefficients
     mean, variance = field.at(torch.arange(features.shape[1], device=b.device).expand_as(away), features)
     offset = mean - (features * b[:, None]).sum(-1)
-    variance = variance + now.ratio("roughness")[:, None] + away * now.ratio("unseen")[:, None]
-    wide = elsewhere_variance(config, spread_around(scene, anchors.valid, b[:, 0]))
+    unseen = away * now.ratio("unseen")[:, None]
+    variance = variance + now.ratio("roughness")[:, None] + unseen
+    wide = elsewhere_variance(config, spread_around(scene, anchors.valid, b[:, 0]), unseen)
     scale = local_scale(scene, left_out, anchors.valid)
     variance = scale * (inlier_factor(now, away) * variance + steepness(grid, field.offset))
     p = wrong(now, wrong_factor(config, away, scale))
