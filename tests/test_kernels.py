@@ -15,9 +15,11 @@ import torch
 from modules import frame as input_frame
 from modules import same
 
-from ufmstar_torch import UfMStar, frame
+from ufmstar_torch import SPGFConfig, UfMStar, frame
 from ufmstar_torch.kernels import check_cpu, posterior_cpu, select, step_cpu
+from ufmstar_torch.kernels.host import moved, on_host
 from ufmstar_torch.posterior.update import update as update_posterior
+from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.step import step
 from ufmstar_torch.step_parts import REFERENCE
 
@@ -98,6 +100,16 @@ def test_several_threads_at_once():
     with ThreadPoolExecutor(3) as pool:
         for out in pool.map(run, range(3)):
             assert all(same(mine, theirs) for mine, theirs in zip(out, alone, strict=True))
+
+
+def test_tensors_move_and_nothing_else_is_copied():
+    given = SegmentInput(torch.ones(1, 2, 3), torch.eye(3)[None], SPGFConfig(), None)
+    there, number = moved((given, 3), "meta")
+    assert number == 3
+    assert there.depth.device.type == there.intrinsics.device.type == "meta"
+    assert there.config is given.config
+    assert moved(given.config, "meta") is given.config
+    assert torch.equal(on_host(lambda at: at.depth + 1)(given), given.depth + 1)
 
 
 def test_importing_the_package_leaves_the_warnings_alone():

@@ -271,7 +271,7 @@ def test_one_anchor_that_is_off_by_a_factor_of_twenty_does_not_decide(tier):
 
 
 def test_another_surface_is_more_probable_and_less_certain_away_from_evidence():
-    """Where anchors agree the probability is small; away from them it is what holds for the stream."""
+    """Anchors that agree make it improbable near them; away from them its probability is the stream's own."""
     depth = np.full((28, 56), 2.0)
     pixel = np.stack([np.tile([1.0, 3.0], 14), np.repeat(np.arange(0.0, 28, 2), 2)], -1)
     _, out = updated(depth, (pixel, np.full(28, 2.2), np.full(28, 1e-4)))

@@ -134,6 +134,11 @@ def test_pictures_and_mixture(path, tmp_path):
     assert own.shape[1] < 0.8 * sheet.shape[1]  # no column for an error that is zero by construction
 
 
+def test_ufm_star_stays_on_the_cpu_where_the_networks_run_elsewhere(path):
+    job = replace(own_depth_job(path), device=torch.device("cuda"))
+    assert job.ufm(run_folder.Checkpoint()).mean.device.type == "cpu"
+
+
 def test_without_ground_truth(tmp_path):
     path, _ = write_generic(tmp_path, frames=3)
     for file in (path / "depth").iterdir():

@@ -103,7 +103,9 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
         rows = [Row(Method.parse(name), setting) for name, setting in _rows(network.base, options.backends)]
         how: dict[str, Any] = {"device": device, "multiview_device": device, "plan": plan}
         result = measure(rows, {network.base: network}, sequence, **how)
-        result["streams"] = time_streams(network, sequence, options.streams, device=device, plan=plan)
+        result["streams"] = []
+        if options.streams:
+            result["streams"] = time_streams(network, sequence, options.streams, device=device, plan=plan)
         results.append(result)
     used = {name: str(value) for name, value in vars(options).items() if value is not None}
     return {"schema": 2, "date": datetime.now(UTC).isoformat(timespec="seconds"), "options": used, "results": results}

@@ -16,7 +16,7 @@ from ufmstar_torch.eval.bench.measure import Plan
 from ufmstar_torch.eval.bench.networks import DEPTH, TimedNetwork
 from ufmstar_torch.eval.bench.timing import pinned_threads, spread
 from ufmstar_torch.eval.engine.clock import synchronize
-from ufmstar_torch.eval.sequences.frame import FrameSequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.ufmstar import UfMStar
 
 _SLOTS = 1024  # a graph needs room that does not grow
@@ -63,7 +63,7 @@ def time_streams(
     return lines
 
 
-def _given(network: TimedNetwork, frame: Any, device: torch.device) -> Given:
+def _given(network: TimedNetwork, frame: Frame, device: torch.device) -> Given:
     """Depth [1, H, W], pose [1, 4, 4] and intrinsics [1, 3, 3] of a frame; the camera stays on the CPU."""
     x, K = network.prepare(frame, device)
     return network.predict(DEPTH, x, K).depth.clone(), torch.from_numpy(frame.T_world_cam)[None], K.cpu().double()

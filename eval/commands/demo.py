@@ -40,6 +40,7 @@ class DemoOptions(MachineOptions):
             (.onnx, .tflite)
         onboard: live instead, as on a small robot: one network, quantised, at 30 images/s among things of many sizes
         seconds: of --onboard
+        device: cpu, cuda or cuda:N
         threads: number of CPU threads; default: all cores, with --onboard but one
     """
 

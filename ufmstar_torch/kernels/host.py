@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
-Value = TypeVar("Value")
 
-
-def moved(value: Value, device: torch.device | str) -> Value:
+def moved(value: Any, device: torch.device | str) -> Any:
     """The same value with its tensors on a device: a tensor, a tuple, or a dataclass with tensors in its fields."""
     if isinstance(value, Tensor):
-        return value.to(device)  # type: ignore[return-value]
+        return value.to(device)
     if isinstance(value, tuple):
-        return tuple(moved(part, device) for part in value)  # type: ignore[return-value]
+        return tuple(moved(part, device) for part in value)
     if not is_dataclass(value) or isinstance(value, type):
         return value
     before = {f.name: getattr(value, f.name) for f in fields(value)}
@@ -26,10 +24,10 @@ def moved(value: Value, device: torch.device | str) -> Value:
     return replace(value, **after) if changed else value
 
 
-def on_host(kernel: Callable[..., Value]) -> Callable[..., Value]:
+def on_host(kernel: Callable[..., Any]) -> Callable[..., Any]:
     """The kernel for the tensors of a device, for which it waits; the results lie on the first tensor's device."""
 
-    def call(*arguments: Any) -> Value:
+    def call(*arguments: Any) -> Any:
         return moved(kernel(*moved(arguments, "cpu")), _first(arguments).device)
 
     return call

@@ -33,7 +33,7 @@ class PosteriorConfig(Checked):
         discs: discs of anchors that are held out in a frame
         radius: of a disc; standard deviation of the Gaussian that weighs the anchors around a node; distance from the
             evidence from which on the errors of anchors do not change the probability of another surface
-        wrong: probability that the local correction does not hold, at evidence, before it is learnt
+        wrong: probability that the local correction does not hold, before it is learnt
         elsewhere: how many times as fast the variance of y grows with the distance from evidence if it does not hold
         near: standard deviation of the Gaussian that weighs the errors of anchors around a node
         widest: variance of y from which on the variance of the depth grows no more

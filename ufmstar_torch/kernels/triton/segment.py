@@ -144,7 +144,7 @@ def _stored(x, single: tl.constexpr):
 
 @triton.jit
 def _loaded(moments, whole, at):
-    """What a row's segment has in memory."""
+    """Load a segment: its moments, squared length, number of pixels and interval (``scanline.Rows``)."""
     m, w = moments + 8 * at, whole + 3 * at
     return (
         tl.load(m), tl.load(m + 1), tl.load(m + 2), tl.load(m + 3), tl.load(m + 4), tl.load(m + 5), tl.load(m + 6),
