@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import signal
 import sys
 from bisect import bisect_left
 from collections import Counter
@@ -12,10 +10,9 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Condition, Thread, current_thread, main_thread
+from threading import Condition, Thread, current_thread
 from time import perf_counter
-from types import FrameType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -97,8 +94,6 @@ class LiveDepth:
         state: file in which ``model.state_dict()`` is saved, whole or not at all, every ``save_every`` seconds [s] and
             at the end; None = never. ``model.load_state_dict(torch.load(FILE))`` goes on from it.
         save_every: see ``state``.
-        at_sigterm: on SIGTERM, end after the current image, save the state, and then deliver the signal to the handler
-            that was there before. Only from the main thread.
 
     Raises:
         TypeError, ValueError: an argument is impossible.
@@ -119,7 +114,6 @@ class LiveDepth:
         max_gap: float = 0.1,
         state: str | Path | None = None,
         save_every: float = 10.0,
-        at_sigterm: bool = False,
     ) -> None:
         for name, value in (("max_wait", max_wait), ("max_gap", max_gap), ("save_every", save_every)):
             if not 0 <= value < math.inf:
@@ -128,8 +122,6 @@ class LiveDepth:
             raise TypeError(f"model must be an UncertainDepth, got {type(model).__name__}: UncertainDepth(network)")
         if not callable(on_result):
             raise TypeError(f"on_result must be callable, got {type(on_result).__name__}")
-        if at_sigterm and current_thread() is not main_thread():
-            raise ValueError("at_sigterm needs the main thread, where Python handles signals: leave it out here")
         self._state = None if state is None else Path(state)
         if self._state is not None and not self._state.parent.is_dir():
             raise FileNotFoundError(f"state: no such folder: {self._state.parent}")
@@ -138,18 +130,15 @@ class LiveDepth:
         self.model, self._on_result = model, on_result
         self._intrinsics = None if intrinsics is None else as_intrinsics(intrinsics)
         self._max_wait, self._max_gap, self._save_every = max_wait, max_gap, save_every
-        self._changed = Condition()  # guards everything below; reentrant, since a signal may come inside
+        self._changed = Condition()  # guards everything below
         self._waiting: list[_Waiting] = []  # images, the oldest first
         self._times: list[float] = []  # of the poses, increasing
         self._poses: list[np.ndarray] = []
         self._last_image = -math.inf
-        self._busy = self._ending = self._ended = self._resetting = self._signalled = False
+        self._busy = self._ending = self._ended = self._resetting = False
         self._counts, self._dropped, self._skipped = Counter[str](), Counter[str](), Counter[str]()
         self._error: BaseException | None = None
-        self._before: Any = None  # the handler of SIGTERM before ours; None = ours is not installed
         self._worker = Thread(target=self._run, name="ufmstar live", daemon=True)
-        if at_sigterm:
-            self._before = signal.signal(signal.SIGTERM, self._terminate) or signal.SIG_DFL
         self._worker.start()
 
     def push_image(self, stamp: float, rgb: ImageLike, intrinsics: CameraLike | None = None) -> None:
@@ -258,31 +247,14 @@ class LiveDepth:
             self._changed.notify_all()
         if current_thread() is not self._worker:
             self._worker.join()
-        ours = current_thread() is main_thread() and signal.getsignal(signal.SIGTERM) == self._terminate
-        if self._before is not None and ours:  # else a later handler may lead to ours
-            signal.signal(signal.SIGTERM, self._before)
-            self._before = None
-
-    def _terminate(self, number: int, _: FrameType | None) -> None:
-        """Handler of SIGTERM: the worker ends, saves, and sends the signal again, to the handler before."""
-        signal.signal(number, self._before or signal.SIG_DFL)
-        self._before = None
-        with self._changed:
-            self._signalled = self._ending = True
-            ended = self._ended
-            self._changed.notify_all()
-        if ended:
-            os.kill(os.getpid(), number)
 
     def _run(self) -> None:
         with ExitStack() as stack:
             stack.push(self._keep_error)
             self._work()
         with self._changed:
-            self._busy, self._ended, signalled = False, True, self._signalled
+            self._busy, self._ended = False, True
             self._changed.notify_all()
-        if signalled:
-            os.kill(os.getpid(), signal.SIGTERM)
 
     def _keep_error(self, _: object, error: BaseException | None, __: object) -> bool:
         self._error = error
