@@ -22,7 +22,6 @@ from ufmstar_torch.eval.methods.suite import Suite, suite_named
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics.recalibration import fit
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.suite.shards import rank_of
 from ufmstar_torch.eval.suite.work_items import Shard
 from ufmstar_torch.eval.tour import make_tour, render, tour_path
 from ufmstar_torch.eval.tour.view import intrinsics
@@ -30,7 +29,6 @@ from ufmstar_torch.online import TrainDecision
 
 NAN, INF = math.nan, math.inf
 EYE, K = torch.eye(4, dtype=torch.float64), torch.from_numpy(intrinsics(24, 32))
-TORCHRUN = {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"}
 network, tour = NetworkChoice.parse, open_sequence
 
 
@@ -97,7 +95,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: network("depth_only=ground-truth:48"), "HxW"),
     # shards
     *[(partial(Shard.parse, text), "--shard must be") for text in ("0/2", "3/2", "1", "1/0", "a/b", "1/2/3", "-1/2")],
-    (lambda: rank_of({**TORCHRUN, "RANK": "4"}), "1/n to n/n, got 5/4"),
     # recalibration
     *[
         (partial(Recalibration, *knots), "Recalibration")

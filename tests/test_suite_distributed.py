@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import subprocess
 import sys
 import time
@@ -14,19 +13,17 @@ import forked
 import process_parts
 import pytest
 import torch
-from tiny_suite import NAMES, TRUTH, Stub, go, job_on, kept
+from tiny_suite import NAMES, TRUTH, go, job_on, kept
 from trainings import SPEC
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.run import machine
 from ufmstar_torch.eval.run.folder import FolderError
-from ufmstar_torch.eval.suite.shards import evaluate_suite, rank_of
+from ufmstar_torch.eval.suite.shards import evaluate_suite
 from ufmstar_torch.eval.suite.work_items import Shard
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
-
-TORCHRUN = {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"}
 
 
 @pytest.fixture
@@ -148,32 +145,3 @@ def test_shards_may_begin_in_any_order_and_share_a_folder(rooms, tmp_path, whole
     with pytest.raises(ValueError, match="--overwrite goes without shards"):
         go(job, shard=Shard(1, 2), overwrite=True)
     assert kept(job.out) == whole
-
-
-def as_rank(rank, job, result):
-    """One of torchrun's processes."""
-    os.environ |= {"RANK": str(rank), "WORLD_SIZE": "2", "LOCAL_RANK": str(rank)}
-    stub = Stub(lambda *_: time.sleep(0.02))
-    outcome, _ = go(job, stub, shard=None)
-    result.put((outcome.finished, [name for name, _ in stub.asked]))
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # of forks, from Python 3.12 on
-def test_torchruns_processes_are_shards(rooms, tmp_path):
-    fork = multiprocessing.get_context("fork")
-    results, job = fork.Queue(), job_on(rooms, tmp_path / "out")
-    children = [fork.Process(target=as_rank, args=(rank, job, results)) for rank in range(2)]
-    for child in children:
-        child.start()
-    assert sorted(results.get(timeout=60) for _ in children) == [(True, ["ash", "cedar"]), (True, ["birch"])]
-    for child in children:
-        child.join(60)
-    go(job_on(rooms, tmp_path / "stubbed"))
-    assert kept(job.out) == kept(tmp_path / "stubbed")
-
-
-def test_ranks_of_torchrun():
-    assert rank_of(TORCHRUN) == (Shard(4, 4), 1)
-    alone = {**TORCHRUN, "RANK": "0", "WORLD_SIZE": "1", "LOCAL_RANK": "0"}
-    assert rank_of({}) == rank_of({"WORLD_SIZE": "4"}) == rank_of(alone) == (Shard(), 0)

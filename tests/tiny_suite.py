@@ -25,7 +25,7 @@ from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.suite.job import EvalJob
 from ufmstar_torch.eval.suite.shards import evaluate_suite
-from ufmstar_torch.eval.suite.work_items import ALL, find_work
+from ufmstar_torch.eval.suite.work_items import find_work
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -207,7 +207,7 @@ def go(job, evaluate=None, **how):
     reported)."""
     lines: list[str] = []
     with mock.patch("ufmstar_torch.eval.suite.evaluate.evaluate_sequence", evaluate or Stub()):
-        outcome = evaluate_suite(job, **{"shard": ALL, **how}, report=lines.append)
+        outcome = evaluate_suite(job, **how, report=lines.append)
     return outcome, lines
 
 

@@ -108,13 +108,13 @@ class EvalOptions(MachineOptions):
     """The rows of a table or figure of the paper, on sequences of your own.
 
     A sequence's rows are written when its last frame is done: whatever ends the program, --resume computes what is
-    missing. The work can be divided: --processes on one computer, --shard in a cluster's job array, or torchrun.
+    missing. The work can be divided: --processes on one computer, --shard in a cluster's job array.
 
     Attributes:
         device: cpu or cuda; of several --processes, each takes the next GPU in turn
         threads: number of CPU threads of each process; default: all cores, divided among --processes
         processes: number of processes on this computer
-        shard: i/n, only the i-th of n parts of the sequences, 1/n to n/n; torchrun's processes are shards as well
+        shard: i/n, only the i-th of n parts of the sequences, 1/n to n/n
         dry_run: show rows and sequences, and stop
     """
 
@@ -145,9 +145,9 @@ class EvalOptions(MachineOptions):
             raise ValueError("--overwrite goes without shards: another one may have begun")
 
     @property
-    def part(self) -> Shard | None:
-        """The shard; None: all of them, or torchrun's. Raises ValueError: no such part."""
-        return None if self.shard is None else Shard.parse(self.shard)
+    def part(self) -> Shard:
+        """The shard. Raises ValueError: no such part."""
+        return ALL if self.shard is None else Shard.parse(self.shard)
 
 
 read = reader(EvalOptions, "ufmstar eval")
@@ -261,7 +261,7 @@ def _dry_run(options: EvalOptions) -> int:
     job = job_from(options)
     for base in job.unused:
         print(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
-    networks, items = job.load(torch.device("cpu")), (options.part or ALL).of(job.items)
+    networks, items = job.load(torch.device("cpu")), options.part.of(job.items)
     print(f"{job.suite.name}: {job.suite.title}\n{len(job.suite.rows)} rows:")
     for row in job.suite.rows:
         print(f"  {row.label}  [{networks[row.method.base].label}]")

@@ -1,7 +1,7 @@
 """The division of an evaluation: static shards of its sequences, and a task for each sequence of a shard.
 
-A shard is chosen by ``--shard`` (one job of a cluster's array, say) or by torchrun's rank; ``--processes`` evaluates it
-in a pool of processes. A record that exists is not computed again, so that a killed evaluation continues where it was.
+``--shard`` chooses a shard (one job of a cluster's array, say); ``--processes`` evaluates it in a pool of processes. A
+record that exists is not computed again, so that a killed evaluation continues where it was.
 """
 
 from __future__ import annotations
@@ -28,9 +28,8 @@ from ufmstar_torch.eval.run.machine import available_cores, device_of
 from ufmstar_torch.eval.suite.evaluate import evaluate_item
 from ufmstar_torch.eval.suite.folder import evaluation_folder
 from ufmstar_torch.eval.suite.job import EvalJob
-from ufmstar_torch.eval.suite.work_items import Shard, WorkItem
+from ufmstar_torch.eval.suite.work_items import ALL, Shard, WorkItem
 
-_TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
 _POLL_SECONDS = 0.1
 
 Stop = Callable[[], bool]
@@ -51,7 +50,7 @@ class EvalOutcome:
 def evaluate_suite(
     job: EvalJob,
     *,
-    shard: Shard | None = None,
+    shard: Shard = ALL,
     processes: int = 1,
     threads: int | None = None,
     resume: bool = False,
@@ -64,7 +63,7 @@ def evaluate_suite(
 
     Args:
         job: what is evaluated.
-        shard: which part; None: torchrun's rank, or else everything.
+        shard: which part.
         processes: number of processes on this computer that evaluate sequences of the shard.
         threads: of the CPU for each of several processes; None: all cores divided among them.
         resume, overwrite: see ``evaluation_folder``. The shards of an evaluation start in any order, so that each of
@@ -79,16 +78,14 @@ def evaluate_suite(
         CacheError, OSError: nothing can be written.
         RuntimeError: one of several processes failed; the message names the sequence.
     """
-    shard, local = (shard, 0) if shard is not None else rank_of(os.environ)
     if overwrite and shard.count > 1:
         raise ValueError("--overwrite goes without shards: another one may have begun")
-    device = torch.device(device_of(job.device, local) if processes == 1 else "cpu")
+    device = torch.device(device_of(job.device, 0) if processes == 1 else "cpu")
     networks, items, folder = job.load(device), shard.of(job.items), job.folder
     how = {"resume": resume or shard.count > 1, "overwrite": overwrite}
     with evaluation_folder(job.out, job.about(networks), shard=shard, **how), warned_once():
         if processes > 1:
-            numbers = range(local * processes, (local + 1) * processes)
-            finished = _in_processes(job, items, numbers, threads, stop, report, progress)
+            finished = _in_processes(job, items, processes, threads, stop, report, progress)
         else:
             judge, finished = job.judge(networks, device), False
             with suppress(Stopped):
@@ -101,36 +98,27 @@ def evaluate_suite(
     return EvalOutcome(finished, stop(), complete, {labels[where]: failed[where] for where in labels.keys() & failed})
 
 
-def rank_of(environment: Mapping[str, str]) -> tuple[Shard, int]:
-    """The shard of a process, and its number on its computer, as torchrun states them in the environment; the whole
-    where it has not started the process. Raises ValueError: the variables are not such numbers."""
-    if any(name not in environment for name in _TORCHRUN):
-        return Shard(), 0
-    rank, world, local = (int(environment[name]) for name in _TORCHRUN)
-    return Shard(rank + 1, world), local
-
-
 def _in_processes(
     job: EvalJob,
     items: Sequence[WorkItem],
-    numbers: Sequence[int],
+    processes: int,
     threads: int | None,
     stop: Stop,
     report: Report,
     progress: Shown,
 ) -> bool:
-    """Evaluate sequences in a pool of processes of these ``numbers``, a task each; whether all were done. Raises
+    """Evaluate sequences in a pool of processes, a task each; whether all were done. Raises
     RuntimeError: a task failed; the others end after their frame."""
     context = multiprocessing.get_context("spawn")
     stopped, queue = context.Event(), context.SimpleQueue()
-    for number in numbers:
+    for number in range(processes):
         queue.put(number)
-    threads = threads or max(1, available_cores() // len(numbers))
+    threads = threads or max(1, available_cores() // processes)
     waiting, running = list(items), dict[Future[str], WorkItem]()
-    with ProcessPoolExecutor(len(numbers), context, _begin, (job, queue, threads, stopped)) as pool:
+    with ProcessPoolExecutor(processes, context, _begin, (job, queue, threads, stopped)) as pool:
         try:
             while (waiting or running) and not stop():
-                while waiting and len(running) < len(numbers):
+                while waiting and len(running) < processes:
                     item = waiting.pop(0)
                     running[pool.submit(_evaluate, item)] = item
                 for future in wait(running, _POLL_SECONDS, FIRST_COMPLETED).done:
