@@ -8,19 +8,23 @@ errors of tracking add up. Gauss-Newton steps on poses and inverse depths, the l
 
 sigma_w and sigma_s are learnt (EM): the error d of the newest pose has the prior variance sigma^2 and, given the
 images, the posterior variance c; so d^2 should be sigma^2 - c on average. Independent errors show in the images. Errors
-that successive poses share, as those of a late trajectory, hardly do; the mean product of successive d measures them. A
-single pose that is off by far more than the others starts another trajectory: SLAM has closed a loop.
+that successive poses share hardly do; the mean product of successive d measures them. Those of a late trajectory follow
+the motion: ``time_offset`` estimates the offset, and the poses are corrected for it beforehand. A single pose that is
+off by far more than the others starts another trajectory: SLAM has closed a loop.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ufmstar_torch.anchors.epipolar import median
 from ufmstar_torch.anchors.saved_state import SavedState
+from ufmstar_torch.anchors.time_offset import TimeOffset
 
 # [px] Standard deviations of a position: by errors of the poses before any is learnt (best on tours whose poses err by
 # .05 to .15 degrees and 2 mm), the least and the largest one that is learnt, and by tracking from one view to the next
@@ -51,6 +55,7 @@ class PoseRefinement(SavedState):
             the corners [1/m^2]; one error for all of them. 0 where nothing was refined.
         correlated: variance of a position by the errors that successive given poses share [px^2].
         jumped: the newest given pose does not follow from those before.
+        offset: the given poses' time offset.
     """
 
     HELD: ClassVar = {
@@ -60,9 +65,11 @@ class PoseRefinement(SavedState):
         "_lately": "surprise_lately",
         "correlated": "correlated_pose_variance",
         "shared": "remaining_pose_variance",
+        "_by_offset": "pose_variance_by_offset",
     }
 
     def __init__(self) -> None:
+        self.offset = TimeOffset()
         self.reset()
 
     def reset(self) -> None:
@@ -72,11 +79,22 @@ class PoseRefinement(SavedState):
         self._learnt = 0  # errors of poses that the variance is from
         self.correlated, self.shared, self.jumped = 0.0, 0.0, False
         self._lately = _SURPRISE
+        self._by_offset = 0.0  # variance of a position by the time offset [px^2]
+        self.offset.reset()
+
+    def state(self) -> dict[str, Tensor]:
+        """A copy of all that is remembered, for :meth:`load_state`."""
+        return super().state() | self.offset.state()
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continue where :meth:`state` was taken; ValueError: an impossible value."""
+        super().load_state(state)
+        self.offset.load_state(state)
 
     @property
     def given(self) -> float:
         """Variance of a position by errors of the given poses [px^2]."""
-        return float(self._variance.sum())
+        return float(self._variance.sum()) + self._by_offset
 
     def refine(
         self, pixel: NDArray[np.float64], seen: NDArray[np.bool_], T_world_cam: NDArray[np.float64],
@@ -105,7 +123,8 @@ class PoseRefinement(SavedState):
         growth = 1 + _DRIFT * np.arange(len(views) - 2, -1, -1)
         precision = seen[np.ix_(tracks, views[:-1])] / growth * (K[0, 0] / _TRACKING) ** 2
         prior = np.broadcast_to(1 / (self._variance[:, None] * unit**2), (len(views), 2, 3)).ravel()
-        poses, error = T_world_cam[views], np.zeros(len(prior))
+        shift = self.offset.shift(T_world_cam[views])
+        poses, error = moved(T_world_cam[views], shift.ravel()), np.zeros(len(prior))
         rho = inverse_depths(ray, precision, poses, 1 / depth, _STUDENT, _DEPTH_STEPS)
         try:
             for _ in range(_STEPS):
@@ -124,7 +143,9 @@ class PoseRefinement(SavedState):
         if not (np.isfinite(poses).all() and np.isfinite(covariance).all()):
             return T_world_cam
         self.shared = median((by_error @ covariance * by_error).sum(1))
+        self._by_offset = float(np.square(shift[-1].reshape(2, 3) / unit).sum()) / 3
         self._learn(error[-6:].reshape(2, 3) / unit, covariance.diagonal()[-6:].reshape(2, 3) / unit**2)
+        self.offset.learn(T_world_cam[views], prior, error, covariance)
         refined = T_world_cam.copy()
         refined[views] = poses
         return refined

@@ -236,7 +236,7 @@ class DenseEvidence(SavedState):
         variance = np.concatenate([(stated + alone) * depth[: len(stated)] ** 4, corners.variance[far]])
         position = (np.concatenate([surface, corners.pixel[far]]) - scale[:2, 2]) / scale.diagonal()[:2]
         none = corners.none if corners.contradicted else Landmarks.none
-        judged = corners.pose_error, shared, corners.contradicted, self._memory.apart
+        judged = corners.pose_error, shared, corners.contradicted, self._memory.apart, corners.lag
         return Landmarks(position, depth, variance, searched, none, *judged)
 
     def _in_cells(

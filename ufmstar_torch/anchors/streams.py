@@ -21,9 +21,11 @@ _CAUSES = (
     "Are poses camera-to-world, of the images' times, and the intrinsics the images'? Does the video stand still? "
     "(said once)"
 )
+_TIMES = "the depth network's views do not: compare the times of poses and images (said once)"
 # A file may be named by a str too; type checkers then find no misspelt word.
 Given = Literal["corners", "dense"] | Path | LandmarkSource
 _IN_A_ROW = 8  # images that contradict their poses before the warning; what a blurred one shows lasts for some
+_LATE = 0.5  # images; a larger time offset of the poses is worth a warning
 _PARTS = ("pixel", "depth", "variance", "valid", "pose_error", "shared", "scale")
 
 
@@ -48,6 +50,7 @@ class StreamLandmarks:
         self.needs_image = any(source.needs_image for source in self._sources)
         self.last: list[Landmarks] = []
         self._contradicted = [0] * len(self._sources)  # images in a row; -1 = the warning is out
+        self._late = set[int]()  # streams whose time offset was named
 
     def update(
         self,
@@ -99,6 +102,10 @@ class StreamLandmarks:
             raise
         self._before, self.last = before, result
         for i, landmarks in enumerate(result):
+            if abs(landmarks.lag) > _LATE and i not in self._late:
+                self._late.add(i)
+                way = f"{abs(landmarks.lag):.1f} images {'late' if landmarks.lag > 0 else 'early'}"
+                _LOG.warning("stream %d: the poses seem %s, which the anchors allow for; %s", i, way, _TIMES)
             if self._contradicted[i] < 0:
                 continue
             self._contradicted[i] = (

@@ -129,6 +129,7 @@ class Landmarks:
             [1/m^2]; it is in ``variance`` too. Infinite where the poses contradict not the newest image alone.
         contradicted: the poses contradict the images, and no depth is used.
         scale: variance of the logarithm of a factor that all depths of the image have in common; in ``variance`` too.
+        lag: by how many images the given poses are late, as far as corners show it; negative = early.
     """
 
     pixel: NDArray[np.float64]
@@ -140,6 +141,7 @@ class Landmarks:
     shared: float = 0.0
     contradicted: bool = False
     scale: float = 0.0
+    lag: float = 0.0
 
     @classmethod
     def skipped(cls, fault: str) -> Landmarks:
@@ -325,6 +327,11 @@ class LandmarkTracker(SavedState):
         return (self._off**2 + self._refinement.given) ** 0.5 if self._off >= 0 else float("nan")
 
     @property
+    def lag(self) -> float:
+        """By how many images the given poses are late; negative = early, 0 = not shown."""
+        return self._refinement.offset.lag
+
+    @property
     def remaining_error(self) -> float:
         """That by the refined poses, with the errors that successive given poses share [px]; 0 = not measured."""
         return (max(self._off, 0.0) ** 2 + self._refinement.correlated) ** 0.5
@@ -446,7 +453,8 @@ class LandmarkTracker(SavedState):
         if result is None or self.contradicted or self.baseline < _PARALLAX * self._depth:
             nothing, shared = np.zeros(0), self.shared(self.baseline)
             pixel = np.zeros((0, 2))
-            return Landmarks(pixel, nothing, nothing, tracked, none, self.pose_error, shared, self.contradicted)
+            judged = self.pose_error, shared, self.contradicted
+            return Landmarks(pixel, nothing, nothing, tracked, none, *judged, lag=self.lag)
         T = self._poses[self._view]
         axis = T[:3, 2]
         depth = (result.point - T[:3, 3]) @ axis
@@ -469,7 +477,7 @@ class LandmarkTracker(SavedState):
         pixel = self._pixel[chosen][fine, self._view]
         shared = self.shared(self.baseline) + self._refinement.shared
         variance = variance[fine] + shared * depth[fine] ** 4
-        return Landmarks(pixel, depth[fine], variance, tracked, none, self.pose_error, shared)
+        return Landmarks(pixel, depth[fine], variance, tracked, none, self.pose_error, shared, lag=self.lag)
 
     def shared(self, baseline: float) -> float:
         """Variance of inverse depths by errors of the poses over a baseline [m], alike for all points [1/m^2]; infinite
