@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import logging
+from itertools import islice
 
 import numpy as np
 import pytest
 import torch
 from landmark_runs import long_walks, true_depth, walk
 from scipy.spatial.transform import Rotation
+from shared_data import require_shared
 
 from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.anchors.time_offset import TimeOffset
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.kernels.bundle_cpu import moved
+
+RECORDINGS = "rgbd_dataset_freiburg1_xyz", "rgbd_dataset_freiburg3_teddy", "hololens_office", "tartanair_sample/P000"
 
 
 def path(times):
@@ -120,3 +125,15 @@ def test_the_estimate_is_saved_with_the_state():
     assert other.state()["corners_lag"].item() == source.state()["corners_lag"].item()
     source.reset()
     assert source.state()["corners_lag_information"].item() == 0
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_recordings_have_no_offset_until_their_poses_are_late(name):
+    frames = list(islice(open_sequence(require_shared(f"data/{name}")).readable(lambda error: None), 31))
+    K = frames[0].intrinsics
+    for late in (0, 1):
+        source = DenseEvidence()
+        for frame, given in zip(frames[late:], frames, strict=False):
+            lag = source.update(frame.image, given.T_world_cam, K).lag
+        print(f"{name}, {late} late: {lag:.2f}")
+        assert abs(lag) < 0.2 if late == 0 else 0.3 < lag < 1
