@@ -137,7 +137,7 @@ class PoseRefinement(SavedState):
                 step = np.asarray(np.linalg.solve(A, b - prior * error), np.float64)
                 poses, error = moved(poses, step), error + step
                 rho = (rho + alone - by_error @ step).clip(FAR / depth, NEAR / depth)
-            covariance = np.linalg.inv(A)
+            covariance = np.asarray(np.linalg.inv(A), np.float64)
         except np.linalg.LinAlgError:  # singular: numbers that are far out of scale
             return T_world_cam
         if not (np.isfinite(poses).all() and np.isfinite(covariance).all()):
