@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence with
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Names of a row's sums.
 METRICS, BY_ERROR, CONFIDENCE = "metrics", "nll_by_error", "confidence"
-EACH = 512  # pixels of a frame, evenly, for ``ufmstar recalibrate --kind confidence``
+EACH = 512  # pixels of a frame, evenly, for ``ufmstar recalibrate --covariate confidence``
 # Metrics of one's own by name (``sequences.plugins``).
 Own = Mapping[str, Any]
 NONE: Own = MappingProxyType({})
