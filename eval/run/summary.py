@@ -167,7 +167,8 @@ def _anchors(done: Records) -> dict[str, Any] | None:
     return {
         **means,
         "frames_before_the_first": len(records) if first is None else first,
-        "frames_without": dict(Counter(record["without"] for record in records if record["without"] is not None)),
+        # Without the figures of single frames, which frames.jsonl has.
+        "frames_without": dict(Counter(r["without"].partition(":")[0] for r in records if r["without"] is not None)),
         **({"frames_with_confidence": sum(r["confidence"] for r in stated)} if stated else {}),
         "mean_anchored": _pixel_mean(done, "mean_anchored"),
         "mean_bias": _pixel_mean(done, "mean_bias"),

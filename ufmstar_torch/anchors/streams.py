@@ -21,7 +21,9 @@ _CAUSES = (
     "Are poses camera-to-world, of the images' times, and the intrinsics the images'? Does the video stand still? "
     "(said once)"
 )
-_TIMES = "the depth network's views do not: compare the times of poses and images (said once)"
+_TIMES = (
+    "Anchors are corrected for it, UfM*'s comparison of views is not: check the times of poses and images (said once)"
+)
 # A file may be named by a str too; type checkers then find no misspelt word.
 Given = Literal["corners", "dense"] | Path | LandmarkSource
 _IN_A_ROW = 8  # images that contradict their poses before the warning; what a blurred one shows lasts for some
@@ -105,7 +107,7 @@ class StreamLandmarks:
             if abs(landmarks.lag) > _LATE and i not in self._late:
                 self._late.add(i)
                 way = f"{abs(landmarks.lag):.1f} images {'late' if landmarks.lag > 0 else 'early'}"
-                _LOG.warning("stream %d: the poses seem %s, which the anchors allow for; %s", i, way, _TIMES)
+                _LOG.warning("stream %d: the poses seem %s. %s", i, way, _TIMES)
             if self._contradicted[i] < 0:
                 continue
             self._contradicted[i] = (
