@@ -10,7 +10,7 @@ import lightning.pytorch as pl
 import torch
 from torch import nn
 
-from ufmstar_torch.anchors.landmarks import DENSE
+from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
 from ufmstar_torch.eval.engine.judge import METRICS
 from ufmstar_torch.eval.engine.networks import NetworkSource

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.tracker import OtherCameraError
+from ufmstar_torch.anchors.landmarks import OtherCameraError
 from ufmstar_torch.arguments import CameraLike, ImageLike, as_image, as_intrinsics, as_pose
 from ufmstar_torch.atomic import write_atomic
 from ufmstar_torch.camera import rotation_deviation

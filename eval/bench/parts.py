@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.landmarks import landmark_source
+from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork

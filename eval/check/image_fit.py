@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from ufmstar_torch.anchors.corners import find, follow
-from ufmstar_torch.anchors.tracker import checked
+from ufmstar_torch.anchors.landmarks import checked
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 

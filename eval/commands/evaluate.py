@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from ufmstar_torch.anchors.landmarks import DENSE
+from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
 from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, option, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals

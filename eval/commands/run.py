@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 
 import torch
 
-from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, LandmarkSource
+from ufmstar_torch.anchors.landmarks import LandmarkSource
+from ufmstar_torch.anchors.sources import CORNERS, DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.depth import SECTIONS, MapOptions, NetworkOptions, UfMOptions
 from ufmstar_torch.eval.commands.options import MachineOptions, as_dict, positional, reader, usage_errors

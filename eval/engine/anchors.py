@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
-from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, LandmarkMap, LandmarkSource, landmark_source
+from ufmstar_torch.anchors.landmarks import Landmarks, LandmarkSource
+from ufmstar_torch.anchors.sources import CORNERS, DENSE, FILE_TYPES, LandmarkMap, landmark_source
 from ufmstar_torch.anchors.streams import StreamLandmarks
-from ufmstar_torch.anchors.tracker import Landmarks, TrackerConfig
+from ufmstar_torch.anchors.tracker import TrackerConfig
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRUTH, Setting

@@ -13,7 +13,7 @@ from functools import partial
 
 import torch
 
-from ufmstar_torch.anchors.landmarks import DENSE
+from ufmstar_torch.anchors.sources import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.estimators import make_estimator

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.tracker import Landmarks
+from ufmstar_torch.anchors.landmarks import Landmarks
 from ufmstar_torch.eval.engine.anchors import AnchorSource
 from ufmstar_torch.eval.engine.clock import timed
 from ufmstar_torch.eval.engine.estimators import Estimator

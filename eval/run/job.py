@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.landmarks import LandmarkSource, landmark_source
+from ufmstar_torch.anchors.landmarks import LandmarkSource
+from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.check.image_fit import FollowedCorners, ImageFit, image_fit, track_corners
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks

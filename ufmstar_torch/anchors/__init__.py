@@ -8,9 +8,9 @@ if TYPE_CHECKING:
     from ufmstar_torch.anchors.anchors import Anchors as Anchors
     from ufmstar_torch.anchors.dense import DenseConfig as DenseConfig
     from ufmstar_torch.anchors.dense import DenseEvidence as DenseEvidence
-    from ufmstar_torch.anchors.landmarks import LandmarkMap as LandmarkMap
-    from ufmstar_torch.anchors.landmarks import landmark_source as landmark_source
-    from ufmstar_torch.anchors.tracker import Landmarks as Landmarks
+    from ufmstar_torch.anchors.landmarks import Landmarks as Landmarks
+    from ufmstar_torch.anchors.sources import LandmarkMap as LandmarkMap
+    from ufmstar_torch.anchors.sources import landmark_source as landmark_source
     from ufmstar_torch.anchors.tracker import LandmarkTracker as LandmarkTracker
     from ufmstar_torch.anchors.tracker import TrackerConfig as TrackerConfig
 else:

@@ -24,15 +24,9 @@ from ufmstar_torch.anchors.dense_keyframes import Keyframes
 from ufmstar_torch.anchors.dense_memory import Memory
 from ufmstar_torch.anchors.dense_poses import Fit, PoseErrors
 from ufmstar_torch.anchors.epipolar import median
+from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked
 from ufmstar_torch.anchors.saved_state import SavedState
-from ufmstar_torch.anchors.tracker import (
-    REPEATED,
-    Landmarks,
-    LandmarkTracker,
-    OtherCameraError,
-    TrackerConfig,
-    checked,
-)
+from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.optional import optional
 

@@ -1,13 +1,9 @@
-"""Sources of landmarks for one camera, image by image: the corner tracker, dense evidence, or a map of
-landmarks in a file.
-"""
+"""Landmarks of an image, and the interface of their sources (``sources``)."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,20 +12,84 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
-from ufmstar_torch.anchors.dense import DenseEvidence
-from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker
-from ufmstar_torch.array_files import read_npz
-from ufmstar_torch.camera import invert_rigid
+from ufmstar_torch.optional import optional
 
-CORNERS, DENSE = "corners", "dense"
-FILE_TYPES = (".csv", ".txt", ".npz")
-# Landmarks of one image: as many as a tracker follows, or a few more.
-_MOST = 500
+# Why an image has no landmark.
+REPEATED = "the image is the one before again, with another pose"
+
+
+class OtherCameraError(ValueError):
+    """An image is of another size or camera than those before."""
+
+    def __init__(self) -> None:
+        super().__init__("image and K must be of the size and camera of the images before: call reset() first")
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Triangulated corners as the current image sees them.
+
+    Attributes:
+        pixel: [N, 2] position (u, v) [px].
+        depth: [N] along the optical axis [m].
+        variance: [N] of ``depth`` [m^2].
+        tracked: corners followed into this image, of which these N passed all tests; of a map, its landmarks.
+        none: why there is no landmark, where N = 0.
+        pose_error: standard deviation of tracked corners from their epipolar lines by the given poses [px]; NaN = not
+            measured.
+        shared: variance of inverse depths by errors of the poses, the same error for all landmarks of the image
+            [1/m^2]; it is in ``variance`` too. Infinite where the poses contradict not the newest image alone.
+        contradicted: the poses contradict the images, and no depth is used.
+        scale: variance of the logarithm of a factor that all depths of the image have in common; in ``variance`` too.
+        lag: by how many images the given poses are late, as far as corners show it; negative = early.
+    """
+
+    pixel: NDArray[np.float64]
+    depth: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    tracked: int
+    none: str = "no parallax, or no earlier view that agrees"
+    pose_error: float = float("nan")
+    shared: float = 0.0
+    contradicted: bool = False
+    scale: float = 0.0
+    lag: float = 0.0
+
+    @classmethod
+    def skipped(cls, fault: str) -> Landmarks:
+        """None, of an image whose pose or intrinsics have a fault."""
+        return cls(np.zeros((0, 2)), np.zeros(0), np.zeros(0), 0, none=fault)
+
+    def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
+        """As UfM* takes them, for one stream whose depth map has its own size and intrinsics.
+
+        Args:
+            K_camera: [3, 3] of the images [px].
+            intrinsics: [3, 3] or [1, 3, 3] of the depth map [px]: the same camera, resized or cropped.
+            capacity: pad to this number, so that shapes stay the same from frame to frame.
+
+        Raises:
+            ValueError: more landmarks than ``capacity``.
+        """
+        n = len(self.depth)
+        room = n if capacity is None else capacity
+        if room < n:
+            raise ValueError(f"capacity must be at least the number of landmarks, {n}, got {capacity}")
+
+        def padded(values: NDArray) -> Tensor:
+            full = np.zeros((1, room, *values.shape[1:]))
+            full[0, :n] = values
+            return torch.from_numpy(full).to(intrinsics.device)
+
+        # Made by NumPy: each of torch's operations takes several times as long after a network.
+        valid = torch.from_numpy(np.arange(room)[None] < n).to(intrinsics.device)
+        frame = torch.from_numpy(np.array([[self.pose_error], [self.shared], [self.scale]])).to(intrinsics.device)
+        result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, *frame)
+        return result.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
 
 class LandmarkSource(Protocol):
-    """Landmarks of one camera, in the order of its images. :class:`LandmarkTracker`,
-    :class:`DenseEvidence` and :class:`LandmarkMap` are three.
+    """Landmarks of one camera, in the order of its images: a tracker of corners, dense evidence, or a map.
 
     Attributes:
         needs_image: whether :meth:`update` looks at the image, beyond its size.
@@ -48,7 +108,9 @@ class LandmarkSource(Protocol):
         """Process the next image [H, W, 3] RGB, its pose [4, 4] [m] and its intrinsics [3, 3] [px].
 
         Raises:
-            ValueError: a wrong shape or dtype; the source is as it was then.
+            TypeError: ``image`` is no array, where one is needed.
+            ValueError: a wrong shape or dtype, a pose that is not finite, another size or camera than before (call
+                :meth:`reset` first); the source is as it was then.
         """
         ...
 
@@ -66,160 +128,23 @@ class LandmarkSource(Protocol):
         ...
 
 
-def landmark_source(value: str | Path | LandmarkSource) -> LandmarkSource:
-    """The source that a word or a file's name stands for, in its initial state.
-
-    Args:
-        value: "corners": tracked corners; "dense": dense evidence; the name of a file:
-            :meth:`LandmarkMap.read`; a source: itself.
+def checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:
+    """Gray image, pose and intrinsics.
 
     Raises:
-        FileNotFoundError: no such file.
-        TypeError: neither a word, nor a file's name, nor a source.
-        ValueError: no word of these and no file of landmarks.
+        TypeError, ValueError: as :meth:`LandmarkSource.update`.
     """
-    if not isinstance(value, str | Path):
-        if not callable(getattr(value, "update", None)):
-            raise TypeError(f"anchors must be 'corners', 'dense', a file's name or a LandmarkSource, got {value!r}")
-        return value
-    if value == CORNERS:
-        return LandmarkTracker()
-    if value == DENSE:
-        return DenseEvidence()
-    return LandmarkMap.read(value)
+    if not isinstance(image, np.ndarray):
+        raise TypeError(f"image must be a NumPy array [H, W, 3] or [H, W], got {type(image).__name__}")
+    if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
+        raise ValueError(f"image must be uint8 [H, W, 3] or [H, W], got {image.dtype} {image.shape}")
+    T, K = np.asarray(T_world_cam, dtype=np.float64), np.asarray(K, dtype=np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise ValueError("T_world_cam must be a finite 4x4 camera-to-world matrix")
+    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise ValueError("K must be a finite 3x3 matrix with positive focal lengths [px]")
+    if image.ndim == 2:
+        return np.ascontiguousarray(image), T, K
+    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
 
-
-@dataclass(frozen=True, eq=False)
-class LandmarkMap:
-    """Landmarks at known places of the world: of a SLAM map, of a survey.
-
-    An image's landmarks are those in front of the camera and inside the image (:meth:`Anchors.from_points`), at most
-    500, evenly through the map's order. What hides a landmark is not known: of a large map, give the part that the
-    camera can see.
-
-    Attributes:
-        points_world: [P, 3] [m].
-        sigma: [P] standard deviation of a landmark's position, the same in every direction [m].
-
-    Raises:
-        ValueError: wrong shapes, or no landmark with finite values.
-    """
-
-    points_world: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    needs_image = False
-
-    def __post_init__(self) -> None:
-        points, sigma = np.array(self.points_world, dtype=np.float64), np.array(self.sigma, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != 3 or sigma.shape != points.shape[:1]:
-            raise ValueError(f"points_world must be [P, 3] and sigma [P], got {points.shape} and {sigma.shape}")
-        if not (np.isfinite(points).all(axis=1) & np.isfinite(sigma) & (sigma >= 0)).any():
-            raise ValueError("points_world and sigma must hold a landmark with finite values and sigma >= 0")
-        object.__setattr__(self, "points_world", points)
-        object.__setattr__(self, "sigma", sigma)
-
-    @classmethod
-    def read(cls, path: str | Path) -> LandmarkMap:
-        """From a file: ``.csv`` or ``.txt`` with a line ``x y z sigma`` [m] for each landmark, separated by commas or
-        spaces, ``#`` before a comment, a first line of names allowed; or ``.npz`` with ``points`` [P, 3] and ``sigma``
-        [P] [m]. World axes and scale are those of the poses. A row that is not finite is never used.
-
-        Raises:
-            FileNotFoundError: no such file.
-            ValueError: another format; the message names the file.
-        """
-        path = Path(path)
-        if path.suffix.lower() not in FILE_TYPES:
-            raise ValueError(
-                f"anchors: {str(path)!r} is neither {CORNERS!r}, {DENSE!r} nor a file {', '.join(FILE_TYPES)}"
-            )
-        try:
-            points, sigma = read_npz(path, ["points", "sigma"]) if path.suffix.lower() == ".npz" else _read_text(path)
-            return cls(points, sigma)
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"{path}: expected landmarks x y z sigma [m]: {error}") from error
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        """A digest of the values."""
-        digest = hashlib.sha256(self.points_world.tobytes() + self.sigma.tobytes()).hexdigest()
-        return {"anchors": "landmarks", "landmarks": digest}
-
-    def anchors(self, T_world_cam: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Anchors:
-        """All landmarks as anchors of B views; those out of view are not valid.
-
-        Args:
-            T_world_cam: [B, 4, 4] camera-to-world [m].
-            intrinsics: [B, 3, 3] or [3, 3] [px].
-            size: (H, W) [px].
-
-        Returns:
-            [B, P].
-        """
-        T_cam_world = invert_rigid(T_world_cam.double())
-        points = torch.from_numpy(self.points_world).to(T_cam_world.device)
-        points_cam = points @ T_cam_world[:, :3, :3].mT + T_cam_world[:, None, :3, 3]
-        variance = torch.from_numpy(self.sigma).to(points_cam.device).square().expand(len(points_cam), -1)
-        return Anchors.from_points(points_cam, variance, intrinsics, size)
-
-    def update(
-        self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
-    ) -> Landmarks:
-        """The landmarks in an image; without an image, those less than 80 degrees off the optical axis.
-
-        Raises:
-            ValueError: a pose or intrinsics of another shape, or not finite.
-        """
-        T, K = np.asarray(T_world_cam, dtype=np.float64), np.asarray(K, dtype=np.float64)
-        if T.shape != (4, 4) or K.shape != (3, 3) or not (np.isfinite(T).all() and np.isfinite(K).all()):
-            raise ValueError("T_world_cam must be a finite 4x4 matrix and K a finite 3x3 matrix")
-        offset = np.zeros(2)
-        if image is None:  # a square about the optical axis
-            half = np.tan(np.radians(80)) * np.array([K[0, 0], K[1, 1]])
-            offset, size = half - K[:2, 2], (int(2 * half[1]), int(2 * half[0]))
-        else:
-            size = (image.shape[0], image.shape[1])
-        shifted = K.copy()
-        shifted[:2, 2] += offset
-        result = self.anchors(torch.from_numpy(T)[None], torch.from_numpy(shifted), size)
-        assert result.valid is not None
-        kept = np.flatnonzero(result.valid[0].numpy())
-        kept = kept[:: -(-len(kept) // _MOST) or 1]
-        pixel, depth, variance = (x[0].numpy()[kept] for x in (result.pixel, result.depth, result.variance))
-        return Landmarks(pixel - offset, depth, variance, len(self.sigma), none="no landmark of the map is in view")
-
-    def reset(self) -> None:
-        """Nothing: a map remembers no image."""
-
-    def state(self) -> dict[str, Tensor]:
-        """{}: a map remembers no image."""
-        return {}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Nothing to restore.
-
-        Raises:
-            ValueError: ``state`` is that of another source.
-        """
-        if state:
-            raise ValueError(f"state must be empty for a map of landmarks, got {sorted(state)}")
-
-
-def _read_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    lines = [line.partition("#")[0].replace(",", " ").split() for line in path.read_text(encoding="utf-8").splitlines()]
-    rows = [(number, words) for number, words in enumerate(lines, start=1) if words]
-    if rows and not _is_number(rows[0][1][0]):
-        rows = rows[1:]  # names of the columns
-    for number, words in rows:
-        if len(words) != 4 or not all(map(_is_number, words)):
-            raise ValueError(f"line {number} holds {' '.join(words)!r}")
-    values = np.array([words for _, words in rows], dtype=np.float64).reshape(-1, 4)
-    return values[:, :3], values[:, 3]
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), dtype=np.uint8), T, K

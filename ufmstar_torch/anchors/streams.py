@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors.anchors import Anchors
-from ufmstar_torch.anchors.landmarks import LandmarkSource, landmark_source
-from ufmstar_torch.anchors.tracker import REPEATED, Landmarks
+from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, LandmarkSource
+from ufmstar_torch.anchors.sources import landmark_source
 from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.frame import FRAME_FAULTS, intrinsics_fault, pose_fault
 

@@ -16,13 +16,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.anchors import Anchors
 from ufmstar_torch.anchors.bundle import PoseRefinement
 from ufmstar_torch.anchors.corners import find, follow
 from ufmstar_torch.anchors.epipolar import NEAREST, median, off_lines, weighted_median
+from ufmstar_torch.anchors.landmarks import REPEATED, Landmarks, OtherCameraError, checked
 from ufmstar_torch.anchors.saved_state import SavedState, saved_image
 from ufmstar_torch.checked import Checked, number
-from ufmstar_torch.optional import optional
 
 if TYPE_CHECKING:
     from ufmstar_torch.kernels.triangulate_cpu import Triangulated
@@ -37,7 +36,6 @@ _DRIFT = 0.6
 _MEMORY, _LONG = 0.8, 4
 # Why an image has no landmark.
 _NO_TRACK, _NO_DEPTH = "no corner followed from the frame before", "no parallax, or no track that fits the poses"
-REPEATED = "the image is the one before again, with another pose"
 # Entries of two poses that differ by no more are of one pose [1, m].
 _SAME = 1e-6
 # Depths of a scene, over the median: where the poses allow a corner's point to be. Half of the corners lie nearer than
@@ -58,13 +56,6 @@ _CLEAR_SHARE = 1 / 3
 _CELLS = 6
 # The median of the absolute value of a standard normal variable.
 _MEDIAN = 0.6745
-
-
-class OtherCameraError(ValueError):
-    """An image is of another size or camera than those before."""
-
-    def __init__(self) -> None:
-        super().__init__("image and K must be of the size and camera of the images before: call reset() first")
 
 
 @dataclass(frozen=True)
@@ -111,69 +102,6 @@ class TrackerConfig(Checked):
         super().__post_init__()
         if self.min_views > self.window:
             raise ValueError(f"TrackerConfig.min_views must be at most window = {self.window}, got {self.min_views}")
-
-
-@dataclass(frozen=True, eq=False)
-class Landmarks:
-    """Triangulated corners as the current image sees them.
-
-    Attributes:
-        pixel: [N, 2] position (u, v) [px].
-        depth: [N] along the optical axis [m].
-        variance: [N] of ``depth`` [m^2].
-        tracked: corners followed into this image, of which these N passed all tests; of a map, its landmarks.
-        none: why there is no landmark, where N = 0.
-        pose_error: standard deviation of tracked corners from their epipolar lines by the given poses [px]; NaN = not
-            measured.
-        shared: variance of inverse depths by errors of the poses, the same error for all landmarks of the image
-            [1/m^2]; it is in ``variance`` too. Infinite where the poses contradict not the newest image alone.
-        contradicted: the poses contradict the images, and no depth is used.
-        scale: variance of the logarithm of a factor that all depths of the image have in common; in ``variance`` too.
-        lag: by how many images the given poses are late, as far as corners show it; negative = early.
-    """
-
-    pixel: NDArray[np.float64]
-    depth: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    tracked: int
-    none: str = "no parallax, or no earlier view that agrees"
-    pose_error: float = float("nan")
-    shared: float = 0.0
-    contradicted: bool = False
-    scale: float = 0.0
-    lag: float = 0.0
-
-    @classmethod
-    def skipped(cls, fault: str) -> Landmarks:
-        """None, of an image whose pose or intrinsics have a fault."""
-        return cls(np.zeros((0, 2)), np.zeros(0), np.zeros(0), 0, none=fault)
-
-    def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
-        """As UfM* takes them, for one stream whose depth map has its own size and intrinsics.
-
-        Args:
-            K_camera: [3, 3] of the images [px].
-            intrinsics: [3, 3] or [1, 3, 3] of the depth map [px]: the same camera, resized or cropped.
-            capacity: pad to this number, so that shapes stay the same from frame to frame.
-
-        Raises:
-            ValueError: more landmarks than ``capacity``.
-        """
-        n = len(self.depth)
-        room = n if capacity is None else capacity
-        if room < n:
-            raise ValueError(f"capacity must be at least the number of landmarks, {n}, got {capacity}")
-
-        def padded(values: NDArray) -> Tensor:
-            full = np.zeros((1, room, *values.shape[1:]))
-            full[0, :n] = values
-            return torch.from_numpy(full).to(intrinsics.device)
-
-        # Made by NumPy: each of torch's operations takes several times as long after a network.
-        valid = torch.from_numpy(np.arange(room)[None] < n).to(intrinsics.device)
-        frame = torch.from_numpy(np.array([[self.pose_error], [self.shared], [self.scale]])).to(intrinsics.device)
-        result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, *frame)
-        return result.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
 
 class LandmarkTracker(SavedState):
@@ -490,25 +418,3 @@ class LandmarkTracker(SavedState):
 def contradiction(error: float, limit: float) -> str:
     """The warning that no depth is used, where corners lie ``error`` px from their epipolar lines."""
     return f"poses contradict the images: corners lie {error:.1f} px from their epipolar lines, at most {limit:.1f}"
-
-
-def checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:
-    """Gray image, pose and intrinsics.
-
-    Raises:
-        TypeError, ValueError: as :meth:`LandmarkTracker.update`.
-    """
-    if not isinstance(image, np.ndarray):
-        raise TypeError(f"image must be a NumPy array [H, W, 3] or [H, W], got {type(image).__name__}")
-    if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
-        raise ValueError(f"image must be uint8 [H, W, 3] or [H, W], got {image.dtype} {image.shape}")
-    T, K = np.asarray(T_world_cam, dtype=np.float64), np.asarray(K, dtype=np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise ValueError("T_world_cam must be a finite 4x4 camera-to-world matrix")
-    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise ValueError("K must be a finite 3x3 matrix with positive focal lengths [px]")
-    if image.ndim == 2:
-        return np.ascontiguousarray(image), T, K
-    cv2 = optional("cv2", "landmarks of images need OpenCV", "'ufmstar-torch[eval]'")
-
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), dtype=np.uint8), T, K

@@ -1,0 +1,185 @@
+"""Sources of landmarks by name: the corner tracker, dense evidence, or a map of landmarks in a file."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ufmstar_torch.anchors.anchors import Anchors
+from ufmstar_torch.anchors.dense import DenseEvidence
+from ufmstar_torch.anchors.landmarks import Landmarks, LandmarkSource
+from ufmstar_torch.anchors.tracker import LandmarkTracker
+from ufmstar_torch.array_files import read_npz
+from ufmstar_torch.camera import invert_rigid
+
+CORNERS, DENSE = "corners", "dense"
+FILE_TYPES = (".csv", ".txt", ".npz")
+# Landmarks of one image: as many as a tracker follows, or a few more.
+_MOST = 500
+
+
+def landmark_source(value: str | Path | LandmarkSource) -> LandmarkSource:
+    """The source that a word or a file's name stands for, in its initial state.
+
+    Args:
+        value: "corners": tracked corners; "dense": dense evidence; the name of a file:
+            :meth:`LandmarkMap.read`; a source: itself.
+
+    Raises:
+        FileNotFoundError: no such file.
+        TypeError: neither a word, nor a file's name, nor a source.
+        ValueError: no word of these and no file of landmarks.
+    """
+    if not isinstance(value, str | Path):
+        if not callable(getattr(value, "update", None)):
+            raise TypeError(f"anchors must be 'corners', 'dense', a file's name or a LandmarkSource, got {value!r}")
+        return value
+    if value == CORNERS:
+        return LandmarkTracker()
+    if value == DENSE:
+        return DenseEvidence()
+    return LandmarkMap.read(value)
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkMap:
+    """Landmarks at known places of the world: of a SLAM map, of a survey.
+
+    An image's landmarks are those in front of the camera and inside the image (:meth:`Anchors.from_points`), at most
+    500, evenly through the map's order. What hides a landmark is not known: of a large map, give the part that the
+    camera can see.
+
+    Attributes:
+        points_world: [P, 3] [m].
+        sigma: [P] standard deviation of a landmark's position, the same in every direction [m].
+
+    Raises:
+        ValueError: wrong shapes, or no landmark with finite values.
+    """
+
+    points_world: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    needs_image = False
+
+    def __post_init__(self) -> None:
+        points, sigma = np.array(self.points_world, dtype=np.float64), np.array(self.sigma, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3 or sigma.shape != points.shape[:1]:
+            raise ValueError(f"points_world must be [P, 3] and sigma [P], got {points.shape} and {sigma.shape}")
+        if not (np.isfinite(points).all(axis=1) & np.isfinite(sigma) & (sigma >= 0)).any():
+            raise ValueError("points_world and sigma must hold a landmark with finite values and sigma >= 0")
+        object.__setattr__(self, "points_world", points)
+        object.__setattr__(self, "sigma", sigma)
+
+    @classmethod
+    def read(cls, path: str | Path) -> LandmarkMap:
+        """From a file: ``.csv`` or ``.txt`` with a line ``x y z sigma`` [m] for each landmark, separated by commas or
+        spaces, ``#`` before a comment, a first line of names allowed; or ``.npz`` with ``points`` [P, 3] and ``sigma``
+        [P] [m]. World axes and scale are those of the poses. A row that is not finite is never used.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: another format; the message names the file.
+        """
+        path = Path(path)
+        if path.suffix.lower() not in FILE_TYPES:
+            raise ValueError(
+                f"anchors: {str(path)!r} is neither {CORNERS!r}, {DENSE!r} nor a file {', '.join(FILE_TYPES)}"
+            )
+        try:
+            points, sigma = read_npz(path, ["points", "sigma"]) if path.suffix.lower() == ".npz" else _read_text(path)
+            return cls(points, sigma)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path}: expected landmarks x y z sigma [m]: {error}") from error
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """A digest of the values."""
+        digest = hashlib.sha256(self.points_world.tobytes() + self.sigma.tobytes()).hexdigest()
+        return {"anchors": "landmarks", "landmarks": digest}
+
+    def anchors(self, T_world_cam: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Anchors:
+        """All landmarks as anchors of B views; those out of view are not valid.
+
+        Args:
+            T_world_cam: [B, 4, 4] camera-to-world [m].
+            intrinsics: [B, 3, 3] or [3, 3] [px].
+            size: (H, W) [px].
+
+        Returns:
+            [B, P].
+        """
+        T_cam_world = invert_rigid(T_world_cam.double())
+        points = torch.from_numpy(self.points_world).to(T_cam_world.device)
+        points_cam = points @ T_cam_world[:, :3, :3].mT + T_cam_world[:, None, :3, 3]
+        variance = torch.from_numpy(self.sigma).to(points_cam.device).square().expand(len(points_cam), -1)
+        return Anchors.from_points(points_cam, variance, intrinsics, size)
+
+    def update(
+        self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
+    ) -> Landmarks:
+        """The landmarks in an image; without an image, those less than 80 degrees off the optical axis.
+
+        Raises:
+            ValueError: a pose or intrinsics of another shape, or not finite.
+        """
+        T, K = np.asarray(T_world_cam, dtype=np.float64), np.asarray(K, dtype=np.float64)
+        if T.shape != (4, 4) or K.shape != (3, 3) or not (np.isfinite(T).all() and np.isfinite(K).all()):
+            raise ValueError("T_world_cam must be a finite 4x4 matrix and K a finite 3x3 matrix")
+        offset = np.zeros(2)
+        if image is None:  # a square about the optical axis
+            half = np.tan(np.radians(80)) * np.array([K[0, 0], K[1, 1]])
+            offset, size = half - K[:2, 2], (int(2 * half[1]), int(2 * half[0]))
+        else:
+            size = (image.shape[0], image.shape[1])
+        shifted = K.copy()
+        shifted[:2, 2] += offset
+        result = self.anchors(torch.from_numpy(T)[None], torch.from_numpy(shifted), size)
+        assert result.valid is not None
+        kept = np.flatnonzero(result.valid[0].numpy())
+        kept = kept[:: -(-len(kept) // _MOST) or 1]
+        pixel, depth, variance = (x[0].numpy()[kept] for x in (result.pixel, result.depth, result.variance))
+        return Landmarks(pixel - offset, depth, variance, len(self.sigma), none="no landmark of the map is in view")
+
+    def reset(self) -> None:
+        """Nothing: a map remembers no image."""
+
+    def state(self) -> dict[str, Tensor]:
+        """{}: a map remembers no image."""
+        return {}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Nothing to restore.
+
+        Raises:
+            ValueError: ``state`` is that of another source.
+        """
+        if state:
+            raise ValueError(f"state must be empty for a map of landmarks, got {sorted(state)}")
+
+
+def _read_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    lines = [line.partition("#")[0].replace(",", " ").split() for line in path.read_text(encoding="utf-8").splitlines()]
+    rows = [(number, words) for number, words in enumerate(lines, start=1) if words]
+    if rows and not _is_number(rows[0][1][0]):
+        rows = rows[1:]  # names of the columns
+    for number, words in rows:
+        if len(words) != 4 or not all(map(_is_number, words)):
+            raise ValueError(f"line {number} holds {' '.join(words)!r}")
+    values = np.array([words for _, words in rows], dtype=np.float64).reshape(-1, 4)
+    return values[:, :3], values[:, 3]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
