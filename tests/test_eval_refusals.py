@@ -13,7 +13,7 @@ import torch
 from tiny_suite import row, rows_of
 
 from ufmstar_torch import AnchorConfig, Recalibration, UfMStarConfig
-from ufmstar_torch.choose import UncertaintySampler, choose
+from ufmstar_torch.choose import choose
 from ufmstar_torch.eval.bench.measure import measure
 from ufmstar_torch.eval.commands.poses import read as read_poses
 from ufmstar_torch.eval.engine.load import NetworkChoice
@@ -111,11 +111,6 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: choose([1.0, 2.0], poses=torch.eye(4)[None]), r"poses must be \[2, 4, 4\]"),
     (lambda: choose([1.0, 2.0], poses=torch.eye(4).repeat(2, 1, 1) * NAN), "poses must be finite"),
     (lambda: choose([1.0, -2.0], poses=torch.eye(4).repeat(2, 1, 1)), "scores of at least 0"),
-    (lambda: UncertaintySampler([-1.0, 2.0], 1), "at least 0"),
-    (lambda: UncertaintySampler([NAN], 1), "some above"),
-    (lambda: UncertaintySampler([1.0], 1.5), "count"),
-    (lambda: UncertaintySampler([1.0], 0), "count must be a whole number of at least 1"),
-    (lambda: UncertaintySampler([1.0, 0.0], 2, top=True), "at most the 1 scored"),
     *[
         (partial(TrainDecision, **values), "cost must be finite, first at least 2")
         for values in ({"cost": NAN}, {"cost": 0.1, "first": 1}, {"cost": 0.1, "half_life": 0.0})

@@ -20,7 +20,6 @@ from ufmstar_torch.kernels import check_cpu, posterior_cpu, select, step_cpu
 from ufmstar_torch.kernels.host import moved, on_host
 from ufmstar_torch.posterior.update import update as update_posterior
 from ufmstar_torch.segment_input import SegmentInput
-from ufmstar_torch.step import step
 from ufmstar_torch.step_parts import REFERENCE
 
 pytestmark = pytest.mark.numerics
@@ -30,21 +29,6 @@ KERNELS = (
     "_feature_means", "_cameras",
     "_append", "_camera", "_maps",
 )  # fmt: skip
-
-
-def test_without_numba_the_reference_runs_and_warns_once(monkeypatch):
-    monkeypatch.setitem(sys.modules, "numba", None)
-    select.has_numba.cache_clear()
-    try:
-        with pytest.warns(UserWarning, match="numba cannot be imported .* torch reference serves") as caught:
-            chosen = [select.select_step("auto", "cpu") for _ in range(2)]
-        assert select.select_check("auto", "cpu") is frame.check_values
-        assert len(caught) == 1
-        assert all(one.func is step and one.keywords == {"kernels": REFERENCE} for one in chosen)
-        with pytest.raises(ImportError):
-            select.select_step("numba", "cpu")
-    finally:
-        select.has_numba.cache_clear()
 
 
 def test_seam():

@@ -10,11 +10,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import DataLoader
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.choose import UncertaintySampler, choose
+from ufmstar_torch.choose import choose
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.tour import export_tour
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
@@ -70,19 +69,6 @@ def test_a_diverse_choice_leaves_out_neighbours():
     assert choose(scores, poses=turned)[:2] == [0, 3], "the same place, another direction"
     assert choose([1.0, math.nan, 0.8, 0.5], poses=poses) == [0, 3, 2]
     assert choose([1.0, math.nan], poses=along([0.0, math.nan])) == [0], "a pose without a score does not count"
-
-
-def test_a_sampler_follows_the_scores():
-    sampler = UncertaintySampler([0.0, 1.0, math.nan, 3.0], 4000)
-    drawn = torch.cat(list(DataLoader(range(4), batch_size=100, sampler=sampler)))
-    counts = torch.bincount(drawn, minlength=4).tolist()
-    assert (counts[0], counts[2], len(drawn)) == (0, 0, 4000)
-    assert counts[3] == pytest.approx(3000, abs=5 * math.sqrt(4000 * 0.75 * 0.25))
-    assert list(sampler) != drawn.tolist(), "another epoch"
-    sampler.update([1.0, 0.0, 0.0, 0.0])
-    assert set(sampler) == {0}
-    best = UncertaintySampler([1.0, 5.0, 3.0, 4.0], 2, top=True)
-    assert sorted(best) == [1, 3]
 
 
 # ---- the command ----

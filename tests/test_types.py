@@ -54,9 +54,9 @@ def own_network():
     model = UncertainDepth(wrap_network(lambda x: x[:, :1] + 1))
     print(model(torch.ones(1, 3, 48, 64), torch.eye(4), (50.0, 50.0, 32.0, 24.0)).std.median())
 def choosing():
-    from ufmstar_torch.choose import UncertaintySampler, choose
+    from ufmstar_torch.choose import choose
     from ufmstar_torch.online import TrainDecision
-    print("chosen", choose([1.0, 2.0]), list(UncertaintySampler([0.0, 1.0], 2)), TrainDecision(0.1)(torch.ones(3)))
+    print("chosen", choose([1.0, 2.0]), TrainDecision(0.1)(torch.ones(3)))
 def metrics():
     from ufmstar_torch.eval.metrics import mean_and_ci
 def ranking():
@@ -98,7 +98,7 @@ def test_what_is_missing_without_extras_is_named():
     ):
         (line,) = (line for line in said.splitlines() if line.startswith(who))
         assert re.search(rf"needs the package {package}: pip install 'ufmstar-torch\[{extra}\]'", line), line
-    assert "chosen [1, 0] [1, 1] True" in said, said
+    assert "chosen [1, 0] True" in said, said
     assert "corners landmarks of images need OpenCV: pip install 'ufmstar-torch[eval]'" in said
 
 

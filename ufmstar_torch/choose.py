@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.utils.data import Sampler
 
 
 def choose(
@@ -66,53 +65,3 @@ def choose(
         nearest = torch.where(sequence == sequence[best], torch.minimum(nearest, d), nearest)
         left[best] = -math.inf
     return chosen
-
-
-class UncertaintySampler(Sampler[int]):
-    """The images of an epoch of a ``DataLoader``, by their scores.
-
-    Args:
-        scores: [N] of every image of the data set, at least 0 [m^2]; NaN = no score: not taken.
-        count: images of an epoch.
-        top: take the ``count`` images with the highest scores, each once and in a random order. Else they are drawn
-            with replacement, with a probability in proportion to the score.
-        seed: of the random draws, which differ from epoch to epoch.
-
-    Example::
-
-        sampler = UncertaintySampler(scores, count=64)
-        for epoch in range(10):
-            for batch in DataLoader(images, batch_size=4, sampler=sampler):
-                ...
-            sampler.update([float(model.mean_uncertainty(*frame).mean) for frame in pool])  # under the new weights
-    """
-
-    def __init__(self, scores: Tensor | Sequence[float], count: int, *, top: bool = False, seed: int = 0) -> None:
-        self.count, self.top = count, top
-        self._generator = torch.Generator().manual_seed(seed)
-        self.update(scores)
-
-    def update(self, scores: Tensor | Sequence[float]) -> None:
-        """Take other scores [N] from the next epoch on.
-
-        Raises:
-            ValueError: not [N], a negative or infinite score, none above 0, or with ``top`` fewer than ``count``.
-        """
-        score = torch.as_tensor(scores, dtype=torch.float64).nan_to_num(0.0, torch.inf, -torch.inf)
-        taken = int((score > 0).sum())
-        if score.dim() != 1 or not bool((score.isfinite() & (score >= 0)).all()) or not taken:
-            raise ValueError(f"scores must be [N] of at least 0, some above, or NaN, got {tuple(score.shape)}")
-        if not isinstance(self.count, int) or self.count < 1 or (self.top and self.count > taken):
-            most = f"with top at most the {taken} scored images, got {self.count}"
-            raise ValueError(f"count must be a whole number of at least 1, {most}")
-        self.scores = score
-
-    def __iter__(self) -> Iterator[int]:
-        if self.top:
-            best = self.scores.argsort(descending=True, stable=True)[: self.count]
-            yield from best[torch.randperm(self.count, generator=self._generator)].tolist()
-        else:
-            yield from torch.multinomial(self.scores, self.count, True, generator=self._generator).tolist()
-
-    def __len__(self) -> int:
-        return self.count

@@ -39,14 +39,14 @@ def select_step(name: str, device_type: str) -> Step:
     Args:
         name: "torch": the reference on every device; it waits for the device only where the mixture may
             have to grow. "numba": compiled for the CPU, CPU tensors only. "triton": for a GPU; of CPU tensors only in
-            Triton's interpreter (``TRITON_INTERPRET=1``). "auto": numba on the CPU, Triton on CUDA, ROCm and XPU, each
-            where it can be imported; on another accelerator the torch reference, except that the segmentation, a long
+            Triton's interpreter (``TRITON_INTERPRET=1``). "auto": numba on the CPU, Triton on CUDA, ROCm and XPU, where
+            it can be imported; on another accelerator the torch reference, except that the segmentation, a long
             chain of tiny steps there, runs on the host: the depth map is copied over, which waits for the device.
         device_type: ``torch.device.type`` of the depth.
 
     Raises:
         ValueError: "numba" or "triton" for tensors of another device.
-        ImportError: "numba" or "triton" by name where it cannot be imported.
+        ImportError: "triton" by name where it cannot be imported.
     """
     if _compiled(name, device_type):
         from ufmstar_torch.kernels import step_cpu
@@ -85,7 +85,7 @@ def select_kernels(name: str, device_type: str) -> Kernels:
     """The parts of the step where it is the reference's; arguments as :func:`select_step`."""
     if _on_gpu(name, device_type):
         return _triton()
-    if name == "torch" or device_type in ("cpu", "meta") or not has_numba():
+    if name == "torch" or device_type in ("cpu", "meta"):
         return REFERENCE
     from ufmstar_torch.kernels import segment_cpu
 
@@ -97,10 +97,8 @@ def _compiled(name: str, device_type: str) -> bool:
     if name == "numba":
         if device_type != "cpu":
             raise ValueError(f"backend='numba' needs CPU tensors, got device type {device_type!r}")
-        import numba as numba  # an ImportError for who asked for it by name
-
         return True
-    return name == "auto" and device_type == "cpu" and has_numba()
+    return name == "auto" and device_type == "cpu"
 
 
 def _on_gpu(name: str, device_type: str) -> bool:
@@ -116,9 +114,9 @@ def _on_gpu(name: str, device_type: str) -> bool:
 
 def select_posterior(name: str, device_type: str) -> PosteriorUpdate:
     """The posterior's update for a device; arguments and errors as :func:`select_step`. For tensors of an accelerator
-    it runs on the host, where numba can be imported."""
+    it runs on the host."""
     compiled = _compiled(name, device_type)
-    if not compiled and (name == "torch" or device_type in ("cpu", "meta") or not has_numba()):
+    if not compiled and (name == "torch" or device_type in ("cpu", "meta")):
         return update_posterior
     from ufmstar_torch.kernels import posterior_cpu
 
@@ -150,21 +148,8 @@ def _has_triton(device_type: str) -> bool:
     return True
 
 
-@functools.cache
-def has_numba() -> bool:
-    """True if numba can be imported; warns once if not."""
-    try:
-        import numba as numba
-    except ImportError as error:
-        warnings.warn(f"numba cannot be imported ({error}); the slower torch reference serves", stacklevel=4)
-        return False
-    return True
-
-
 def compile_triangulation() -> None:
-    """Compile what triangulates tracked corners, where numba can be imported."""
-    if not has_numba():
-        return
+    """Compile what triangulates tracked corners."""
     import numpy as np
 
     from ufmstar_torch.kernels.triangulate_cpu import triangulate
