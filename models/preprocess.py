@@ -170,25 +170,35 @@ class Preprocess(Checked):
         return depth[..., rows.to(depth.device)[:, None], columns.to(depth.device)]
 
     def _resampled(self, image: Tensor) -> Tensor:
-        """[B, 3, h, w] in [0, 1], resized, cropped and resized. On the CPU, bytes stay bytes until the end: torch
-        rounds them after every step, as Pillow does."""
+        """[B, 3, h, w] in [0, 1]; bytes on the processor by a kernel, linearly (``preprocess_cpu``)."""
         _check(image)
-        if image.dtype in (torch.float16, torch.bfloat16):  # torch resamples neither on the CPU
-            return self._resampled(image.float()).to(image.dtype)
-        in_bytes = image.dtype == torch.uint8 and image.is_cpu
-        x = image if in_bytes or image.is_floating_point() else image.to(torch.get_default_dtype()) / 255
+        g = self.geometry(*image.shape[-2:])
+        single = torch.get_default_dtype() == torch.float32
+        if image.dtype == torch.uint8 and image.is_cpu and self.antialias and not self.cubic and single and len(image):
+            from ufmstar_torch.models.preprocess_cpu import resample
+
+            once = g.resized == g.cropped == g.image
+            steps = (g.final, 0, 0, g.final, g.final) if once else (g.resized, g.top, g.left, g.cropped, g.final)
+            pixels = image.permute(0, 2, 3, 1).contiguous().numpy()
+            return torch.stack([torch.from_numpy(resample(one, *steps)) for one in pixels])
+        return self.resampled(image)
+
+    def resampled(self, image: Tensor) -> Tensor:
+        """[B, 3, h, w] in [0, 1], resized, cropped and resized: the reference for every device, type and filter."""
+        x = image.to(torch.get_default_dtype()) / 255 if image.dtype == torch.uint8 else image
+        if image.dtype in (torch.float16, torch.bfloat16):  # torch resamples none of these on the CPU
+            return self.resampled(image.float()).to(image.dtype)
         g = self.geometry(*x.shape[-2:])
         x = self._resize(x, g.resized)
         x = x[..., g.top : g.top + g.cropped[0], g.left : g.left + g.cropped[1]]
-        x = self._resize(x, g.final)
-        return x.to(torch.get_default_dtype()) / 255 if in_bytes else x
+        return self._resize(x, g.final)
 
     def _resize(self, x: Tensor, size: tuple[int, int]) -> Tensor:
         if x.shape[-2:] == size:
             return x
         mode = "bicubic" if self.cubic else "bilinear"
         resized = F.interpolate(x, size, mode=mode, align_corners=False, antialias=self.antialias)
-        return resized.clamp(0, 1) if self.cubic and x.is_floating_point() else resized
+        return resized.clamp(0, 1) if self.cubic else resized
 
 
 def _check(image: Tensor) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -110,8 +108,8 @@ def test_nyu_geometry_and_the_fields_formula() -> None:
 
 @pytest.mark.parametrize("size", [(480, 640), (360, 540), (968, 1296)], ids=str)
 def test_colour_is_resampled_as_pillow_does(size: tuple[int, int]) -> None:
-    """torch rounds bytes as Pillow does, but for a unit here and there. Without antialiasing they would be 13 to 24
-    apart in the mean on this noise."""
+    """The field's loaders went through Pillow in bytes, which rounds four times: observed .35 of 255 apart in
+    the mean and 1.6 at most; without antialiasing it would be 13 to 24 in the mean on this noise."""
     generator = np.random.default_rng(0)
     array = generator.integers(0, 256, (*size, 3), dtype=np.uint8)
     g = NYU.geometry(*size)
@@ -120,8 +118,8 @@ def test_colour_is_resampled_as_pillow_does(size: tuple[int, int]) -> None:
     expected = np.asarray(Image.fromarray(cropped).resize(g.final[::-1], Image.Resampling.BILINEAR))
     got = NYU.apply_image(torch.from_numpy(array).permute(2, 0, 1)[None])[0].permute(1, 2, 0).numpy() * 255
     difference = np.abs(got - expected.astype(np.float32))
-    assert difference.max() <= 1.01
-    assert difference.mean() < 0.1
+    assert difference.max() <= 2
+    assert difference.mean() < 0.5
 
 
 def test_depth_pixels_are_the_ones_seen() -> None:
@@ -144,7 +142,7 @@ def test_bytes_and_floats_agree_and_are_scaled() -> None:
     image = torch.randint(0, 256, (2, 3, 300, 400), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     unit = NYU.apply_image(image)
     assert 0 <= unit.min() <= unit.max() <= 1
-    torch.testing.assert_close(NYU.apply_image(image.double() / 255).float(), unit, rtol=0, atol=2 / 255)
+    torch.testing.assert_close(NYU.apply_image(image.double() / 255).float(), unit, rtol=0, atol=1e-4)
     mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
     got = Preprocess.nyu(value_range=255.0, mean=mean, std=std).apply_image(image)
     for channel in range(3):
@@ -152,14 +150,11 @@ def test_bytes_and_floats_agree_and_are_scaled() -> None:
 
 
 @pytest.mark.parametrize("size", [(480, 640), (375, 1242), (100, 120)])
-@pytest.mark.parametrize("cubic", [False, True])
-def test_bytes_are_resampled_as_floats_but_for_rounding_after_each_step(size, cubic):
-    """Two steps round rows and columns: at most 2 of 255 apart, 4 by a cubic kernel; no value here overshoots."""
-    image = torch.randint(96, 160, (2, *size, 3), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
+@pytest.mark.parametrize("preprocess", [NYU, Preprocess(size=(224, 224)), Preprocess(crop=(64, 96)), Preprocess()])
+def test_the_kernel_equals_the_reference(size, preprocess):
+    image = torch.randint(0, 256, (2, *size, 3), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
     image = image.permute(0, 3, 1, 2)
-    for preprocess in (replace(NYU, cubic=cubic), Preprocess(size=(224, 224), cubic=cubic), Preprocess()):
-        got = preprocess.apply_image(image)
-        assert got.is_contiguous()
-        torch.testing.assert_close(got, preprocess.apply_image(image.contiguous()), rtol=0, atol=1.01 / 255)
-        floats = preprocess.apply_image(image.float() / 255)
-        torch.testing.assert_close(got, floats, rtol=0, atol=(4 if cubic else 2) / 255)
+    fast, slow = preprocess.apply_image(image), preprocess.resampled(image)
+    assert fast.is_contiguous()
+    torch.testing.assert_close(fast, slow, rtol=0, atol=1e-6)
+    torch.testing.assert_close(fast, preprocess.apply_image(image.contiguous()), rtol=0, atol=0)
