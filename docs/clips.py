@@ -53,7 +53,7 @@ class Clip:
     K: NDArray[np.float64]
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def has_truth(self) -> NDArray[np.bool_]:
         """[N, h, w] where there is ground truth."""
         return self.truth > 0
 
@@ -68,7 +68,8 @@ def add_sources(parser: argparse.ArgumentParser) -> None:
 
 
 def clips(arguments: argparse.Namespace) -> Iterator[Clip]:
-    """FastDepth on the shared sequences; or on tours one network's depth, and four in turn with their variance."""
+    """With ``--root``: FastDepth on the shared sequences. With ``--tours``: one network, then four alternating networks
+    with their variance."""
     if arguments.root is not None:
         network = load_network("fastdepth", arguments.root / "weights" / "fastdepth_nyu.onnx").eval()
         for name, path in SHARED.items():
@@ -90,7 +91,7 @@ def demo_networks() -> list[DepthNetwork]:
 
 
 def readable(sequence: FrameSequence) -> Iterator[Frame]:
-    """The frames of a sequence but those whose files are broken."""
+    """The frames of a sequence that can be decoded."""
     for index in range(len(sequence)):
         try:
             yield sequence[index]
@@ -99,7 +100,7 @@ def readable(sequence: FrameSequence) -> Iterator[Frame]:
 
 
 def predict(name: str, source: str, members: list[DepthNetwork], *, aleatoric: bool) -> Clip:
-    """The members in turn on every frame that can be read; their own variance only if asked for."""
+    """Predict every readable frame; the members alternate. ``aleatoric`` keeps their predicted variance."""
     rows = []
     for frame in readable(open_sequence(source)):
         member = members[len(rows) % len(members)]
@@ -108,19 +109,21 @@ def predict(name: str, source: str, members: list[DepthNetwork], *, aleatoric: b
             x, K = member.preprocess(image, intrinsics[None])
             text = member(x)
         depth, k = text.depth[0].float().numpy(), K[0].double().numpy()
-        own = text.aleatoric_variance[0].float().numpy() if aleatoric else depth
+        aleatoric_map = text.aleatoric_variance[0].float().numpy() if aleatoric else depth
         truth = truth_at(frame, k, depth.shape)
-        rows.append((depth, own, np.zeros_like(depth) if truth is None else truth, frame.T_world_cam, k))
-    depths, owns, truths, poses, Ks = (np.stack(column) for column in zip(*rows, strict=True))
-    return Clip(name, depths, owns if aleatoric else None, truths, poses, Ks[0])
+        rows.append((depth, aleatoric_map, np.zeros_like(depth) if truth is None else truth, frame.T_world_cam, k))
+    depths, aleatoric_maps, truths, poses, Ks = (np.stack(column) for column in zip(*rows, strict=True))
+    return Clip(name, depths, aleatoric_maps if aleatoric else None, truths, poses, Ks[0])
 
 
 def estimate(clip: Clip, estimator: nn.Module) -> Map:
     """[N, h, w] variance by a fresh UfM or UfM* [m^2]."""
     K, maps = torch.from_numpy(clip.K)[None], []
     for i, depth in enumerate(clip.depth):
-        own = None if clip.aleatoric is None else torch.from_numpy(clip.aleatoric[i])[None]
-        maps.append(estimator(torch.from_numpy(depth)[None], torch.from_numpy(clip.pose[i])[None], K, own).variance[0])
+        aleatoric = None if clip.aleatoric is None else torch.from_numpy(clip.aleatoric[i])[None]
+        maps.append(
+            estimator(torch.from_numpy(depth)[None], torch.from_numpy(clip.pose[i])[None], K, aleatoric).variance[0]
+        )
     return torch.stack(maps).numpy()
 
 
@@ -129,7 +132,7 @@ def judge(clip: Clip, variance: Map, stride: int) -> dict[str, float]:
     metrics = SequenceMetrics()
     part = (slice(None), slice(None, None, stride), slice(None, None, stride))
     metrics.update(*(torch.from_numpy(maps[part].copy()) for maps in (clip.depth, variance, clip.truth)))
-    return metrics.compute() | {"rms": float(np.sqrt(variance[clip.known].mean(dtype=np.float64)))}
+    return metrics.compute() | {"rms": float(np.sqrt(variance[clip.has_truth].mean(dtype=np.float64)))}
 
 
 def line(*words: str) -> None:

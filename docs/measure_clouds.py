@@ -24,7 +24,7 @@ def read_points(path: Path) -> NDArray[np.float64]:
 
 
 def distances(cloud: NDArray[np.float64], truth: NDArray[np.float64]) -> tuple[float, float, float]:
-    """[cm] median and 90 % quantile from the cloud's points to the nearest of the truth, and the median back."""
+    """[cm] Median and 90 % quantile of the distances from cloud to truth, and the median from truth to cloud."""
     to_truth, back = cKDTree(truth).query(cloud)[0], cKDTree(cloud).query(truth)[0]
     median, most = np.quantile(to_truth, [0.5, 0.9])
     return 100 * float(median), 100 * float(most), 100 * float(np.median(back))

@@ -1,11 +1,11 @@
-"""Measures what a confidence in a wrong unit is worth: UfM* with anchors, with and without it, on rendered tours.
+"""Measures the benefit of a confidence in an arbitrary unit: UfM* with anchors on rendered tours, with and without it.
 
     python docs/measure_confidence.py
 
-The network is the demo's first one, which predicts sigma. That is left out ("today"), stated in metres (A), or turned
-into a confidence: 1/(1 + sigma^2), a logit that rises with the error, sigma per depth, and numbers drawn at random. Of
-each and of both sources of anchors, means over tours and the paired difference to "today" with its 95 % interval, then
-the NLL of the posterior.
+The network is the demo's first one, which predicts sigma. The rows ignore sigma ("today"), pass it in metres (A), or
+pass a confidence: 1/(1 + sigma^2), a logit that rises with the error, sigma per depth, or random numbers. Each row has,
+for both sources of anchors, means over tours, the paired difference to "today" with its 95 % interval, and the NLL of
+the posterior.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.methods.ufm import UfM
 
 COLUMNS = ("rms", "delta1", "ece_delta", "overconfidence", "ece_q", "spearman", "ause_rmse", "nll_left_out_share")
-PAPERS = UfMStarConfig(unmeasured="paper")  # the disagreement alone, nothing where none was measured
+PAPERS = UfMStarConfig(unmeasured="paper")  # the disagreement alone, 0 where none was measured
 LITERAL = {"unmeasured": "paper", "segment": {"min_pixels": 2000, "min_rows": 32, "prune": "either"}}
 PROGRAM = {"unmeasured": "paper", "segment": {"min_pixels": 2000, "min_rows": 32}}
 NOISE_FLOOR = 0.08  # [m] of SPGF: segments resolve nothing finer
@@ -29,39 +29,39 @@ BORDER = 16  # [px]
 EDGE = 0.1  # relative change of depth between neighbouring pixels
 
 
-def scaled_to(target: float, variance: NDArray[np.floating], known: NDArray[np.bool_]) -> Map:
-    """The same times a number, so that its mean is ``target``."""
-    result: Map = (variance * (target / variance[known].mean(dtype=np.float64))).astype(np.float32)
+def scaled_to(target: float, variance: NDArray[np.floating], has_truth: NDArray[np.bool_]) -> Map:
+    """The variance, scaled to the mean ``target`` over the pixels with ground truth."""
+    result: Map = (variance * (target / variance[has_truth].mean(dtype=np.float64))).astype(np.float32)
     return result
 
 
-def shuffled(variance: Map, known: NDArray[np.bool_]) -> Map:
-    """The same values at other pixels of the frame (of those with ground truth)."""
+def shuffled(variance: Map, has_truth: NDArray[np.bool_]) -> Map:
+    """The variance, permuted within each frame among the pixels with ground truth."""
     rng, result = np.random.default_rng(0), variance.copy()
     for i in range(len(variance)):
-        result[i][known[i]] = rng.permutation(variance[i][known[i]])
+        result[i][has_truth[i]] = rng.permutation(variance[i][has_truth[i]])
     return result
 
 
 def variances(clip: Clip) -> Iterator[tuple[str, Map]]:
-    """UfM and UfM*, and variances that know nothing; "scaled" ones have the mean of that of UfM*."""
-    known, d2 = clip.known, clip.depth.astype(np.float64) ** 2
+    """UfM, UfM* and uninformative controls. "scaled": multiplied to the mean of UfM*'s variance."""
+    has_truth, d2 = clip.has_truth, clip.depth.astype(np.float64) ** 2
     ufm, star = estimate(clip, UfM()), estimate(clip, UfMStar(PAPERS))
-    mean = float(star[known].mean(dtype=np.float64))
+    mean = float(star[has_truth].mean(dtype=np.float64))
     yield "UfM-100K", ufm
-    yield "UfM-100K, scaled", scaled_to(mean, ufm, known)
+    yield "UfM-100K, scaled", scaled_to(mean, ufm, has_truth)
     yield "UfM*, < 2000 px or < 32 rows dropped", estimate(clip, UfMStar(UfMStarConfig.from_dict(LITERAL)))
     yield "UfM*, < 2000 px and < 32 rows dropped", estimate(clip, UfMStar(UfMStarConfig.from_dict(PROGRAM)))
     yield "UfM*", star
-    yield "UfM*, shuffled within each frame", shuffled(star, known)
+    yield "UfM*, shuffled within each frame", shuffled(star, has_truth)
     if clip.aleatoric is not None:
         yield "A, the networks' own", clip.aleatoric
-        yield "A, scaled", scaled_to(mean, clip.aleatoric, known)
-        yield "A + M, M shuffled", clip.aleatoric + shuffled(star - clip.aleatoric, known)
-    yield "sigma = c d, scaled", scaled_to(mean, d2, known)
+        yield "A, scaled", scaled_to(mean, clip.aleatoric, has_truth)
+        yield "A + M, M shuffled", clip.aleatoric + shuffled(star - clip.aleatoric, has_truth)
+    yield "sigma = c d, scaled", scaled_to(mean, d2, has_truth)
     yield "one variance, scaled", np.full_like(star, mean)
     yield "sigma = .25 d", (0.0625 * d2).astype(np.float32)
-    yield "one variance, the true MSE", np.full_like(star, _squared(clip)[known].mean())
+    yield "one variance, the true MSE", np.full_like(star, _squared(clip)[has_truth].mean())
 
 
 def _squared(clip: Clip) -> NDArray[np.float64]:
@@ -80,15 +80,15 @@ def baselines(clip: Clip, stride: int) -> None:
 
 def places(clip: Clip) -> dict[str, NDArray[np.bool_]]:
     """Masks [N, h, w] over the pixels with ground truth: thirds of depth, border, edges, and the rest."""
-    d, known = clip.depth, clip.known
-    low, high = np.quantile(d[known], (1 / 3, 2 / 3))
-    border = np.ones_like(known)
+    d, has_truth = clip.depth, clip.has_truth
+    low, high = np.quantile(d[has_truth], (1 / 3, 2 / 3))
+    border = np.ones_like(has_truth)
     border[:, BORDER:-BORDER, BORDER:-BORDER] = False
     down, across = np.zeros_like(d), np.zeros_like(d)
     down[:, 1:], across[:, :, 1:] = np.abs(np.diff(d, axis=1)), np.abs(np.diff(d, axis=2))
     edge = np.maximum(down, across) > EDGE * d
     masks = {
-        "all": known,
+        "all": has_truth,
         "nearest third": d <= low,
         "middle third": (d > low) & (d <= high),
         "farthest third": d > high,
@@ -96,22 +96,22 @@ def places(clip: Clip) -> dict[str, NDArray[np.bool_]]:
         "depth edges": edge & ~border,
         "the rest": ~edge & ~border,
     }
-    return {name: mask & known for name, mask in masks.items()}
+    return {name: mask & has_truth for name, mask in masks.items()}
 
 
 def regions(clip: Clip, _: int) -> None:
-    """By place: share of the pixels, RMSE, and mean squared error over mean variance (1 = calibrated)."""
+    """By region: share of the pixels, RMSE, and mean squared error over mean variance (1 = calibrated)."""
     squared, ufm, star = _squared(clip), estimate(clip, UfM()), estimate(clip, UfMStar(PAPERS))
     for name, mask in places(clip).items():
         mse = squared[mask].mean()
         ratios = (mse / v[mask].mean(dtype=np.float64) for v in (ufm, star))
-        line(clip.name, name, f"{mask.sum() / clip.known.sum():.3f}", f"{mse**0.5:.2f} m", *map(shown, ratios))
+        line(clip.name, name, f"{mask.sum() / clip.has_truth.sum():.3f}", f"{mse**0.5:.2f} m", *map(shown, ratios))
 
 
 def floors(clip: Clip, _: int) -> None:
-    """The NLL under floors of the variance: of the pixels where it was positive, and of all."""
-    known, focal = clip.known, float(min(clip.K[0, 0], clip.K[1, 1]))
-    squared, d = _squared(clip)[known], clip.depth[known].astype(np.float64)
+    """The NLL under different variance floors, over the pixels with a positive variance and over all pixels."""
+    has_truth, focal = clip.has_truth, float(min(clip.K[0, 0], clip.K[1, 1]))
+    squared, d = _squared(clip)[has_truth], clip.depth[has_truth].astype(np.float64)
     choices = {
         "none": np.zeros_like(d),
         "pixel footprint (d/f)^2/12": (d / focal) ** 2 / 12,
@@ -120,7 +120,7 @@ def floors(clip: Clip, _: int) -> None:
         "(.1 d)^2": (0.1 * d) ** 2,
     }
     for method, variance in (("UfM-100K", estimate(clip, UfM())), ("UfM*", estimate(clip, UfMStar(PAPERS)))):
-        v = variance[known].astype(np.float64)
+        v = variance[has_truth].astype(np.float64)
         for name, floor in choices.items():
             raised = np.maximum(v, floor)
             with np.errstate(divide="ignore", invalid="ignore"):

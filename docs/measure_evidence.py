@@ -8,9 +8,9 @@ error; and the processor time of a frame [ms].
 
     python docs/measure_evidence.py --weights fastdepth_nyu.onnx --frames 30 SEQUENCE ...
 
-prints for each defect and sequence, of FastDepth with the posterior from dense evidence: RMSE over the network's /
+prints, for each defect and sequence, for FastDepth with the posterior from dense evidence: RMSE over the network's /
 root mean square z / the same within .05 image widths of an anchor / percent of pixels beyond 3 sigma / ``calibration``
-/ the median ``pose_error`` [px]. The first frames, in which nothing has parallax, do not count.
+/ the median ``pose_error`` [px]. The first frames are left out, because they have no parallax.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 
 GRID, NORMAL = 28, 0.674  # the median of |z| of a standard normal variable
-FIRST, STRIDE = 5, 4  # judged are every fourth pixel of every fourth row from the sixth frame on
+FIRST, STRIDE = 5, 4  # metrics use every fourth pixel of every fourth row, from the sixth frame on
 NEAR = 0.05  # image widths from an anchor
 Frames = list[Frame]
 
@@ -78,7 +78,7 @@ def anchors(name: str, frames: Frames, kind: str) -> str:
 
 
 def posed(frames: Frames, poses: list[NDArray[np.float64]]) -> Frames:
-    """The frames with other poses."""
+    """The frames with these poses."""
     return [replace(frame, T_world_cam=T) for frame, T in zip(frames, poses, strict=True)]
 
 
@@ -89,7 +89,7 @@ def noisy(degrees: float) -> Callable[[Frames], Frames]:
 
 
 def late(count: int) -> Callable[[Frames], Frames]:
-    """Poses of so many frames before."""
+    """Replace every pose by the pose ``count`` frames earlier."""
     return lambda frames: posed(frames, [frames[max(i - count, 0)].T_world_cam for i in range(len(frames))])
 
 
@@ -166,19 +166,19 @@ def judged(frames: Frames, predictions: list[tuple[Tensor, Tensor, NDArray[np.fl
             continue
         parts = (depth, out.posterior_depth, out.posterior_variance)
         d, g, V, t = (x[::STRIDE, ::STRIDE].ravel() for x in (*(part[0].numpy() for part in parts), truth))
-        known = (t > 0) & np.isfinite(g)
-        network.append(np.square(d - t)[known])
-        errors.append(np.square(g - t)[known])
-        z.append((np.square(g - t) / V)[known])
-        near.append(close(marks, depth)[::STRIDE, ::STRIDE].ravel()[known])
+        measured = (t > 0) & np.isfinite(g)
+        network.append(np.square(d - t)[measured])
+        errors.append(np.square(g - t)[measured])
+        z.append((np.square(g - t) / V)[measured])
+        near.append(close(marks, depth)[::STRIDE, ::STRIDE].ravel()[measured])
         calibration.append(float(out.statistics.calibration[0]))
         pose.append(float(out.statistics.pose_error[0]))
     squares = np.concatenate(z)
     ratio = (np.concatenate(errors).mean() / np.concatenate(network).mean()) ** 0.5
     shown = [x[np.isfinite(x)] for x in (np.array(calibration[-10:]), np.array(pose))]
     rest = [f"{np.median(x):.1f}" if len(x) else "–" for x in shown]
-    beside = squares[np.concatenate(near)]
-    rms = [f"{x.mean() ** 0.5:.1f}" if len(x) else "–" for x in (squares, beside)]
+    near_squares = squares[np.concatenate(near)]
+    rms = [f"{x.mean() ** 0.5:.1f}" if len(x) else "–" for x in (squares, near_squares)]
     return " / ".join([f"{ratio:.2f}", *rms, f"{100 * (squares > 9).mean():.0f}", *rest])
 
 

@@ -1,14 +1,14 @@
-"""Measures the effect of each constant of the posterior on rendered tours with networks that are wrong in four ways.
+"""Measures the effect of each constant of the posterior on rendered tours with four networks.
 
     python docs/measure_posterior.py --weights fastdepth_nyu.onnx
 
 prints the posterior's figures as means over tours (± 95 % of their mean), networks and evidence, and by how much each
 changes where one constant of ``PosteriorConfig`` is halved and doubled (``--change NAME=VALUE ...``: other values; *:
 beyond the 95 % interval of the paired difference). The tours are two homes, a hall, two plain homes, and a plain one
-in which the camera turns in place. The networks are FastDepth, the demo's first one, and two that are made of the
-truth: one off by a factor of its own in every cube of space, and one that sees no edges. The evidence is dense, tracked
-corners, and of the dense evidence only what is nearer than 40 % of the image. Frames are predicted once, so a change
-costs some seconds. ``--clips`` names recordings: FastDepth, from the first anchor on.
+in which the camera turns in place. The networks are FastDepth, the demo's first one, and two that corrupt the ground
+truth: one multiplies the depth in every cube of space by a random factor, the other smooths depth edges. The evidence
+is dense, tracked corners, or the dense evidence in the nearest 40 % of the image. Every frame is predicted once, so
+another value of a constant costs some seconds. ``--clips`` names recordings: FastDepth, from the first anchor on.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ KINDS_OF_TOURS = ("711?style=home", "713?style=home", "712?style=hall", "721?sty
                   "732?style=blank&pan=1")  # fmt: skip
 TOURS = [f"tour:{kind}&frames=40&size=240x320" for kind in KINDS_OF_TOURS]
 MIXTURE = ("mixture_nll", "mixture_ece_delta", "mixture_ece_q", "mixture_coverage")
-# The last one is no metric: share of frames whose RMSE is above 1.1 of the network's.
+# The last one: share of frames whose RMSE exceeds 1.1 times the network's.
 FIGURES = ("delta1", "rmse", "ece_delta", "ece_q", "nll", "spearman", *MIXTURE, "worse_frames")
 KINDS = DENSE, CORNERS, NEAR = "dense", "corners", "near"
 NEAREST = 0.4  # share of the image that evidence of NEAR covers
-STRIDE = 4  # judged are every fourth pixel of every fourth row
-CUBE, FACTOR = 1.7, 0.35  # of a network made of the truth [m], and the standard deviation of its log factors
-BLUR = 4, 5  # rows and columns of depth that a network without edges sees
+STRIDE = 4  # metrics use every fourth pixel of every fourth row
+CUBE, FACTOR = 1.7, 0.35  # corrupted truth: cube size [m], standard deviation of the log factors
+BLUR = 4, 5  # corrupted truth without edges: rows and columns
 STUDENT = 2.571  # 97.5 % quantile for six tours
 
 
@@ -68,7 +68,7 @@ class Prepared:
 
 
 def prepare(source: str, network: DepthNetwork | bool, frames: int | None = None) -> list[Prepared]:
-    """The frames of a sequence; a network that is made of the truth is told by whether it sees edges."""
+    """Predictions and anchors of a sequence's frames."""
     sources, ufm, prepared = {kind: landmark_source(kind) for kind in (DENSE, CORNERS)}, UfMStar(), []
     for frame in islice(open_sequence(source).readable(print), frames):
         if frame.image is None or frame.depth is None or not np.isfinite(frame.T_world_cam).all():
@@ -97,7 +97,7 @@ def predicted(frame: Frame, network: DepthNetwork) -> tuple[Tensor, Tensor]:
 
 
 def made(frame: Frame, edges: bool) -> tuple[Tensor, Tensor]:
-    """The truth over a factor of e^.4, and of its own in every cube of space or without edges; likewise."""
+    """Corrupted truth [1, h, w] and K: divided by e^.4, and by a factor per cube of space (``edges``) or smoothed."""
     assert frame.depth is not None
     size = (frame.depth.shape[0] * 7 // 10, frame.depth.shape[1] * 7 // 10)
     K = resize_intrinsics(torch.from_numpy(frame.intrinsics)[None], frame.depth.shape, size)
@@ -125,8 +125,8 @@ def figures(prepared: list[Prepared], kind: str, config: PosteriorConfig) -> lis
         maps = out.depth[0], variances[0], one.truth, one.frame.depth[0], variances[1], out.outlier[0]
         depth, variance, truth, network, *mixture = (x[..., ::STRIDE, ::STRIDE] for x in maps)
         metrics.update(depth, variance, truth, mixture=(mixture[0], mixture[1]))
-        known = (truth > 0) & (network > 0)
-        error, before = (truth - depth)[known], (truth - network)[known]
+        measured = (truth > 0) & (network > 0)
+        error, before = (truth - depth)[measured], (truth - network)[measured]
         worse.append((error.square().mean() > 1.21 * before.square().mean()).double())
     row = metrics.compute() | {"worse_frames": float(torch.stack(worse).nanmean())}
     return [row[name] for name in FIGURES]

@@ -1,6 +1,6 @@
 """Active learning on tours: which images of a walk are worth a label?
 
-Two rounds label those with the largest mean variance, or random ones; another walk through the rooms judges.
+Two rounds label the images with the largest mean variance, or random images. Another walk is the test set.
 """
 
 from copy import deepcopy
@@ -50,7 +50,7 @@ def trained(network: Any, labelled: list[Any], steps: int, rng: np.random.Genera
 
 
 def main(seeds: int = 4, frames: int = 160, labels: int = 12, steps: int = 60) -> dict[str, list[float]]:
-    """By choice the mean RMSE [m] after training, its difference to random choice's, and the interval."""
+    """By selection rule: mean RMSE [m] after training, its difference to random selection, and the interval."""
     start: Any = load_trained(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))[0]
     results: dict[str, list[float]] = {name: [] for name in ("before", "random", *PARTS)}
     for seed in range(200_001, 200_001 + seeds):

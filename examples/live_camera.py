@@ -1,4 +1,4 @@
-"""The camera of this computer, live: sigma beside the image, with poses from a file that a SLAM writes.
+"""Show the live camera image beside its sigma. Poses come from a trajectory file that a SLAM writes.
 
     python examples/live_camera.py --weights fastdepth_nyu.onnx --trajectory poses.txt --intrinsics 600 600 319.5 239.5
 
@@ -30,7 +30,7 @@ def main(words: Sequence[str] | None = None) -> Any:
     network = load_network("fastdepth", options.weights)
     model = UncertainDepth(network, UfMStarConfig(on_bad_frame="skip"))
     model.ufm.warm_up((224, 224))
-    latest: list[LiveResult] = []  # the newest alone; windows belong to the main thread
+    latest: list[LiveResult] = []  # only the newest result; OpenCV windows need the main thread
 
     def on_result(result: LiveResult) -> None:
         latest[:] = [result]

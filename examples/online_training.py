@@ -1,6 +1,7 @@
-"""Online training on tours: on which images of a walk does a label, with a step of training, pay?
+"""Online training on tours: for which images is a label and a training step worth its cost?
 
-``TrainDecision`` chooses them; beside it as many at random (all three take the first eight images), all, and none.
+Compares ``TrainDecision`` with random selection of as many images, with all images and with none. Every selection but
+the last includes the first eight images.
 """
 
 from copy import deepcopy
@@ -30,7 +31,7 @@ def walk(images: list[Any], network: Any, chosen: TrainDecision | set[int]) -> t
         statistics = image_statistics(result, torch.linalg.inv(last) @ pose)
         if chosen(statistics) if isinstance(chosen, TrainDecision) else i in chosen:
             labelled, last = [*labelled, i], pose
-            batch = [images[j] for j in (i, *rng.choice(labelled, 3))]  # with labels that are there already
+            batch = [images[j] for j in (i, *rng.choice(labelled, 3))]  # on earlier labels
             x, truth = (torch.cat([one[part] for one in batch]) for part in (0, 1))
             before = loss_of(network.distribution(x), truth, truth > 0)
             optimizer.zero_grad()

@@ -19,7 +19,7 @@ from ufmstar_torch.eval.sequences.frame import Entry, make_sequence
 
 
 class ShareOfDepth(Alone):
-    """The standard deviation is a tenth of the depth; nothing is kept from frame to frame."""
+    """The standard deviation is a tenth of the depth. The method has no state."""
 
     def update(self, predicted, T_world_cam, anchors=None):
         answer = super().update(predicted, T_world_cam)

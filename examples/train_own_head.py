@@ -1,6 +1,8 @@
-"""A head on a depth network of your own: what does it gain, and what does UfM* add? `python examples/train_own_head.py`
+"""Train an uncertainty head on your own depth network, then evaluate it with and without UfM*. `python
+examples/train_own_head.py`
 
-The network (take yours) learns depth in rendered rooms; then a head learns how far the frozen network errs in others.
+The network (replace it with yours) learns depth in rendered rooms. The head learns the frozen network's errors in
+others.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""A TSDF of a run's depth, every pixel weighted alike or by 1/sigma^2: error of the surface in cm.
+"""Fuse a run's depth into a TSDF, with equal weights or with 1/sigma^2, and print the surface error [cm].
 
     ufmstar run "tour:5?frames=60&size=120x160" --model trained --weights models/weights/demo.safetensors --posterior \\
         --out out/tour
@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from ufmstar_torch.eval.run.export import gated_frames, run_settings
 from ufmstar_torch.eval.sequences import open_sequence
 
-VOXEL, TRUNCATION = 0.08, 0.4  # [m]; the second is about the posterior's mean sigma
+VOXEL, TRUNCATION = 0.08, 0.4  # [m]; the truncation is about the posterior's mean sigma
 WEIGHTS = {"all alike": np.ones_like, "1/sigma^2": lambda sigma: 1 / np.maximum(sigma, 0.01) ** 2}
 
 
@@ -29,7 +29,7 @@ def fuse(frames, low, shape):
         inside = (u >= 0) & (v >= 0) & (u < frame.depth.shape[1]) & (v < frame.depth.shape[0])
         seen, pixels = seen[inside], (v[inside], u[inside])
         distance = (frame.depth[pixels] - camera[seen, 2]) / TRUNCATION
-        near = distance > -1  # a pixel that was left out is NaN, and not near
+        near = distance > -1  # False for NaN: pixels without depth
         for name, weigh in WEIGHTS.items():
             weight = weigh(frame.sigma[pixels][near])
             sums[name][:, seen[near]] += weight * np.minimum(distance[near], 1), weight

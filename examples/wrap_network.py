@@ -1,6 +1,6 @@
-"""A depth network of your own behind UfM*: what are its variance and its corrected depth worth in a rendered hall?
+"""Run your own depth network with UfM*, and evaluate its variance and corrected depth in a rendered hall.
 
-`network` stands for yours: any function or module that takes images and returns depth, here by name.
+Replace `network` by yours: any function or module from images to depth, here in a dict.
 """
 
 from importlib.resources import files
@@ -18,12 +18,12 @@ from ufmstar_torch.models import load_trained, wrap_network
 
 def main(tour: int = 5, frames: int = 40) -> dict[str, SequenceMetrics]:
     """The figures of depth and variance, by row."""
-    own: Any = load_trained(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))[0]
+    pretrained: Any = load_trained(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))[0]
 
     def network(image: Tensor) -> dict[str, Tensor]:
-        return {"metric_depth": own(image).depth}
+        return {"metric_depth": pretrained(image).depth}
 
-    wrapped = wrap_network(network, "metric_depth", preprocess=own.preprocess)
+    wrapped = wrap_network(network, "metric_depth", preprocess=pretrained.preprocess)
     model = UncertainDepth(wrapped, posterior=True)
     rows = {"UfM*": SequenceMetrics(), "posterior": SequenceMetrics()}
     walk = tour_sequence(tour, frames=150, style="hall")

@@ -64,9 +64,9 @@ class WrappedNetwork(DeclaredNetwork):
         except (AssertionError, RuntimeError, TypeError, ValueError) as error:  # how programs refuse an input
             if not self.path or isinstance(error, torch.OutOfMemoryError):
                 raise
-            given = f"{image.dtype} {tuple(image.shape)}{' and K' if self._passes_intrinsics else ''}"
+            shown = f"{image.dtype} {tuple(image.shape)}{' and K' if self._passes_intrinsics else ''}"
             raise ValueError(
-                f"{self.path} fails on {given}: {error}; if it is made for another input, declare its size in the "
+                f"{self.path} fails on {shown}: {error}; if it is made for another input, declare its size in the "
                 "spec's preprocess and a second input, of intrinsics, as takes_intrinsics, or export it for this one"
             ) from error
         return result if isinstance(result, DepthPrediction) else self.declared(result, image, intrinsics)
@@ -129,9 +129,9 @@ def wrap_network(
             or any(v is not None for v in (output, aleatoric, epistemic, confidence, focal, max_depth))
         ):
             raise ValueError("of a model of transformers only scale, takes_intrinsics and preprocess can be declared")
-        own = preprocess is None or isinstance(preprocess, Preprocess)
+        declares_preprocess = preprocess is None or isinstance(preprocess, Preprocess)
         declared: dict[str, Any] = {
-            "preprocess" if own else "processor": preprocess,
+            "preprocess" if declares_preprocess else "processor": preprocess,
             "takes_intrinsics": takes_intrinsics,
         }
         return from_hugging_face(network, kind=METRIC, scale=scale, **declared)

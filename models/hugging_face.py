@@ -399,8 +399,8 @@ def _kind(checkpoint: Checkpoint, spec: HuggingFaceSpec) -> str:
     config, name, model_type = checkpoint.config, checkpoint.name, checkpoint.model_type
     kind, takes_intrinsics = spec.kind, spec.takes_intrinsics
     if model_type not in _ALWAYS_METRIC:
-        known = ", ".join(_ALWAYS_METRIC)
-        raise CheckpointError(f"{name} ({model_type}) cannot be loaded as a depth model: covered are {known}")
+        names = ", ".join(_ALWAYS_METRIC)
+        raise CheckpointError(f"{name} ({model_type}) cannot be loaded as a depth model: covered are {names}")
     if takes_intrinsics and model_type != "depth_pro":
         raise ValueError(
             f"takes_intrinsics goes with Depth Pro, whose depth depends on the focal length, not {model_type}"

@@ -95,8 +95,8 @@ class LiteRTNetwork(DeclaredNetwork):
 
     def __getstate__(self) -> dict[str, Any]:
         # An interpreter cannot be copied or pickled; the copy opens its own from the same file.
-        own = ("interpreter", "input", "details")
-        return {key: value for key, value in self.__dict__.items() if key not in own}
+        unsaved = ("interpreter", "input", "details")
+        return {key: value for key, value in self.__dict__.items() if key not in unsaved}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)

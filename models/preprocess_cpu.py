@@ -14,12 +14,12 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import kept
+from ufmstar_torch.kernels.compile_cpu import cached
 
 Array = NDArray[Any]
 Taps = tuple[Array, Array]
 _PULSES = 256  # rows at a time: memory
-compiled = kept(fastmath={"contract"})
+compiled = cached(fastmath={"contract"})
 
 
 def resample(

@@ -76,12 +76,12 @@ class NetworkSpec(Checked):
         if (self.members > 1) != (self.method == "batch_ensemble"):
             expected = "1" if self.members > 1 else "at least 2"
             raise ValueError(f"NetworkSpec.members must be {expected} for {self.method!r}, got {self.members}")
-        own = self.architecture == "module"
-        if own and self.module is None:
+        is_module = self.architecture == "module"
+        if is_module and self.module is None:
             raise ValueError("NetworkSpec.module must describe the network of architecture 'module'")
         size, smallest = self.size, _SMALLEST.get(self.architecture, 1)
         whole = type(size) is tuple and len(size) == 2 and all(type(side) is int for side in size)
-        if not whole or not fits(*size, 1 if own else _MULTIPLE, smallest):
+        if not whole or not fits(*size, 1 if is_module else _MULTIPLE, smallest):
             expected = f"multiples of {_MULTIPLE} px from {smallest} px on"
             raise ValueError(f"NetworkSpec.size must be (height, width) in {expected}, got {size!r}")
         for f in fields(self):

@@ -1,6 +1,6 @@
-"""The implementations of the steps behind one set of signatures: the torch reference, numba, Triton.
+"""The implementations of every step under common signatures: the torch reference, numba, Triton.
 
-Arguments and results lie on the CPU, wherever a backend computes; ``conftest.backend`` is each of them in turn.
+Arguments and results are CPU tensors on every backend. The fixture ``backend`` of conftest.py yields each backend.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class Backend:
     """One implementation.
 
     Attributes:
-        device: of a module's tensors.
-        kernels: its parts.
-        check: of a frame's values.
-        slow: it runs in Triton's interpreter: few frames, few examples.
+        device: device of a module's tensors.
+        kernels: the kernels of the steps.
+        check: the check of a frame's values.
+        slow: True in Triton's interpreter, where tests use few frames and examples.
     """
 
     name: str
@@ -47,11 +47,11 @@ class Backend:
     slow: bool = False
 
     def spgf(self, depth, intrinsics, config, *, features=None):
-        """Step 2 of depth maps [B, H, W]."""
+        """Segment depth maps [B, H, W] (step 2)."""
         return self.kernels.spgf(SegmentInput.of(depth, intrinsics, config, features))
 
     def module(self, config: UfMStarConfig, dtype: torch.dtype = torch.float32) -> Callable[..., Any]:
-        """A UfM* of this backend that takes and returns CPU tensors; the module itself is its ``ufm``."""
+        """UfM* on this backend, with CPU tensors as arguments and results; ``ufm`` is the wrapped module."""
         ufm = UfMStar(config.replace(backend=self.name), dtype=dtype, device=self.device)
         call = ufm if self.device == "cpu" else _on(self.device, ufm)
         wrapped: Any = functools.partial(call)
@@ -61,7 +61,7 @@ class Backend:
 
 @functools.cache
 def make_backend(name: str) -> Backend:
-    """The backend of a name; skips where this machine cannot run it."""
+    """Return the named backend; skip the test where this machine cannot run it."""
     if name == "torch":
         return Backend(name, "cpu", REFERENCE, select_check(name, "cpu"))
     if name == "numba":
@@ -82,22 +82,22 @@ def make_backend(name: str) -> Backend:
 
 @functools.cache
 def compiled(part: Callable[..., Any]) -> Callable[..., Any]:
-    """A part of compiled kernels as a function that Python calls."""
+    """Wrap a function of the compiled kernels so that Python can call it."""
     return numba.njit(lambda *arguments: part(*arguments))
 
 
 def _on(device: str, kernel: Callable[..., Any]) -> Any:
-    """The same function for CPU tensors, computed on a device."""
+    """Run a kernel on ``device``, with CPU tensors as arguments and result."""
 
     def call(*arguments: Any, **options: Any) -> Any:
-        given = moved(arguments, device), {name: moved(value, device) for name, value in options.items()}
-        return moved(kernel(*given[0], **given[1]), "cpu")
+        options = {name: moved(value, device) for name, value in options.items()}
+        return moved(kernel(*moved(arguments, device), **options), "cpu")
 
     return call
 
 
 def _by_field(m: GaussianMixture, stream: int):
-    """All slots of a stream by field (``rigid_cpu``)."""
+    """All slots of a stream, one row per field (``rigid_cpu``)."""
     table = np.empty((rigid_cpu.FIELDS, rigid_cpu.padded(m.capacity)))
     moments = (v[stream].numpy() for v in (m.mean, m.covariance, m.weight))
     rigid_cpu.gather(m.capacity, *moments, table)
@@ -105,13 +105,13 @@ def _by_field(m: GaussianMixture, stream: int):
 
 
 def _corresponding(previous, current, intrinsics, size, config):
-    """The compiled lists of pairs, in increasing c and then k, as matrices; the overlap of other pairs stays 0."""
+    """The compiled lists of pairs as matrices, checked to be sorted by c, then k. The overlap of other pairs is 0."""
     match = torch.zeros(previous.streams, current.capacity, previous.capacity, dtype=torch.bool)
     overlap = torch.zeros(match.shape, dtype=torch.float64)
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, gaussian.PIXEL_VARIANCE)
     for b in range(previous.streams):
-        given = [value for m in (previous, current) for value in (_by_field(m, b), m.capacity)]
-        c, k, beta = compiled(correspond_cpu.matches)(*given, intrinsics[b].double().numpy(), *size, thresholds)
+        mixtures = [value for m in (previous, current) for value in (_by_field(m, b), m.capacity)]
+        c, k, beta = compiled(correspond_cpu.matches)(*mixtures, intrinsics[b].double().numpy(), *size, thresholds)
         match[b, c, k], overlap[b, c, k] = True, torch.from_numpy(beta)
         assert np.array_equal(np.stack([c, k], 1), match[b].nonzero().numpy())
     return Correspondence(match, overlap)
@@ -136,21 +136,22 @@ def _fused(previous, current, pairs, config, *, rounds=None):
 def _floored(cov, floor):
     out, mean = cov.clone(), torch.zeros(*cov.shape[:-2], 3, dtype=cov.dtype)
     mean[..., 2] = floor.sqrt()  # a camera whose pixel is 1 wide at depth 1
-    given = (value.numpy() for value in (mean.view(-1, 3), out.view(-1, 3, 3), torch.ones_like(floor).view(-1)))
-    fuse_cpu.lift(*given, 0.0, 1.0, 1.0, 0.0)
+    arrays = (value.numpy() for value in (mean.view(-1, 3), out.view(-1, 3, 3), torch.ones_like(floor).view(-1)))
+    fuse_cpu.lift(*arrays, 0.0, 1.0, 1.0, 0.0)
     return out
 
 
 def seen(m: GaussianMixture, features: int | None = None) -> list[regress_cpu.Seen]:
-    """The occupied slots of each stream as the compiled regression takes them; with so many features, zeros."""
+    """The occupied slots of each stream as arguments of the compiled regression; ``features``: that many zero
+    features."""
     out = []
     for b in range(m.streams):
         at = m.valid[b]
         rows = torch.cat([m.mean[b], m.covariance[b].flatten(1), m.weight[b, :, None]], 1)[at].double()
         components = np.zeros((rigid_cpu.FIELDS, rigid_cpu.padded(len(rows))))
         components[:, : len(rows)] = rows.T
-        own = m.features[b][at].double().numpy() if features is None else np.zeros((len(rows), features))
-        out.append(regress_cpu.Seen(components, m.disagreement[b][at].double().numpy(), own))
+        feature_rows = m.features[b][at].double().numpy() if features is None else np.zeros((len(rows), features))
+        out.append(regress_cpu.Seen(components, m.disagreement[b][at].double().numpy(), feature_rows))
     return out
 
 

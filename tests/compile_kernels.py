@@ -1,4 +1,4 @@
-"""``compile_kernels.py float32|float64``: compiles what many tests need of the kernels, and keeps it on disk."""
+"""``compile_kernels.py float32|float64``: compile the kernels that many tests use into the cache on disk."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ if __name__ == "__main__":
         two_frames(EXACT, torch.float32)
         compile_triangulation()
         dense_anchors()
-    else:  # anchors first: what does not depend on the dtype is compiled by one of the two processes
+    else:  # anchors first, so that only one of the two processes compiles the kernels without a dtype
         two_frames(EXACT.replace(anchors=AnchorConfig(), posterior=PosteriorConfig()), torch.float64)
         two_frames(NEAR, torch.float64)
     folder = Path(kernels.__file__).with_name("__pycache__")

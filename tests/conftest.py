@@ -1,4 +1,4 @@
-"""One thread a process, kernels that are compiled once, Hypothesis's profiles, and fixtures of several files."""
+"""Sets one thread per process, compiles the kernels once, and defines Hypothesis's profiles and the shared fixtures."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ settings.load_profile("interpreted" if os.environ.get("TRITON_INTERPRET") == "1"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Start to compile the kernels while the workers of pytest-xdist collect the tests."""
+    """Compile the kernels in the background while the workers of pytest-xdist collect the tests."""
     if config.getoption("tx", None) and not config.option.collectonly:
         dtypes = [dtype for dtype in ("float32", "float64") if not _compiled(dtype)]
         config.stash[COMPILERS] = [subprocess.Popen([sys.executable, COMPILE, dtype]) for dtype in dtypes]
 
 
 def pytest_xdist_node_collection_finished(node) -> None:
-    """No test starts before the kernels are compiled: numba's cache is shared by the workers."""
+    """Wait for the compiled kernels before the first test: the workers share numba's cache."""
     for compiler in node.config.stash.get(COMPILERS, []):
         compiler.wait()
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """A worker for each core, but none where files or tests are named on the command line."""
+    """Start one worker per core, or none if the command line names files or tests."""
     return 0 if _names_files(config) else min(len(os.sched_getaffinity(0)), MAX_WORKERS)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what needs a device, and what is slow unless files or tests are named, where ``-m`` does not choose."""
+    """Without ``-m``, deselect tests that need a GPU, and slow tests unless the command line names files or tests."""
     if config.option.markexpr:
         return
     markers = ("interpreter", "gpu") if _names_files(config) else ("slow", "interpreter", "gpu")
@@ -55,7 +55,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Take back what the test before did to torch's threads; numba changes their number when its own threads start."""
+    """Reset torch's number of threads: numba changes it when it starts its threads."""
     torch = sys.modules.get("torch")
     if torch is not None and torch.get_num_threads() != THREADS:
         torch.set_num_threads(THREADS)
@@ -74,13 +74,13 @@ def _compiled(dtype: str) -> bool:
 
 TRITON = (
     pytest.mark.interpreter, pytest.mark.gpu,
-    pytest.mark.filterwarnings("ignore::RuntimeWarning:triton"),  # numpy on inf and NaN, as a GPU computes silently
+    pytest.mark.filterwarnings("ignore::RuntimeWarning:triton"),  # NumPy on inf and NaN; a GPU is silent
 )  # fmt: skip
 
 
 @pytest.fixture(scope="session", params=["torch", "numba", pytest.param("triton", marks=TRITON)])
 def backend(request: pytest.FixtureRequest):
-    """Each implementation of the steps in turn (``backends``)."""
+    """Every backend of ``backends.py``."""
     from backends import make_backend
 
     return make_backend(request.param)
@@ -88,7 +88,7 @@ def backend(request: pytest.FixtureRequest):
 
 @pytest.fixture(scope="session", params=["numba", pytest.param("triton", marks=TRITON)])
 def compiled_backend(request: pytest.FixtureRequest):
-    """Those that are compared with the reference."""
+    """Every backend but the reference."""
     from backends import make_backend
 
     return make_backend(request.param)
@@ -96,7 +96,8 @@ def compiled_backend(request: pytest.FixtureRequest):
 
 @pytest.fixture(scope="session")
 def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An evaluation with a failed, an unfinished and a hostile sequence, example frames and a room, and its report."""
+    """The folder of an evaluation and its report: a failed, an unfinished and a hostile sequence, example frames and a
+    room."""
     from evaluations import ENSEMBLE, HOSTILE, KITCHEN, LATER, SCENES, TITLE, write_evaluation, write_examples
 
     from ufmstar_torch.eval.report.write import write_report
@@ -119,7 +120,7 @@ def results(evaluation: Path):
 
 @pytest.fixture
 def ufmstar(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
-    """Calls the program: (exit code, stdout, stderr)."""
+    """Run the command line in this process: (exit code, stdout, stderr)."""
     from ufmstar_torch import cli
 
     for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"):
@@ -136,7 +137,7 @@ def ufmstar(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture(scope="session")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three sequences of 4 frames. Nobody may change them."""
+    """Three sequences of 4 frames. Tests must not change them."""
     from tiny_suite import write_rooms
 
     return write_rooms(tmp_path_factory.mktemp("rooms"))
@@ -144,7 +145,7 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def network_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """A file of tiny networks for every base: {base: what a user types}. Nobody may change them."""
+    """A file of tiny networks for every base: {base: "BASE=trained:FILE"}. Tests must not change them."""
     from tiny_suite import write_networks
 
     return write_networks(tmp_path_factory.mktemp("networks"))
@@ -152,7 +153,7 @@ def network_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 @pytest.fixture(scope="session")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sequence to train on. Nobody may change it."""
+    """A sequence to train on. Tests must not change it."""
     from trainings import write_frames
 
     return write_frames(tmp_path_factory.mktemp("frames") / "walk")
@@ -160,7 +161,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def one_thread():
-    """One thread of torch's, restored afterwards."""
+    """Set torch to one thread during a module's tests."""
     import torch
 
     threads = torch.get_num_threads()

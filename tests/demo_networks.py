@@ -11,7 +11,7 @@ SPEC = NetworkSpec(widths=0.1, positive="softplus", size=SIZE, preprocess="resiz
 
 
 def members(count=3, spec=SPEC):
-    """Networks without training: their depths differ, which is all that the plumbing needs."""
+    """Untrained networks with different depths."""
     torch.manual_seed(0)
     networks = [build_network(spec).eval() for _ in range(count)]
     with torch.no_grad():
@@ -22,6 +22,6 @@ def members(count=3, spec=SPEC):
 
 
 def write_members(path):
-    """A file of three of them; the file."""
+    """Write three of these networks to a file, and return its path."""
     save_trained(path, members(), SPEC, info={"note": "a test"})
     return path

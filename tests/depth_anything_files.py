@@ -1,4 +1,4 @@
-"""Tiny checkpoints of ``transformers`` with random weights, as a user's directory holds them."""
+"""Writes tiny checkpoints of ``transformers`` with random weights."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def lively(model, seed):
-    """Random weights large enough for outputs that depend on the image."""
+    """Random weights, large enough for the output to depend on the image."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for value in model.parameters():
@@ -18,7 +18,7 @@ def lively(model, seed):
 
 
 def write_depth_anything(folder, kind, seed=0, max_depth=20):
-    """A Depth Anything V2 of 90 thousand weights with the published checkpoints' image processor."""
+    """Write a Depth Anything V2 of 90 thousand weights, with the image processor of the published checkpoints."""
     import transformers
 
     backbone = transformers.Dinov2Config(
@@ -42,8 +42,8 @@ def write_depth_anything(folder, kind, seed=0, max_depth=20):
 
 
 def write_other(folder, architecture, seed=0, **changes):
-    """A tiny model of another architecture with its image processor, for images of 64 x 64; ``changes`` of the
-    configuration."""
+    """Write a tiny model of another architecture with its image processor, for images of 64 x 64. ``changes`` override
+    its configuration."""
     import transformers
 
     neck = {"neck_hidden_sizes": [16, 16, 32, 32], "fusion_hidden_size": 16}

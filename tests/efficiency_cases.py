@@ -1,4 +1,4 @@
-"""A short tour and networks that see its depth, for the tests of what uncertainty costs."""
+"""A short tour and networks that predict its depth, for the tests of the cost of uncertainty."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SIZE = (64, 96)
 def network(
     head: str = "aleatoric", offset: float = 0.2, dropout: float = 0.0, backbone: type[Linear] = Linear
 ) -> UncertaintyNetwork:
-    """Depth is what :func:`room_sequence` hides in the image's red, plus ``offset``."""
+    """A network: depth = 5 m times the red channel of the image + ``offset``."""
     torch.manual_seed(0)
     inside: Backbone = backbone(weights=(5.0, 0.0), offset=offset, dropout=dropout)
     inside.preprocess = Preprocess(size=SIZE)
@@ -29,7 +29,7 @@ def network(
 
 @functools.cache
 def room_sequence(frames: int = 8) -> FrameSequence:
-    """Views of a room whose depth [5 m] is the red of the image."""
+    """Views of a room. The red channel of the image is the depth [5 m]."""
     height, width = SIZE
     rendered = open_sequence(f"tour:1?frames=150&size={height}x{width}&sensor=0")
     tour = [rendered[index] for index in range(frames)]

@@ -1,4 +1,4 @@
-"""Folders of ``ufmstar eval`` as it leaves them, from drawn numbers: real records and real sums, no network."""
+"""Writes folders of ``ufmstar eval`` from random numbers: real records and sums, no network."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.work_items import WorkItem
 
 Maps = tuple[Tensor, Tensor | None, Tensor]
-# How far sigma falls short of the error: 1 is calibrated.
+# Ratio of the error to sigma: 1 is calibrated.
 SHORT = {ALONE: 2.5, UFM: 1.8, UFM_STAR: 1.2}
 NETWORK = "FastDepth"
 
@@ -31,7 +31,7 @@ def rows_of(*names: str) -> list[Row]:
     return [Row(Method.parse(name)) for name in names]
 
 
-# The evaluation that all tests of the report share (``out`` in conftest.py).
+# The evaluation of the fixture ``evaluation`` in conftest.py.
 ENSEMBLE = rows_of("Ensemble", "UfM-Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble")
 SCENES = [("scannet", f"scene000{i}_00") for i in range(5)]
 KITCHEN = ("7-scenes", r"kitchen&_50% $a$ \frac{ ^$ <b>")
@@ -46,7 +46,7 @@ def folder_of(out: Path, dataset: str, sequence: str) -> Path:
 
 
 def write_examples(out: Path, dataset: str, sequence: str, rows: Sequence[Row]) -> None:
-    """An example frame "7" with maps of the rows, and a room of the last one."""
+    """Write an example frame "7" with maps of the rows, and a room for the last row."""
     folder = folder_of(out, dataset, sequence)
     for name in ("examples", "room"):
         (folder / name).mkdir(parents=True)
@@ -63,7 +63,7 @@ def write_examples(out: Path, dataset: str, sequence: str, rows: Sequence[Row]) 
 
 
 def draw_maps(row: Row, sequence: str, pixels: int = 800) -> Maps:
-    """Depth, variance and truth [pixels]; rows of a sequence share depth and truth, noise on poses shortens sigma."""
+    """Random depth, variance and truth [pixels]. Rows of a sequence share depth and truth; pose noise reduces sigma."""
     rng = np.random.default_rng(sum(map(ord, sequence)))
     truth = rng.uniform(1.0, 6.0, pixels)
     error = rng.uniform(0.05, 0.25) * truth * rng.uniform(0.2, 1.8, pixels)
@@ -77,7 +77,7 @@ def draw_maps(row: Row, sequence: str, pixels: int = 800) -> Maps:
 
 
 def judge(maps: Maps, references: Mapping[str, Tensor]) -> tuple[Record, dict[str, dict[str, Tensor]]]:
-    """A record's figures and curves, and the sums behind them."""
+    """The figures and curves of a record, and the sums they are computed from."""
     depth, variance, truth = maps
     metrics = SequenceMetrics(with_variance=variance is not None)
     metrics.update(depth, variance, truth)
@@ -98,7 +98,7 @@ def confident(variance: Tensor) -> Tensor:
 def write_sequence(
     out: Path, suite: str, dataset: str, sequence: str, rows: Iterable[Row], network: str = NETWORK
 ) -> None:
-    """Records and sums of the rows on one sequence."""
+    """Write records and sums of the rows for one sequence."""
     folder = folder_of(out, dataset, sequence)
     folder.mkdir(parents=True, exist_ok=True)
     rows = list(rows)
@@ -138,7 +138,7 @@ def record_of(suite: str, dataset: str, sequence: str, row: Row, judged: Record,
 def in_memory(
     figures: Mapping[tuple[Row, tuple[str, str]], Mapping[str, float]], suite: str = "own", **more: Any
 ) -> Results:
-    """Results with the figures given by row and (data set, sequence), in that order, and no curves."""
+    """Results without curves. ``figures`` maps row and (data set, sequence), in that order, to figures."""
     records = [
         record_of(suite, *where, row, Record("", "", "", "", "", figures=dict(values)))
         for (row, where), values in figures.items()
@@ -180,7 +180,7 @@ def write_evaluation(
     unfinished: Sequence[tuple[str, str]] = (),
     failed: Mapping[tuple[str, str], str] | None = None,
 ) -> Path:
-    """A folder; ``unfinished`` sequences have no record yet, ``failed`` ones a reason."""
+    """Write a folder. ``unfinished`` sequences have no record yet; ``failed`` sequences have a reason."""
     failed = failed or {}
     write_about(out, suite, title, rows, [*sequences, *unfinished, *failed])
     for dataset, sequence in sequences:
@@ -202,7 +202,7 @@ def parsed(text: str) -> dict[str, dict[str, str]]:
 
 
 def check_latex(text: str) -> None:
-    """Assert that it can be set: braces, environments, columns and characters."""
+    """Assert that LaTeX can compile the table: braces, environments, columns and characters."""
     bare = re.sub(r"\\[\\{}$&%#_]", "", text)
     assert bare.count("{") == bare.count("}")
     assert bare.count("$") % 2 == 0

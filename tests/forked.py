@@ -1,4 +1,4 @@
-"""Processes of their own that import nothing again: forked from one process that has imported the package."""
+"""Starts test processes quickly: forks of one process that has imported the package."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _program(words):
 
 def start(function, *arguments, **environment):
     """Start a process in a new process group that calls a function of a test file; return once it runs."""
-    begun, module = CONTEXT.Event(), function.__module__.rpartition(".")[2]  # pytest knows it as tests.MODULE
+    begun, module = CONTEXT.Event(), function.__module__.rpartition(".")[2]  # pytest imports the file as tests.MODULE
     process = CONTEXT.Process(target=_call, args=(begun, environment, module, function.__name__, arguments))
     process.start()
     assert begun.wait(120)

@@ -1,4 +1,4 @@
-"""Run after installing the wheel or the sdist: every package is there, and it is not the checkout's."""
+"""Checks an installed wheel or sdist: every package exists, and none is imported from the checkout."""
 
 from __future__ import annotations
 

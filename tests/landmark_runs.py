@@ -1,4 +1,4 @@
-"""A rendered walk for sources of landmarks, and the errors of what they return."""
+"""A rendered walk for the tests of landmark sources, and the errors of their landmarks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ufmstar_torch.eval.sequences.open import open_sequence
 
 @functools.cache
 def walk():
-    """14 frames of 180 x 240; nobody may change them."""
+    """14 frames of 180 x 240. Tests must not change them."""
     return list(open_sequence("tour:5?frames=14&size=180x240"))
 
 
@@ -28,7 +28,7 @@ def true_depth(frame, pixel):
 
 
 def surprise(frame, result):
-    """Errors of inverse depths over their standard deviations, absolute [N]."""
+    """[N] absolute errors of inverse depths over their standard deviations."""
     z = true_depth(frame, result.pixel)
     return np.abs(1 / result.depth - 1 / z) * result.depth**2 / np.sqrt(result.variance)
 

@@ -1,4 +1,4 @@
-"""Tiny copies of every dataset layout on disk, rendered, so that each file's content is known."""
+"""Writes rendered sequences in every dataset layout, tiny and with known content."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from scipy.spatial.transform import Rotation
 
-from scenes import FURNITURE, look, render
+from scenes import FURNITURE, camera_pose, render
 
 SIZE = (48, 64)  # (H, W)
 NED_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -27,7 +27,7 @@ class Truth:
 
 
 def resized(fx, fy, cx, cy, old, new=SIZE):
-    """K of an ``old`` (H, W) camera after a resize that keeps the image's borders (half a pixel out)."""
+    """K after a resize from ``old`` (H, W) that maps the image borders (at -1/2) to the image borders."""
     sy, sx = new[0] / old[0], new[1] / old[1]
     return np.array([[fx * sx, 0, (cx + 0.5) * sx - 0.5], [0, fy * sy, (cy + 0.5) * sy - 0.5], [0, 0, 1]])
 
@@ -35,7 +35,7 @@ def resized(fx, fy, cx, cy, old, new=SIZE):
 def walk(frames):
     """A walk through the room with turns: neighbouring frames are 11 cm and 2 degrees apart."""
     steps = np.arange(frames)
-    return [look((-0.5 + 0.1 * i, -0.2 + 0.02 * i, -0.9 + 0.03 * i), 0.035 * i - 0.2, 0.05) for i in steps]
+    return [camera_pose((-0.5 + 0.1 * i, -0.2 + 0.02 * i, -0.9 + 0.03 * i), 0.035 * i - 0.2, 0.05) for i in steps]
 
 
 def paint(depth, T_world_cam, K):
@@ -71,7 +71,7 @@ def write_depth_png(path, depth, units_per_metre, scale_text=None):
 
 
 def truncate(path: Path, share=0.5):
-    """Cuts a file off, as a full disk does."""
+    """Truncate a file, as a full disk does."""
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
 
@@ -82,7 +82,7 @@ def quaternion_line(T):
 
 
 def write_tum(root, frames=6, folder="rgbd_dataset_freiburg2_desk"):
-    """Colour at 10 + i/30 s, depth 5 ms later, poses of the walk at 100 Hz between linear key poses."""
+    """Colour and a pose at 10 + i/30 s, depth 5 ms later."""
     path = root / folder
     scene = truth(resized(520.9, 521.0, 325.1, 249.7, (480, 640)), frames)
     rgb, depth, poses = ["# color images"], ["# depth maps"], ["# timestamp tx ty tz qx qy qz qw"]
@@ -99,7 +99,7 @@ def write_tum(root, frames=6, folder="rgbd_dataset_freiburg2_desk"):
 
 
 def write_seven_scenes(root, frames=6):
-    """Depth from the depth camera (the poses are its own), colour from one 2.5 cm to its right."""
+    """Depth and poses of the depth camera; the colour camera is 2.5 cm to its right."""
     path = root / "seq-01"
     T_depth_color = np.eye(4)
     T_depth_color[0, 3] = 0.025

@@ -1,4 +1,4 @@
-"""ROS bags of the walk, written with rosbags: ROS 1, db3 and mcap; poses by topic or by tf."""
+"""Writes ROS bags of the walk with rosbags: ROS 1, db3 and mcap; poses on a topic or in tf."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ T_MAP_ODOM = rigid(turn(0, 0, 30), (1.0, 2.0, 0.0))
 
 
 class BagFile:
-    """Writes messages by the names of their types and fields, in whatever ROS."""
+    """Writes messages by the names of their types and fields, in ROS 1 or 2."""
 
     def __init__(self, path, kind):
         self.ros1 = kind == "ros1"
@@ -122,7 +122,8 @@ class BagFile:
 
 def write_bag(root, kind="mcap", poses="odometry", *, compressed=False, depth="16UC1", camera=None, change=None):
     """A robot: ``odom`` -> ``base`` moves, ``base`` -> ``optical`` (``T_BODY_CAMERA``) and ``map`` -> ``odom`` are
-    fixed. Poses lie 10 ms before and after each image, so that they are interpolated. ``change(bag)`` writes more."""
+    fixed. Poses are 10 ms before and after each image, so that readers interpolate. ``change(bag)`` writes further
+    messages."""
     name = "walk.bag" if kind == "ros1" else "walk"
     path, scene = root / name, layouts.truth(K)
     bag = BagFile(path, kind)

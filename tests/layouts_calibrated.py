@@ -1,4 +1,4 @@
-"""Tiny copies of layouts that calibrate their cameras themselves: COLMAP, transforms.json, EuRoC, ARKit."""
+"""Writes tiny sequences in the layouts that store their calibration: COLMAP, transforms.json, EuRoC, ARKit."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SEEN = 12  # points of an image
 
 
 def surface_points(scene):
-    """[12 N, 3] what pixels of each of N frames show [m]."""
+    """[12 N, 3] surface points at 12 pixels of each of N frames [m]."""
     rng, points = np.random.default_rng(0), []
     for T, depth in zip(scene.T_world_cam, scene.depths, strict=True):
         u, v = rng.integers(0, W, SEEN), rng.integers(0, H, SEEN)
@@ -41,8 +41,8 @@ def surface_points(scene):
 
 
 def write_colmap(root, frames=6, *, text=False, model="PINHOLE", coefficients=(), unit=1.0):
-    """``sparse/0`` with two cameras in turn, in a ``unit`` of [m], ``images/`` and ``depth/``; each image sees 12
-    points of its own, on the surfaces."""
+    """``sparse/0`` with two alternating cameras, in a ``unit`` of [m], ``images/`` and ``depth/``. Each image observes
+    12 surface points that no other image observes."""
     path, scene = root / "walk", layouts.truth(K, frames)
     folder = path / "sparse" / "0"
     folder.mkdir(parents=True)
@@ -123,7 +123,7 @@ def write_euroc(root, frames=6, coefficients=(0.0, 0.0, 0.0, 0.0), model="radial
 
 
 def write_stray(root, frames=6, *, per_frame=False):
-    """A phone's folder: a video (lossless here), depth of half its size, of which row 0 has no confidence."""
+    """A phone's folder: a (here lossless) video, and depth of half its size, with confidence 0 in row 0."""
     path, scene = root / "4f3a2b", layouts.truth(K, frames)
     path.mkdir(parents=True)
     layouts.write_video(path / "rgb.mkv", scene.images)

@@ -1,4 +1,4 @@
-"""Tiny copies of layouts that take more writing: KITTI-360 with its laser, ScanNet's .sens, NYU's h5 files."""
+"""Writes tiny sequences as KITTI-360 with laser scans, ScanNet's .sens, and NYU's h5 files."""
 
 from __future__ import annotations
 
@@ -54,28 +54,28 @@ def large_truth(poses):
 
 
 def write_kitti360(root, numbers=(3, 4, 6, 7, 8), standing=(5,), camera="00"):
-    """A drive whose frames ``standing`` have no pose; the truth is of ``numbers``, by their order.
+    """A drive. The frames ``standing`` have no pose; the truth has the frames ``numbers``, in that order.
 
-    Every scan holds what the camera sees at every third column and second row, as the turning laser measures it.
+    Every scan samples the camera's depth at every third column and second row, distorted as by a turning laser.
     """
     every = sorted({*numbers, *standing})
     rect0 = dict(zip(every, large_walk(len(every)), strict=True))
     to_camera = np.linalg.inv(T_car_rect("00")) @ T_car_rect(camera)
     truth = large_truth([rect0[n] @ to_camera for n in every])
-    known = {n: T for n, T in rect0.items() if n not in standing}
+    T_by_number = {n: T for n, T in rect0.items() if n not in standing}
     _write_calibration(root / "calibration")
     folder = root / "data_poses" / DRIVE
     folder.mkdir(parents=True)
     inverse = np.linalg.inv(T_car_rect("00"))
-    np.savetxt(folder / "cam0_to_world.txt", [[n, *T.ravel()] for n, T in known.items()])
-    np.savetxt(folder / "poses.txt", [[n, *(T @ inverse)[:3].ravel()] for n, T in known.items()])
+    np.savetxt(folder / "cam0_to_world.txt", [[n, *T.ravel()] for n, T in T_by_number.items()])
+    np.savetxt(folder / "poses.txt", [[n, *(T @ inverse)[:3].ravel()] for n, T in T_by_number.items()])
     images = root / "data_2d_raw" / DRIVE / f"image_{camera}"
     scans = root / "data_3d_raw" / DRIVE / "velodyne_points" / "data"
     scans.mkdir(parents=True)
     for i, number in enumerate(every):
         layouts.write_image(images / "data_rect" / f"{number:010d}.png", truth.images[i])
-        if number in known:
-            _write_scan(scans / f"{number:010d}.bin", truth.depths[i], truth.K, to_camera, known, number)
+        if number in T_by_number:
+            _write_scan(scans / f"{number:010d}.bin", truth.depths[i], truth.K, to_camera, T_by_number, number)
     stamps = [f"2013-05-28 08:46:{2 + n / 10:012.9f}" for n in range(max(every) + 1)]
     (images / "timestamps.txt").write_text("\n".join(stamps) + "\n")
     keep = [every.index(n) for n in numbers]
@@ -98,24 +98,25 @@ def _write_calibration(folder):
     np.savetxt(folder / "calib_cam_to_velo.txt", T_LASER_MOUNTED[:3].reshape(1, 12))
 
 
-def _write_scan(path, depth, K, to_camera, known, number):
+def _write_scan(path, depth, K, to_camera, T_by_number, number):
     v, u = np.mgrid[0 : depth.shape[0] : 2, 0 : depth.shape[1] : 3]
     z = depth[v, u].ravel()
     in_camera = np.stack([(u.ravel() - K[0, 2]) / K[0, 0] * z, (v.ravel() - K[1, 2]) / K[1, 1] * z, z, np.ones_like(z)])
     T_laser_rect0 = T_LASER_MOUNTED @ rigid(R_RECT["00"].T, (0, 0, 0))
     points = (T_laser_rect0 @ to_camera @ in_camera)[:3]
-    before, now = (number - 1, number) if number - 1 in known else (number, number + 1)
-    if before in known and now in known:
-        motion = np.linalg.inv(known[now]) @ known[before]
+    before, after = (number - 1, number) if number - 1 in T_by_number else (number, number + 1)
+    if before in T_by_number and after in T_by_number:
+        motion = np.linalg.inv(T_by_number[after]) @ T_by_number[before]
         points = roll(points, T_laser_rect0 @ motion @ np.linalg.inv(T_laser_rect0))
     path.write_bytes(np.concatenate([points, np.full((1, len(z)), 0.5)]).T.astype("<f4").tobytes())
 
 
 def roll(points, T_laser_before):
-    """[3, N] what a head that turns clockwise measures of points given as of the moment when it looks forward."""
+    """[3, N] points as measured by a laser head that turns clockwise; the arguments are points at the time it looks
+    forward."""
     rotation = Rotation.from_matrix(T_laser_before[:3, :3]).as_rotvec()
     measured = points
-    for _ in range(20):  # a point's azimuth decides when it is measured, and that its azimuth
+    for _ in range(20):  # the azimuth determines the time of measurement, which changes the azimuth: iterate
         share = np.arctan2(measured[1], measured[0]) / (2 * np.pi)
         shifted = (points - share * T_laser_before[:3, 3:]).T
         measured = Rotation.from_rotvec(-share[:, None] * rotation).apply(shifted).T

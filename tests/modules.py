@@ -1,4 +1,4 @@
-"""A short rendered sequence, and a look at the state of a module."""
+"""A short rendered sequence, and a comparison of a module's state."""
 
 from __future__ import annotations
 
@@ -30,5 +30,5 @@ def snapshot(ufm: torch.nn.Module) -> dict[str, torch.Tensor]:
 
 
 def unchanged(ufm: torch.nn.Module, before: dict[str, torch.Tensor]) -> bool:
-    now = ufm.state_dict()
-    return now.keys() == before.keys() and all(same(v.double(), before[k].double()) for k, v in now.items())
+    after = ufm.state_dict()
+    return after.keys() == before.keys() and all(same(v.double(), before[k].double()) for k, v in after.items())

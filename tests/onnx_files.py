@@ -1,4 +1,4 @@
-"""ONNX files for the tests, written node by node, so that they share nothing with the code that reads them."""
+"""Writes ONNX files node by node, independently of the code that reads them."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Edit = Callable[[onnx.ModelProto], None]
 
 
 def small_network(seed: int = 0) -> FastDepth:
-    """A FastDepth with few, all different widths, and batch norms as training leaves them."""
+    """A FastDepth with few channels, all counts different, and batch norms with non-initial statistics."""
     widths = FastDepthWidths((3, 6, 4, 7, 5, 8, 9, 10, 11, 6, 4, 5, 12, 13), (9, 8, 7, 6, 5))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = FastDepth(widths)
         norms = [m for m in network.modules() if isinstance(m, torch.nn.BatchNorm2d)]
         for norm in norms:
-            norm.momentum = 1.0  # one batch sets the statistics, so that activations keep their size
+            norm.momentum = 1.0  # one batch sets the statistics, so that activations do not grow
             torch.nn.init.uniform_(norm.weight, 0.7, 1.3)
             torch.nn.init.uniform_(norm.bias, 0.0, 0.5)
         with torch.no_grad():
@@ -35,7 +35,7 @@ def small_network(seed: int = 0) -> FastDepth:
 
 
 def write_fastdepth(path: Path, network: FastDepth, size: int = 64, *, opset: int = 13) -> Path:
-    """``network`` as a graph: convolution by convolution from its state_dict, batch norms if it has them."""
+    """Write ``network`` as a graph from its state_dict, convolution by convolution, with its batch norms if any."""
     state, weights, nodes = network.state_dict(), [], []
 
     def weight(key: str) -> str:
@@ -100,7 +100,7 @@ def save(
     types: Sequence[int] = (),
     opset: int = 13,
 ) -> Path:
-    """Write a graph; ``types`` are those of the inputs, float where it is not given."""
+    """Write a graph. ``types``: types of the inputs, by default float."""
     kinds = [*types, *[TensorProto.FLOAT] * (len(inputs) - len(types))]
     graph = helper.make_graph(
         nodes,
@@ -115,7 +115,7 @@ def save(
 
 
 def edited(source: Path, target: Path, edit: Edit) -> Path:
-    """A copy of a file with something changed in it."""
+    """Write a copy of a file after ``change`` has edited its graph."""
     model = onnx.load(str(source))
     edit(model)
     onnx.save(model, str(target))

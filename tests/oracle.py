@@ -34,7 +34,7 @@ def geodesic(mean_k, cov_k, mean_c, cov_c, lam):
 
 
 def overlap_squared(mean_a, cov_a, mean_b, cov_b):
-    """d^2 of docs: squared depth difference, averaged over the image positions that both Gaussians share."""
+    """d^2 of docs/algorithm.md: squared depth difference, averaged over the image overlap of both Gaussians."""
 
     def profile(mean, cov):
         x, y, z = mean
@@ -108,7 +108,7 @@ class Segmentation:
 
 
 def segment(depth, K, segmentation, *, valid=None, features=None, near=0.05):
-    """C_i; its floor is the footprint of a pixel (at the near plane, if nearer).
+    """C_i. The covariance floor is the footprint of a pixel, at no less than the near plane's depth.
 
     features [F, H, W] are averaged over the pixels of a component.
     """
@@ -144,15 +144,15 @@ def correspond(previous_cam, current_cam, K, size, eta, eta_occl, near):
     projected = [candidate(k, K, size, near) for k in previous_cam]
     matches, overlaps = [], {}
     for c, component in enumerate(current_cam):
-        own = candidate(component, K, size, near)
+        gaussian = candidate(component, K, size, near)
         result = []
         for k, other in enumerate(projected):
-            if own is None or other is None:
+            if gaussian is None or other is None:
                 continue
-            overlaps[c, k] = bhattacharyya(*other, *own)
+            overlaps[c, k] = bhattacharyya(*other, *gaussian)
             if overlaps[c, k] >= eta:
                 result.append(k)
-        kept = []
+        visible = []
         for k in result:
             hidden = False
             for other in result:
@@ -160,8 +160,8 @@ def correspond(previous_cam, current_cam, K, size, eta, eta_occl, near):
                 if nearer and bhattacharyya(*projected[other], *projected[k]) > eta_occl:
                     hidden = True
             if not hidden:
-                kept.append(k)
-        matches.append(kept)
+                visible.append(k)
+        matches.append(visible)
     return matches, overlaps
 
 
@@ -188,7 +188,7 @@ def fuse(mixture, current, matches, overlaps, *, overlap_weighted=False, remembe
 
 
 def prepared(mixture):
-    """The mixture with the inverse covariance and the density's factor kept beside each component."""
+    """The mixture, with the inverse covariance and the normalisation of the density added to each component."""
     return [
         {**g, "inverse": np.linalg.inv(g["cov"]), "factor": 1 / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(g["cov"]))}
         for g in mixture
@@ -250,8 +250,8 @@ def compared_share(mixture_cam, depth, valid, K, **prior):
 
 
 def aleatoric_in_h(mixture_cam, depth, valid, K, aleatoric, *, prior_weight):
-    """The aleatoric variance kept as the first feature, read back at every valid pixel; the pixel's own counts as far
-    as the prior explains the point: (sum_k p_k a_k + pi_0 A) / (sum_k p_k + pi_0), exact sum."""
+    """The aleatoric variance at every valid pixel, regressed from the first feature; the pixel's variance A has the
+    prior's weight: (sum_k p_k a_k + pi_0 A) / (sum_k p_k + pi_0), exact sum."""
     out = np.full(depth.shape, np.nan)
     mixture = prepared(mixture_cam)
     for v, u in np.argwhere(valid):
@@ -315,12 +315,12 @@ class Oracle:
             M = M + (1 - self.share()) * (self.unmeasured_relative * depth) ** 2
         if self.unmeasured == "nan":
             M = np.where(self.share() < 0.5, np.nan, M)
-        here = ~np.isnan(M)
+        measured = ~np.isnan(M)
         if self.smoothed is not None:
             both = (1 - self.alpha) * self.smoothed + self.alpha * M
             M = np.where(np.isnan(M), self.smoothed, np.where(np.isnan(self.smoothed), M, both))
         self.smoothed = M
-        M = np.where(here, M, np.nan)
+        M = np.where(measured, M, np.nan)
         V = M + (0 if aleatoric is None else aleatoric) + (0 if epistemic is None else epistemic)
         return V, M
 

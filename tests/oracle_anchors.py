@@ -10,7 +10,8 @@ NEIGHBOURS, SUPPORT, SIGMAS, QUARTILE, LEAST, CLAIM = 8, 3, 2.5, 0.4506, 0.02, 4
 
 
 def believed(anchors):
-    """Mark each (u, v, depth, variance, predicted) that enough of its nearest neighbours in the image support."""
+    """Mark each (u, v, depth, variance, predicted) that is supported by enough of its nearest neighbours in the
+    image."""
     if len(anchors) <= SUPPORT:
         return [True] * len(anchors)
     ratio = [np.log(g / d) for _, _, g, _, d in anchors]
@@ -36,7 +37,7 @@ def weight(claim, others):
 
 
 class AnchoredOracle(oracle.Oracle):
-    """UfM* with the sums of (1, r, e) beside every component and of the stream."""
+    """UfM* with the sums of (1, r, e) per component and per stream."""
 
     def __init__(self, spgf, *, kappa, half_life, **settings):
         super().__init__(spgf, **settings)
@@ -45,12 +46,12 @@ class AnchoredOracle(oracle.Oracle):
 
     def step_anchored(self, depth, T_world_cam, K, anchors, aleatoric=None):
         """V, B and the expected r [H, W]; anchors are (u, v, depth, variance)."""
-        own = np.zeros_like(depth) if aleatoric is None else aleatoric
+        network_variance = np.zeros_like(depth) if aleatoric is None else aleatoric
         V, M = self.step(depth, T_world_cam, K, aleatoric)
         to_cam = oracle.relative(self.T_first, T_world_cam)
         mixture = oracle.prepared([oracle.transform(g, *to_cam) for g in self.mixture])
         self.sums += [np.zeros(3) for _ in range(len(mixture) - len(self.sums))]
-        self._learn(mixture, depth, own, K, anchors)
+        self._learn(mixture, depth, network_variance, K, anchors)
         r_stream, e_stream = self.total[1:] / (self.total[0] + self.kappa)
         B, bias = np.full(depth.shape, np.nan), np.full(depth.shape, np.nan)
         for v, u in np.argwhere(np.isfinite(M)):
@@ -63,11 +64,11 @@ class AnchoredOracle(oracle.Oracle):
             B[v, u], bias[v, u] = max(0.0, depth[v, u] ** 2 * e - M[v, u]), r
         return V + B, B, bias
 
-    def _learn(self, mixture, depth, own, K, anchors):
+    def _learn(self, mixture, depth, network_variance, K, anchors):
         full = [(u, v, g, s2, depth[round(v), round(u)]) for u, v, g, s2 in anchors]
         used = [anchor for anchor, fine in zip(full, believed(full), strict=True) if fine]
         errors = [(g - d) / d for *_, g, _, d in used]
-        claims = [(s2 + own[round(v), round(u)]) / d**2 for u, v, _, s2, d in used]
+        claims = [(s2 + network_variance[round(v), round(u)]) / d**2 for u, v, _, s2, d in used]
         weights = [weight(claim, errors[:i] + errors[i + 1 :]) for i, claim in enumerate(claims)]
         if any(w >= 0.5 for w in weights):
             self.sums = [self.memory * row for row in self.sums]

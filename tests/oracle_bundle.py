@@ -24,7 +24,7 @@ def moved(pose, error):
 
 
 def projected(ray, rho, newest, view):
-    """Position on the plane at depth 1 of a view, of a point on a ray of the newest view."""
+    """Project a point on a ray of the newest view to a view's plane at depth 1."""
     point = newest[:3, 3] + newest[:3, :3] @ np.append(ray, 1) / rho
     x, y, z = view[:3, :3].T @ (point - view[:3, 3])
     return np.array([x / z, y / z])

@@ -23,7 +23,7 @@ def pooled(mean, weight):
 
 
 def factor_map(state):
-    """The factor as a function of c, and the one factor without it."""
+    """The factor as a function of c, and the constant factor without c."""
     anchors = state["anchors"]
     ordered = sorted(c for c, _, _ in anchors)
     edges = [ordered[k * len(ordered) // BINS] for k in range(1, BINS)] if anchors else [np.inf] * (BINS - 1)
@@ -60,7 +60,7 @@ def gain(state):
 
 
 def update(state, confidence, variance, at, predicted, g, s2):
-    """State and V' [H, W] after a frame with anchors at the pixels ``at`` of the flattened image."""
+    """State and V' [H, W] after a frame with anchors. ``at``: their pixels in the flattened image."""
     h, one = factor_map(state)
     new = []
     for i, d, z, s in zip(at, predicted, g, s2, strict=True):

@@ -8,7 +8,7 @@ SIDE, FIRST = 8, -3.5
 
 
 def project(pixel, rho, H, b):
-    """Pixel of the view that shows a pixel (u, v) at an inverse depth rho [1/m]."""
+    """Project pixel (u, v) with inverse depth rho [1/m] into the view."""
     x = H @ np.array([*pixel, 1.0]) + rho * b
     return x[:2] / x[2]
 
@@ -22,13 +22,13 @@ def bilinear(image, u, v):
 
 
 def warp(pixel, rho, H, b, step=1e-4):
-    """[2, 2] by how much the pixel moves in the image for a pixel in the view, by differences."""
+    """[2, 2] derivative of the image position by the position in the view, by finite differences."""
     columns = [project(pixel + step * e, rho, H, b) - project(pixel - step * e, rho, H, b) for e in np.eye(2)]
     return np.linalg.inv(np.stack(columns, axis=1) / (2 * step))
 
 
 def patch(image, pixel, rho, H, b):
-    """[10, 10] the image around a pixel as the view sees it at rho."""
+    """[10, 10] image patch around a pixel, warped into the view at rho."""
     back, result = warp(np.asarray(pixel, float), rho, H, b), np.empty((SIDE + 2, SIDE + 2))
     for j in range(SIDE + 2):
         for i in range(SIDE + 2):
@@ -42,12 +42,13 @@ def zncc(one, other):
 
 
 def window(view, u, v):
-    """[8, 8] around a centre, between pixels."""
+    """[8, 8] window around a centre, interpolated."""
     return np.array([[bilinear(view, u + i + FIRST, v + j + FIRST) for i in range(SIDE)] for j in range(SIDE)])
 
 
 def along_line(image, view, pixel, H, b, low, high):
-    """The best inverse depth in [low, high], and its ZNCC: every twentieth of a pixel is tried."""
+    """The inverse depth in [low, high] with the best ZNCC, and that ZNCC: exhaustive search in steps of a twentieth of
+    a pixel."""
     reference = patch(image, pixel, 0.5 * (low + high), H, b)[1:-1, 1:-1]
     ends = project(pixel, low, H, b), project(pixel, high, H, b)
     steps = int(np.ceil(20 * np.linalg.norm(ends[1] - ends[0])))
@@ -63,7 +64,7 @@ def along_line(image, view, pixel, H, b, low, high):
 
 
 def displaced(pixel, rho, H, b, K, error):
-    """Pixel in a view whose pose and camera are wrong by ``error`` [10]: w, s, f, cx, cy, k."""
+    """Projection into a view whose pose and camera have the ``error`` [10]: w, s, f, cx, cy, k."""
     w, s, (focal, cu, cv, k) = error[:3], error[3:6], error[6:]
     R, t = np.linalg.inv(K) @ H @ K, np.linalg.inv(K) @ b
     fu, fv, u0, v0 = K[0, 0] * (1 + focal), K[1, 1] * (1 + focal), K[0, 2] + cu, K[1, 2] + cv
@@ -77,7 +78,7 @@ def displaced(pixel, rho, H, b, K, error):
 
 
 def by_errors(pixel, rho, H, b, K, step=1e-5):
-    """[2, 10] by how much a pixel moves with the errors, by differences."""
+    """[2, 10] derivative of the projection by the errors, by finite differences."""
     columns = [
         (displaced(pixel, rho, H, b, K, step * e) - displaced(pixel, rho, H, b, K, -step * e)) for e in np.eye(10)
     ]
@@ -85,8 +86,8 @@ def by_errors(pixel, rho, H, b, K, step=1e-5):
 
 
 def errors_and_depths(change, value, variance, across_change, across, across_variance, precision, start, rounds=3):
-    """Errors [6 V + 4], their covariance, depths [N] and their variances [N]: one system of all of them. Views show
-    nothing where the variance is infinite."""
+    """Errors [6 V + 4], their covariance, inverse depths [N] and their variances [N], from one joint system. An
+    infinite variance marks a view without a measurement."""
     count, views, _ = change.shape
     size = len(start)
     weight, weight_across = np.ones((count, views)), np.ones((count, views))
@@ -97,13 +98,13 @@ def errors_and_depths(change, value, variance, across_change, across, across_var
         rows = {}
         for n in range(count):
             for k in range(views):
-                place = [*range(6 * k, 6 * k + 6), *range(6 * views, size)]
-                row, beside = np.zeros(size + count), np.zeros(size + count)
-                row[place], row[size + n], beside[place] = change[n, k], 1, across_change[n, k]
-                rows[n, k] = row, beside
+                columns = [*range(6 * k, 6 * k + 6), *range(6 * views, size)]
+                row, row_across = np.zeros(size + count), np.zeros(size + count)
+                row[columns], row[size + n], row_across[columns] = change[n, k], 1, across_change[n, k]
+                rows[n, k] = row, row_across
                 for each, seen, w in (
                     (row, value[n, k], weight[n, k] / variance[n, k]),
-                    (beside, across[n, k], weight_across[n, k] / across_variance[n, k]),
+                    (row_across, across[n, k], weight_across[n, k] / across_variance[n, k]),
                 ):
                     A += w * np.outer(each, each)
                     r += w * seen * each
@@ -111,16 +112,16 @@ def errors_and_depths(change, value, variance, across_change, across, across_var
         x = covariance @ r
         for n in range(count):
             for k in range(views):
-                row, beside = rows[n, k]
+                row, row_across = rows[n, k]
                 weight[n, k] = 5 / (4 + (value[n, k] - row @ x) ** 2 / variance[n, k])
-                weight_across[n, k] = 5 / (4 + (across[n, k] - beside @ x) ** 2 / across_variance[n, k])
+                weight_across[n, k] = 5 / (4 + (across[n, k] - row_across @ x) ** 2 / across_variance[n, k])
     return x[:size], covariance[:size, :size], x[size:], covariance.diagonal()[size:]
 
 
 def alone(pixel, rho, variance, cell):
-    """[N] squared errors to expect by the anchors in the 5 x 5 cells around each: the probability to be wrong, .026 in
-    the mean, which goes with the eighth power of the share of others, times their mean squared difference. No two
-    anchors have a cell in common."""
+    """[N] expected squared errors from the anchors in the 5 x 5 cells around each: the probability of an outlier (mean
+    .026, proportional to the eighth power of the share of contradicting anchors) times their mean squared difference. A
+    cell has at most one anchor."""
     cells, power, square = np.floor(pixel / cell), np.zeros(len(rho)), np.zeros(len(rho))
     for n in range(len(rho)):
         near = [m for m in range(len(rho)) if m != n and np.abs(cells[m] - cells[n]).max() <= 2]
@@ -135,18 +136,19 @@ def alone(pixel, rho, variance, cell):
 
 
 def confirmed(pixel, rho, variance, agreed, contradicted, cell):
-    """[N] measurements that hold: two views agree; or one, which is not certain to 20 %, or with which at least three
-    others in the 5 x 5 cells around agree, 90 % of all there, each certain to 20 %. No two have a cell in common."""
+    """[N] accepted measurements: two views agree; or one view agrees, and the measurement is not certain to 20 %, or at
+    least three measurements in the 5 x 5 cells around it agree, 90 % of all, each certain to 20 %. A cell has at most
+    one measurement."""
     cells, fine = np.floor(pixel / cell), (agreed > 1) & (contradicted == 0)
     found = [n for n in range(len(rho)) if agreed[n] > 0 and contradicted[n] == 0]
     for n in found:
         near = [m for m in found if m != n and np.abs(cells[m] - cells[n]).max() <= 2]
-        alike = [
+        agreeing = [
             m
             for m in near
             if (rho[m] - rho[n]) ** 2 < max(9 * (variance[m] + variance[n]), (0.05 * rho[n]) ** 2)
             and variance[m] < (0.2 * rho[m]) ** 2
         ]
-        supported = len(alike) >= 3 and len(alike) >= 0.9 * len(near)
+        supported = len(agreeing) >= 3 and len(agreeing) >= 0.9 * len(near)
         fine[n] |= agreed[n] == 1 and (supported or variance[n] >= (0.2 * rho[n]) ** 2)
     return fine

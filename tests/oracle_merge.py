@@ -9,7 +9,7 @@ import numpy as np
 
 
 def joint(g, h):
-    """The component with the common moments of two."""
+    """The component with the joint moments of two components."""
     weight = g["weight"] + h["weight"]
     a, b = g["weight"] / weight, h["weight"] / weight
     d = g["mean"] - h["mean"]
@@ -25,7 +25,7 @@ def joint(g, h):
 
 
 def loss(g, h):
-    """Bound on the divergence per pixel of the lighter one [nat]; infinite where the two may not join."""
+    """Bound on the divergence per pixel of the lighter component [nat]; infinite for a pair that must not join."""
     lighter, heavier = (g, h) if g["weight"] < h["weight"] else (h, g)
     if lighter["count"] > 1 and heavier["count"] == 1:
         return np.inf
@@ -36,7 +36,7 @@ def loss(g, h):
 
 
 def join(components, limit):
-    """Rounds in which those join who are each other's best."""
+    """Repeatedly join the pairs that are each other's best candidate."""
     while True:
         n = len(components)
         table = np.array(
@@ -73,22 +73,22 @@ def mean_shares(g, components, prior_weight):
 
 
 def dissolve(components, least, prior_weight):
-    """Without the components whose own share is below ``least``, where those that stay explain the rest."""
+    """Dissolve components whose share at their own points is below ``least`` and whose neighbours explain the rest."""
     table = [mean_shares(g, components, prior_weight) for g in components]
     weak = [row[k] < least for k, row in enumerate(table)]
     after = [dict(g) for g in components]
-    kept = []
+    retained = []
     for k, g in enumerate(components):
-        given = np.where(weak, 0.0, table[k])
-        if not weak[k] or given.sum() < 1 - least:
-            kept.append(k)
+        shares = np.where(weak, 0.0, table[k])
+        if not weak[k] or shares.sum() < 1 - least:
+            retained.append(k)
             continue
-        for h, share in zip(after, given / given.sum(), strict=True):
+        for h, share in zip(after, shares / shares.sum(), strict=True):
             weight = h["weight"] + share * g["weight"]
             for name in ("m", "features"):
                 h[name] = (h["weight"] * h[name] + share * g["weight"] * g[name]) / weight
             h["weight"], h["sums"] = weight, h["sums"] + share * g["sums"]
-    return [after[k] for k in kept]
+    return [after[k] for k in retained]
 
 
 def merge(components, limit, least, prior_weight):

@@ -92,7 +92,7 @@ def joint_prior(logs, state):
 
 
 def loosened(Q, logs, f, amplitude):
-    """The prior's precision after a first fit f: links are Student's t, with two degrees of freedom."""
+    """The prior's precision reweighted after a first fit f: links have Student's t with two degrees of freedom."""
     Q, q = Q.copy(), FEATURES
     for i, j, variance, _ in links(logs):
         w = 1 / (variance * amplitude)
@@ -163,8 +163,8 @@ def update(state, depth, claimed, pixel, g, variance):
     for round_ in range(2):
         mean, C = condition(mean0, prior, H, y, weight)
         fit, var = H @ mean, np.einsum("ij,jk,ik->i", H, C, H)
-        left = np.maximum(1 - weight * var, 0.05)
-        residual, var = (y - fit) / left, var / left
+        remainder = np.maximum(1 - weight * var, 0.05)
+        residual, var = (y - fit) / remainder, var / remainder
         total = var + noise
         if round_ < 1:
             weight = 1 / (noise + np.maximum(residual**2 / total - 1, 0) * total / 3)
@@ -201,8 +201,8 @@ def update(state, depth, claimed, pixel, g, variance):
 
 
 def local_scale(shape, node, z2, noise, used):
-    """Mean z^2 over the used anchors around each node, each cell and certain anchor alike, weighted by a Gaussian of
-    ``NEAR`` of the image, and of one of z^2 = 1."""
+    """Mean z^2 over the used anchors around each node, weighted by a Gaussian of ``NEAR`` of the image, with a prior
+    observation z^2 = 1. Cells and certain anchors have equal weights."""
     out, count = np.empty(shape), np.bincount(node, minlength=shape[0] * shape[1])
     for r in range(shape[0]):
         for c in range(shape[1]):
@@ -217,13 +217,13 @@ def local_scale(shape, node, z2, noise, used):
 
 
 def wrong_factor(share, scale):
-    """By what another surface is more probable; share = distance."""
+    """Factor on the probability of another surface; share = distance."""
     return scale ** np.maximum(1 - share / RADIUS, 0)
 
 
 def y_variance(shape, node, y, noise, used, centre):
-    """Variance over the used anchors around each node, each cell and certain anchor alike, weighted by a Gaussian of
-    ``RADIUS`` of the image, and of one of variance .25 about ``centre``."""
+    """Variance over the used anchors around each node, weighted by a Gaussian of ``RADIUS`` of the image, with a prior
+    observation of variance .25 about ``centre``. Cells and certain anchors have equal weights."""
     out, count = np.empty(shape), np.bincount(node, minlength=shape[0] * shape[1])
     for r in range(shape[0]):
         for c in range(shape[1]):
@@ -247,7 +247,7 @@ def second_moment(p, variance, offset, wide):
 
 
 def steepness(shape, f):
-    """Variance of f among each node and its eight neighbours; a border's nodes are their own outer neighbours."""
+    """Variance of f over each node and its eight neighbours; the border is replicated."""
     f, out = f.reshape(shape), np.empty(shape)
     for r in range(shape[0]):
         for c in range(shape[1]):
@@ -257,7 +257,7 @@ def steepness(shape, f):
 
 
 def inlier_factor(state, away):
-    """What was learnt of held-out anchors fades within the width of a disc."""
+    """Factor from held-out anchors; it fades within the width of a disc."""
     return 1 + (ratio(state, "inlier") - 1) * np.maximum(1 - away / (2 * RADIUS), 0)
 
 
@@ -285,17 +285,19 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, z2, node, u, v):
     offset = H[:, FEATURES:] @ mean[FEATURES:]
     factor = inlier_factor(state, away)
     scale = local_scale(logs.shape, node, z2, noise, rest)[node]
-    own = factor * (var + noise + away * ratio(state, "unseen")) + steepness(logs.shape, mean[FEATURES:])[node]
-    own, more_wrong = scale * own, wrong_factor(share, scale)
+    inlier_variance = (
+        factor * (var + noise + away * ratio(state, "unseen")) + steepness(logs.shape, mean[FEATURES:])[node]
+    )
+    inlier_variance, more_wrong = scale * inlier_variance, wrong_factor(share, scale)
     beyond = np.array([elsewhere(*each) for each in zip(around, away * ratio(state, "unseen"), strict=True)])
     wide = noise + beyond
     p = np.minimum(ratio(state, "wrong") * more_wrong, 0.5)
-    final = [second_moment(*each) for each in zip(p, own, offset, beyond, strict=True)]
-    here, other = (1 - p) * normal(error, own), p * normal(error + offset, wide)
-    here, other = here / (here + other), other / (here + other)
+    final = [second_moment(*each) for each in zip(p, inlier_variance, offset, beyond, strict=True)]
+    inlier, outlier = (1 - p) * normal(error, inlier_variance), p * normal(error + offset, wide)
+    inlier, outlier = inlier / (inlier + outlier), outlier / (inlier + outlier)
     return pairs(state, logs, held, node, error, var, away, noise) | {
-        "wrong": ((area * other).sum(), (area * more_wrong).sum()),
-        "inlier": ((area * here * factor * error**2 / own).sum(), (area * here).sum()),
+        "wrong": ((area * outlier).sum(), (area * more_wrong).sum()),
+        "inlier": ((area * inlier * factor * error**2 / inlier_variance).sum(), (area * inlier).sum()),
         "calibration": ((area * error**2 / final).sum(), area.sum()),
     }
 

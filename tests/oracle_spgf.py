@@ -1,6 +1,6 @@
-"""SPGF as NumPy float64 loops, written from the specification alone: the judge of both implementations.
+"""SPGF as NumPy float64 loops, written from the specification alone: the reference for both implementations.
 
-Raw moments, one pixel after the other, no cleverness. It imports neither torch nor the package.
+Accumulates raw moments pixel by pixel. Imports neither torch nor the package.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Settings:
-    """The specification's thresholds, by its names; ``a`` belongs to the image as it is."""
+    """The specification's thresholds, under its names; ``a`` applies at the image's resolution."""
 
     a: float
     noise_floor: float
@@ -45,7 +45,7 @@ class Camera:
 
 @dataclass
 class Piece:
-    """A segment, or an active Gaussian: the specification's fields, and the pixels that belong to it."""
+    """A segment or an active Gaussian: the specification's fields and its pixels."""
 
     N: int
     S: Array
@@ -114,7 +114,7 @@ def segment(
         for o in before:
             o.upd = False
         new = [h for h in frame.scanline(v) if not frame.merge(h, before)]
-        last = v == height - 1  # then all are complete together, in the order of the active list
+        last = v == height - 1  # then all complete at once, in the order of the active list
         emitted += [o for o in before if not o.upd and not last]
         active = [o for o in before if o.upd or last] + new
     emitted += active

@@ -11,16 +11,16 @@ from ufmstar_torch.kernels.triangulate_cpu import DAMPING, STEPS, Triangulated
 def triangulate(
     pixel: NDArray[np.float64], seen: NDArray[np.bool_], T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
 ) -> Triangulated:
-    """Points from their positions in several views of one camera.
+    """Triangulate points from their positions in several views of one camera.
 
     Args:
         pixel: [N, W, 2] positions (u, v) [px].
-        seen: [N, W] which of them hold; at least two of each track.
+        seen: [N, W] True where the position is valid; at least two per track.
         T_world_cam: [W, 4, 4] poses of the views.
         K: [3, 3] [px].
     """
     R, centre = T_world_cam[:, :3, :3], T_world_cam[:, :3, 3]
-    # Around the mean camera, so that far-away worlds lose no digits.
+    # Relative to the mean camera, to keep digits far from the world's origin.
     origin = centre.mean(0)
     centre = centre - origin
     homogeneous = np.concatenate([pixel, np.ones((*pixel.shape[:2], 1))], axis=-1)

@@ -1,8 +1,7 @@
 """UfM (ICRA 2022) in NumPy float64 loops over points, straight from its description; slow, plain, and independent.
 
-Imports neither torch nor the package. The points are dicts with keys mean, cov, count and are carried from
-camera to camera, as in the original; rotations are taken as exact.
-"""
+Imports neither torch nor the package. The points are dicts with keys mean, cov, count, transformed from camera to
+camera as in the original. Rotations are assumed exact."""
 
 from __future__ import annotations
 
@@ -30,7 +29,7 @@ class UfM:
             if point["seen"] and valid[v, u]:
                 p, A = self._observe(depth[v, u], s2[v, u], u, v, K)
                 self._fuse(point, p, A)
-                variance[v, u] = point["cov"][2, 2]  # a later point, which is a newer one, overwrites
+                variance[v, u] = point["cov"][2, 2]  # a later point is newer and overwrites
                 hit[v, u] = True
         for v in range(height):
             for u in range(width):

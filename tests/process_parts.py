@@ -1,4 +1,4 @@
-"""A plug-in for processes that are started anew: a reader of sequences at which a process is killed, fails or waits.
+"""A plug-in for spawned processes: a sequence reader that kills the process, fails or waits.
 
 ``NAME.act`` contains "kill", "fail", "wait" or "go".
 """
@@ -23,7 +23,7 @@ class Acting:
         act = path.read_text()
         path.with_suffix(f".{os.getpid()}").touch()
         while act != "go" and len(list(path.parent.glob("*.[0-9]*"))) < 2:
-            time.sleep(0.02)  # until another process is at work as well
+            time.sleep(0.02)  # until another process has started, too
         if act == "kill":
             os.kill(os.getpid(), signal.SIGKILL)
         if act == "fail":

@@ -45,7 +45,7 @@ def mixture(streams: int, capacity: int, seed: int, *, empty: int = 2, features:
 
 
 def as_lists(m: GaussianMixture, stream: int) -> list[dict]:
-    """The components of a stream as the oracle takes them."""
+    """The components of a stream as the oracle's dicts."""
     n = int(m.components[stream])
     return [
         {

@@ -1,4 +1,4 @@
-"""A module in the place of rerun, which few computers have: it records the calls to it and to its streams."""
+"""A stand-in for the package rerun: it records calls to the module and to its streams."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 
 class Rerun(ModuleType):
-    """Stands in for rerun and its streams, whose calls it records: name, arguments, and those by name."""
+    """Records calls as (name, positional arguments, keyword arguments)."""
 
     def __init__(self):
         super().__init__("rerun")

@@ -1,4 +1,4 @@
-"""Small jobs for the tests of the runner and of the command line, and outputs that no interruption may change."""
+"""Small jobs for the tests of the runner and the command line, and the outputs that an interruption must not change."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CONFIG = UfMStarConfig(on_bad_frame="skip")
 
 
 class Brightness(nn.Module):
-    """A "network": depth from brightness, and, if asked, a variance that is a share of the depth."""
+    """A "network": depth from brightness and, optionally, a variance proportional to it."""
 
     def __init__(self, gain=1.0, spread=None, at=None, then=None):
         super().__init__()
@@ -54,14 +54,14 @@ def own_depth_job(path, **options):
 
 
 def job_of(sequence, source, frames=slice(None), config=CONFIG, **options):
-    """Without pictures, unless they are asked for."""
+    """A job, by default without pictures."""
     options = {"video": False, "sheet": False, **options}
     indices, settings = range(len(sequence))[frames], {"note": "a test"}
     return RunJob(sequence, indices, source, config, torch.device("cpu"), settings, **options)
 
 
 def outputs(out):
-    """Every output that must not depend on interruptions, by file: exact bytes, or values without times."""
+    """By file, every output that must not depend on interruptions: exact bytes, or values without times."""
     result = {}
     for file in sorted(out.rglob("*")):
         name = str(file.relative_to(out))
@@ -78,7 +78,7 @@ def outputs(out):
 
 
 def without_times(record):
-    """A record or summary without what a clock says."""
+    """A record or summary without its measured times."""
     return {key: value for key, value in record.items() if key not in ("ms", "time")}
 
 
@@ -88,7 +88,7 @@ def records(out):
 
 
 def read_summary(out):
-    """summary.json, which must be strict JSON."""
+    """Read summary.json as strict JSON."""
 
     def refuse(constant):
         raise AssertionError(f"summary.json holds {constant}")

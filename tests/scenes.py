@@ -19,7 +19,7 @@ def intrinsics(height, width, fov_degrees=70.0):
     return np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1.0]])
 
 
-def look(position, yaw, pitch=0.0):
+def camera_pose(position, yaw, pitch=0.0):
     """Camera-to-world pose; yaw turns right about the vertical axis y (down), pitch looks down [rad]."""
     cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
     R_yaw = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
@@ -52,13 +52,13 @@ def tour(frames=30):
     """Poses that pan over the room, walk past the pillar, and come back to the start (revisits)."""
     phase = np.linspace(0, 2 * np.pi, frames)
     return [
-        look((0.9 * np.sin(p), -0.1 + 0.1 * np.sin(2 * p), -0.6 * (1 - np.cos(p))), 0.35 * np.sin(p), 0.08)
+        camera_pose((0.9 * np.sin(p), -0.1 + 0.1 * np.sin(2 * p), -0.6 * (1 - np.cos(p))), 0.35 * np.sin(p), 0.08)
         for p in phase
     ]
 
 
 def flicker(depth, amount, seed):
-    """Add a smooth random relative error, new in every frame, as a network's depth has it."""
+    """Add a smooth random relative error that differs from frame to frame, like a network's."""
     rng = np.random.default_rng(seed)
     height, width = depth.shape
     y, x = np.linspace(0, 1, height)[:, None], np.linspace(0, 1, width)[None]

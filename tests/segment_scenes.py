@@ -45,7 +45,7 @@ def reference(name: str) -> Reference:
 
 
 def upstream_config(p: dict[str, float]) -> SPGFConfig:
-    """From upstream's names; their thresholds are for the image as it is."""
+    """Config from upstream's names; upstream's thresholds apply at the image's resolution."""
     return SPGFConfig(
         adaptive_thresh_scale=p["adaptive_thresh_scale"],
         noise_floor=p["noise_floor"],
@@ -76,8 +76,8 @@ def run_oracle(depth: Tensor, K: Tensor, config: SPGFConfig) -> tuple[list[oracl
 
 def clutter(seed: int, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Depth [1, H, W] and camera of a random scene: a slanted background, boxes and slanted plates in front
-    of it, noise, dropouts (NaN, 0, infinity) and a far corner beyond max_depth. Noise everywhere, so
-    that no decision hangs on the last bit."""
+    of it, noise, dropouts (NaN, 0, infinity) and a far corner beyond max_depth. The noise keeps every decision away
+    from rounding."""
     rng = np.random.default_rng(seed)
     v, u = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
     z = rng.uniform(1, 6) * (1 + rng.uniform(-0.4, 0.4) * u + rng.uniform(-0.4, 0.4) * v)

@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[2] / "shared"
 
 
 def require_shared(relative: str) -> Path:
-    """The path of shared material; skips where it is missing, fails where it must not be (CI)."""
+    """The path of shared material. If it is missing, skip the test, or fail in CI."""
     path = ROOT / relative
     if not path.exists():
         reason = f"needs the shared material {relative}, which lies beside the project in its own checkout only"

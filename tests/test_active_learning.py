@@ -1,4 +1,4 @@
-"""The example of active learning, and that of a network of one's own."""
+"""The examples of active learning and of wrapping a network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ufmstar_torch import DepthPrediction
 
 
 def test_scores_of_a_constant_network_are_known():
-    """One view: total is A and the square of a fifth of the depth, whichever is larger."""
+    """One view: the total is the larger of A and the square of a fifth of the depth."""
 
     def network(x):
         return DepthPrediction(torch.full((1, 32, 48), 2.0), torch.full((1, 32, 48), 0.25))

@@ -1,4 +1,4 @@
-"""Alignment of relative depth: scale and shift come back, outliers do not count, what is undetermined is refused."""
+"""Alignment of relative depth: recovered scale and shift, robustness to outliers, refusal of undetermined fits."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def random_depth(batch=2, size=SIZE, seed=0, low=0.5, high=8.0):
 
 
 def relative(depth, kind, scale, shift):
-    """The output of a network whose alignment is (scale, shift)."""
+    """Relative depth whose alignment is (scale, shift)."""
     value = depth if kind == "affine" else 1 / depth
     scale, shift = (torch.as_tensor(v, dtype=torch.float64).reshape(-1, 1, 1) for v in (scale, shift))
     return (value - shift) / scale
@@ -123,8 +123,8 @@ def test_pooled_images_get_one_alignment():
 def test_unusable_measurements_are_left_out():
     depth = random_depth(1)
     prediction = relative(depth, "inverse", 0.1, 0.05)
-    for place, value in enumerate((0.0, -1.0, math.nan, math.inf)):
-        depth[0, 0, place] = value
+    for column, value in enumerate((0.0, -1.0, math.nan, math.inf)):
+        depth[0, 0, column] = value
     prediction[0, 1, :2] = torch.tensor([math.nan, math.inf], dtype=torch.float64)
     before = depth.clone(), prediction.clone()
     fit = fit_inverse_depth(prediction, depth)
@@ -195,7 +195,7 @@ def test_alignments_go_through_json_exactly_and_check_their_values():
 
 
 class Nearness(torch.nn.Module):
-    """A relative "network" in half precision: inverse depth from brightness, which is depth / 10 m."""
+    """A relative "network" in half precision: inverse depth from brightness (depth / 10 m)."""
 
     def forward(self, image):
         return (0.4 / (10 * image.mean(1, keepdim=True))).half() - 0.1
@@ -209,7 +209,8 @@ def test_half_precision_outputs_are_aligned_in_single():
 
 
 def test_a_disparity_between_a_least_and_a_largest_depth_is_one_line():
-    """Monodepth's sigmoid s in (0, 1) is 1/d = 1/max + (1/min - 1/max) s; what refuses it names the line."""
+    """Monodepth's sigmoid s in (0, 1) is 1/d = 1/max + (1/min - 1/max) s. The refusal's message states this
+    equation."""
     disparity = nn.Sequential(nn.Conv2d(3, 1, 1), nn.Sigmoid())
     image = torch.rand(2, 3, 4, 6, generator=torch.Generator().manual_seed(0))
     model = AlignedNetwork(disparity, Alignment("inverse", 1 / 0.1 - 1 / 100, 1 / 100))

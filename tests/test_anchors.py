@@ -1,4 +1,4 @@
-"""Effects of anchors on the variance; without them nothing changes (values: test_anchors_oracle.py)."""
+"""Effects of anchors on the variance; without anchors nothing changes (values: test_anchors_oracle.py)."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ def test_a_common_bias_is_measured_and_counted_once():
         depth, bias = output.depth[0][seen], output.bias[0][seen]
         squares = (depth - z).square(), output.variance[0][seen], (depth * (1 + bias) - z).square()
         sums += [float(value.mean()) for value in squares]
-    error, claimed, left = sums
-    # The claimed mean square is the measured one: M's part has been taken off B, not added to it.
+    error, claimed, corrected = sums
+    # The claimed mean square equals the measured one: B excludes M's part.
     assert 0.8 < claimed / error < 1.25
-    assert left < 0.15 * error
+    assert corrected < 0.15 * error
 
 
 def rows(values, valid=None, pixel=None):
@@ -69,27 +69,27 @@ def rows(values, valid=None, pixel=None):
 
 
 @given(st.integers(0, 10**6), st.floats(0.5, 1.0), st.floats(0.5, 20.0))
-@example(70097, 0.5, 1.0)  # a frame whose anchors all count less than half
+@example(70097, 0.5, 1.0)  # a frame whose anchors all have a weight below one half
 @settings(max_examples=30)
 def test_sums_and_means_by_hand(seed, memory, kappa):
     rng = np.random.default_rng(seed)
-    n, k = 3, 3  # fewer than could support each other: all are taken
+    n, k = 3, 3  # too few to support each other: all are used
     sums, total = np.zeros((k, 3)), np.zeros(3)
     evidence = Evidence(torch.zeros(1, k, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64))
     for _ in range(3):
         d, g = rng.uniform(1, 4, n), rng.uniform(1, 4, n)
-        s2, own = rng.uniform(0, 0.1, (2, n))
+        s2, network_variance = rng.uniform(0, 0.1, (2, n))
         share = rng.uniform(0, 0.3, (n, k))
         evidence, used = observe(
             evidence,
-            rows(list(zip(d, g, s2, own, strict=True))),
+            rows(list(zip(d, g, s2, network_variance, strict=True))),
             lambda values, share=share: torch.einsum("nk,bnc->bkc", torch.tensor(share), values),
             memory,
         )
-        errors, claims = list((g - d) / d), (s2 + own) / d**2
+        errors, claims = list((g - d) / d), (s2 + network_variance) / d**2
         weights = [weight(claims[a], errors[:a] + errors[a + 1 :]) for a in range(n)]
         assert used[0].tolist() == [w >= 0.5 for w in weights]
-        if max(weights) >= 0.5:  # without an anchor that is used nothing fades
+        if max(weights) >= 0.5:  # without a used anchor nothing fades
             sums, total = sums * memory, total * memory
         for a in range(n):
             row = weights[a] * np.array([1, errors[a], errors[a] ** 2 - claims[a]])

@@ -1,4 +1,4 @@
-"""Anchors that would spoil what others teach: absurd values, padding, and what is beside the rule."""
+"""Anchors that must not spoil the others: absurd values, padding and rule violations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ ON = UfMStarConfig(anchors=AnchorConfig())
 
 
 def taught(spoilt=None, at=5, frames=8):
-    """B/d^2 on average after every frame of a network that is 20 % off; ``spoilt`` (depth, variance) joins frame 5."""
+    """Mean B/d^2 after every frame of a network that is 20 % off. ``spoilt`` (depth, variance) is the only anchor of
+    frame 5."""
     depths, poses, K = scenes.sequence(frames, H, W, 0.0)
     rng, ufm, result = np.random.default_rng(0), UfMStar(ON), []
     for i, (truth, T) in enumerate(zip(depths, poses, strict=True)):
@@ -48,7 +49,7 @@ def test_an_anchor_without_information_changes_nothing(spoilt, without):
     result, used = taught(spoilt)
     assert np.isfinite(result).all()
     assert used >= 30
-    # The frame with the bad anchor alone teaches nothing, so the rest stays within what a frame's forty change.
+    # The frame with the bad anchor has no effect, so the difference is at most the effect of one frame's forty anchors.
     np.testing.assert_allclose(result, without, rtol=0.25)
 
 
@@ -57,7 +58,7 @@ def test_an_anchor_without_information_changes_nothing(spoilt, without):
     [(0.015, 2.0, 0, 200), (8.0, 0.04, 0, 200), (0.015, 2.0, 200, 4), (2.0, 2.0, 200, 0)],
 )
 def test_many_rejected_anchors_widen_the_variance(predicted, truth, right, far, caplog):
-    """Two streams, of which the second has no anchor that is off."""
+    """Two streams; the second has no wrong anchor."""
     config = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
     ufm, rng, n = UfMStar(config), np.random.default_rng(0), right + far
     K = torch.tensor([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
@@ -80,7 +81,8 @@ def test_many_rejected_anchors_widen_the_variance(predicted, truth, right, far, 
 
 
 def anchored_std(claim, frames=6, every=False):
-    """std [m] where a network is 1 m too far, of frames with 60 anchors; it claims ``claim`` [m^2] at one of them."""
+    """std [m] of a network that is 1 m too far, in frames with 60 anchors; its variance is ``claim`` [m^2] at one
+    anchor."""
     depths, poses, K = scenes.sequence(frames, H, W, 0.0)
     rng, ufm, result = np.random.default_rng(1), UfMStar(ON), []
     for i, (truth, T) in enumerate(zip(depths, poses, strict=True)):
@@ -112,8 +114,10 @@ def test_no_weighted_claim_exceeds_the_other_anchors_errors():
         for _ in range(30):
             d = np.full(n, 3.0)
             rows = stream(np.stack([5.0 * np.arange(n), np.zeros(n)], -1), rng.normal(0.1, 0.01, n), n)
-            own = torch.tensor(10.0 ** rng.uniform(-6, 12, n))[None]
-            spoilt = replace(rows, predicted=rows.predicted * torch.tensor(d), depth=rows.depth * 3, own_variance=own)
+            network_variance = torch.tensor(10.0 ** rng.uniform(-6, 12, n))[None]
+            spoilt = replace(
+                rows, predicted=rows.predicted * torch.tensor(d), depth=rows.depth * 3, own_variance=network_variance
+            )
             evidence = Evidence(torch.zeros(1, 1, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64))
             sums, _ = observe(evidence, spoilt, lambda values: values.sum(1, keepdim=True), 1.0)
             squares = (spoilt.depth / spoilt.predicted - 1).square().sum()
@@ -134,7 +138,7 @@ def test_padding_does_not_decide_which_neighbours_are_asked():
     rng = np.random.default_rng(0)
     for _ in range(40):
         n = int(rng.integers(9, 60))
-        pixel = rng.integers(0, 6, (n, 2)).astype(float)  # a grid: many are equally near
+        pixel = rng.integers(0, 6, (n, 2)).astype(float)  # a grid: many anchors are equally near
         ratio = np.where(rng.random(n) < 0.5, rng.uniform(-1, 1, n), 0.02 * rng.standard_normal(n))
         alone = inliers(stream(pixel, ratio, n))
         for padded in (n + 1, n + 40, 200):

@@ -16,7 +16,7 @@ from ufmstar_torch.anchors.evidence import Evidence, inliers
 from ufmstar_torch.anchors.extension import learn
 from ufmstar_torch.frame import check_frame
 from ufmstar_torch.kernels import anchors_cpu
-from ufmstar_torch.kernels.regress_cpu import look, regress_maps
+from ufmstar_torch.kernels.regress_cpu import regress_maps, views_of
 from ufmstar_torch.regress import distribute
 
 pytestmark = pytest.mark.numerics
@@ -26,8 +26,8 @@ ANCHORED = UfMStarConfig(
 )
 
 
-def taken(truth, rng, count):
-    """(u, v, depth, variance): a third of them far off, positions between pixels, on pixels with a depth."""
+def draw_anchors(truth, rng, count):
+    """(u, v, depth, variance) at subpixel positions near pixels with depth; a third are far off."""
     result = []
     while len(result) < count:
         v, u = int(rng.integers(0, HEIGHT)), int(rng.integers(0, WIDTH))
@@ -46,16 +46,16 @@ def as_anchors(rows):
 
 @pytest.fixture(scope="module")
 def expected():
-    """Inputs and the oracle's answers of five frames of a network that is 30 % too near, the third without anchors."""
+    """Inputs and the oracle's results for five frames of a network that is 30 % too near. The third has no anchors."""
     depths, poses, K = scenes.sequence(5, HEIGHT, WIDTH, 0.04)
     rng = np.random.default_rng(5)
     judge = AnchoredOracle(oracle_settings(SPGF), kappa=3.0, half_life=4.0)
     frames = []
     for i, (truth, T) in enumerate(zip(depths, poses, strict=True)):
-        # On the left the network says that it is wrong, and more than it is: B has nothing to add there.
-        own = np.where(np.arange(WIDTH) < WIDTH / 3, 4.0, 0.01)
-        depth, aleatoric = truth / 1.3, own * (0.5 + rng.random(truth.shape))
-        anchors = [] if i == 2 else taken(truth, rng, 3 if i == 0 else 40)
+        # On the left the network's variance exceeds its error: B adds nothing there.
+        variance = np.where(np.arange(WIDTH) < WIDTH / 3, 4.0, 0.01)
+        depth, aleatoric = truth / 1.3, variance * (0.5 + rng.random(truth.shape))
+        anchors = [] if i == 2 else draw_anchors(truth, rng, 3 if i == 0 else 40)
         frames.append((depth, T, aleatoric, anchors, judge.step_anchored(depth, T, K, anchors, aleatoric)))
     return K, frames, judge
 
@@ -98,32 +98,33 @@ def drawn(seed: int, b: int, n: int) -> tuple[torch.Tensor, ...]:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_the_compiled_support_is_the_references_own(seed):
-    """From none to hundreds of anchors, some of them not valid."""
+    """From 0 to hundreds of anchors, some invalid."""
     n = (1, 2, 3, 4, 5, 9, 12, 40, 100, 300, 301, 1500)[seed]
     pixel, predicted, depth, variance, chance = drawn(seed, 2, n)
     valid = chance < (0.9 if seed % 3 else 0.5)
-    given = AnchorInput(pixel, pixel[..., 0].long(), predicted, depth, variance, 0 * depth, valid)
-    expected = inliers(given)
-    assert torch.equal(anchors_cpu.inliers(given), expected)
+    anchors = AnchorInput(pixel, pixel[..., 0].long(), predicted, depth, variance, 0 * depth, valid)
+    expected = inliers(anchors)
+    assert torch.equal(anchors_cpu.inliers(anchors), expected)
     if n >= 40:
         assert 0 < expected.sum() < valid.sum()
 
 
 @pytest.mark.parametrize("where", ["line", "point", "two points"])
 def test_neighbours_of_anchors_that_lie_together(where):
-    """Cells have no area, or all but two are empty."""
+    """The grid's cells have no area, or all but two cells are empty."""
     pixel, predicted, depth, variance, _ = drawn(1, 1, 60)
     pixel[..., 1] = 7.0
     if where != "line":
         pixel[..., 0] = 3.0
     if where == "two points":
         pixel[:, ::3] = 190.0
-    given = AnchorInput(pixel, pixel[..., 0].long(), predicted, depth, variance, 0 * depth, depth > 0)
-    assert torch.equal(anchors_cpu.inliers(given), inliers(given))
+    anchors = AnchorInput(pixel, pixel[..., 0].long(), predicted, depth, variance, 0 * depth, depth > 0)
+    assert torch.equal(anchors_cpu.inliers(anchors), inliers(anchors))
 
 
 def test_what_is_checked_of_strange_anchors():
-    """Positions, depths and variances of every kind, on a map with a hole: against a plain statement, one by one."""
+    """Extreme positions, depths and variances, on a map with a hole: against the rules written out, anchor by
+    anchor."""
     size, n = (40, 60), 400
     pixel, _, depth, variance, chance = drawn(3, 2, n)
     generator = torch.Generator().manual_seed(0)
@@ -137,8 +138,8 @@ def test_what_is_checked_of_strange_anchors():
     maps[0, 0, 10:20, 10:20] = 0
     cameras = torch.eye(4).expand(2, 4, 4), torch.tensor([[60.0, 0, 30], [0, 60, 20], [0, 0, 1]])
     frame = check_frame(maps[0], *cameras, None, None, None, None, feature_count=0, rotation_tolerance=1e-3)
-    for own, mask in (((), None), ((maps[1],), chance < 0.7), ((maps[1], maps[2]), None)):
-        found, far = check_anchors(Anchors(pixel, depth, variance, mask), frame, own), [0, 0]
+    for variance_maps, mask in (((), None), ((maps[1],), chance < 0.7), ((maps[1], maps[2]), None)):
+        found, far = check_anchors(Anchors(pixel, depth, variance, mask), frame, variance_maps), [0, 0]
         for b, i in np.ndindex(2, n):
             (u, v), g, s2 = np.rint(pixel[b, i].numpy()), float(depth[b, i]), float(variance[b, i])
             fine = 0 <= u < size[1] and 0 <= v < size[0] and 0 < g < np.inf and 0 <= s2 < g * g
@@ -148,7 +149,7 @@ def test_what_is_checked_of_strange_anchors():
             far[b] += fine and not near
             assert bool(found.valid[b, i]) == near
             if near:
-                claimed = sum(float(one[b, int(v), int(u)]) for one in own)
+                claimed = sum(float(one[b, int(v), int(u)]) for one in variance_maps)
                 mine = [float(x[b, i]) for x in (found.predicted, found.depth, found.variance, found.own_variance)]
                 np.testing.assert_allclose(mine, [d, g, s2, claimed], rtol=5e-7)
                 assert int(found.index[b, i]) == v * size[1] + u
@@ -157,19 +158,19 @@ def test_what_is_checked_of_strange_anchors():
         assert 0 <= int(found.index.min()) <= int(found.index.max()) < size[0] * size[1]
 
 
-@pytest.mark.parametrize("some", [False, True])
-def test_what_was_learnt_may_be_small_and_is_moved_by_the_streams(some):
-    """Sums of tiny features stay tiny; the stream's means are added to two features and no other."""
+@pytest.mark.parametrize("sparse", [False, True])
+def test_what_was_learnt_may_be_small_and_is_moved_by_the_streams(sparse):
+    """Sums of tiny features stay tiny. The stream's means are added to the first two features only."""
     depths, poses, K = scenes.sequence(1, HEIGHT, WIDTH, 0.04)
     walked = UfMStar(ANCHORED.replace(backend="numba"))
     walked(torch.tensor(depths[0])[None], torch.tensor(poses[0]), torch.tensor(K))
     seen = seen_of(walked.mixture, features=3)
     seen[0].features[:] = 1e-32, 0.5, 1.0
-    pixels = torch.arange(0, HEIGHT * WIDTH, 7)[None] if some else None
+    pixels = torch.arange(0, HEIGHT * WIDTH, 7)[None] if sparse else None
     depth = torch.tensor(depths[0], dtype=torch.float32)[None].nan_to_num(0, posinf=0).clamp_min(0)
-    given = seen, depth, torch.tensor(K)[None], ANCHORED, pixels, None
-    plain = regress_maps(*given).features
-    moved = regress_maps(*given, np.array([[0.25, -0.125]])).features
+    arguments = seen, depth, torch.tensor(K)[None], ANCHORED, pixels, None
+    plain = regress_maps(*arguments).features
+    moved = regress_maps(*arguments, np.array([[0.25, -0.125]])).features
     offset = torch.tensor([0.25, -0.125, 0.0])
     torch.testing.assert_close(moved, plain + offset, rtol=5e-7, atol=5e-8, equal_nan=True)
     fine = plain[~plain[..., 0].isnan()]
@@ -201,7 +202,7 @@ def test_the_compiled_lesson_is_the_references_own(n, dtype, tolerance):
         anchors = check_anchors(Anchors(pixel, g, (0.02 * g).square()), frame, (0.01 * seen,))
         a = learn(slow, mixture, frame, anchors, config, distribute)
         components = seen_of(mixture, features=3)
-        views = look(components, frame.depth, frame.intrinsics, config, dtype)
+        views = views_of(components, frame.depth, frame.intrinsics, config, dtype)
         b = anchors_cpu.learn_in_view(fast, mixture.capacity, components, views, frame, anchors, config)
         slow, fast = a.evidence, b.evidence
         assert torch.equal(a.used, b.used)

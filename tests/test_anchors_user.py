@@ -1,4 +1,4 @@
-"""Anchors that a user brings: points into pixels, through ``UncertainDepth``; what a reset keeps."""
+"""Anchors from a user: projection of points, ``UncertainDepth``, and resets."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_points_project_to_their_pixels_by_each_streams_camera():
     expected = [(3.25, 40.0, 2.0), (0.0, 0.0, 0.5), (63.0, 47.0, 8.0)]
     points = torch.tensor([[at(*w) for w in expected]])
     actual = Anchors.from_points(points, torch.full((1, 3), 0.01, dtype=torch.float64), K, (H, W))
-    # float32 points: a millionth of a pixel's ray
+    # float32 points: a relative error of 1e-6
     torch.testing.assert_close(actual.pixel[0], torch.tensor([w[:2] for w in expected]).double(), rtol=0, atol=1e-4)
     torch.testing.assert_close(actual.depth[0], torch.tensor([2.0, 0.5, 8.0]).double(), rtol=1e-6, atol=0)
     assert actual.variance.tolist() == [[0.01] * 3]
@@ -46,7 +46,7 @@ def test_points_project_to_their_pixels_by_each_streams_camera():
     [
         (at(10.0, 10.0, -2.0), 0.01),  # behind the camera
         ([0.1, 0.1, 0.0], 0.01),
-        (at(-0.6, 10.0, 2.0), 0.01),  # beside the image: its pixel would be -1
+        (at(-0.6, 10.0, 2.0), 0.01),  # outside the image: its pixel would be -1
         (at(63.6, 10.0, 2.0), 0.01),
         (at(10.0, 47.6, 2.0), 0.01),
         ([NAN, 0.0, 2.0], 0.01),
@@ -84,18 +84,18 @@ def test_the_mask_and_padding_are_respected():
     ],
 )
 def test_wrong_kinds_and_shapes_are_named(change, error, told):
-    given = {"points_cam": torch.ones(1, 4, 3), "variance": torch.zeros(1, 4), "intrinsics": K, "size": (H, W)}
+    arguments = {"points_cam": torch.ones(1, 4, 3), "variance": torch.zeros(1, 4), "intrinsics": K, "size": (H, W)}
     with pytest.raises(error, match=told):
-        Anchors.from_points(**{**given, **change})
+        Anchors.from_points(**{**arguments, **change})
 
 
 def test_moved_to_a_resized_image():
     half = resize_intrinsics(K, (H, W), (H // 2, W // 2))
-    given = Anchors(torch.tensor([[[10.5, 20.5]]]), torch.ones(1, 1), torch.zeros(1, 1))
-    result = given.moved(K, half)
+    anchors = Anchors(torch.tensor([[[10.5, 20.5]]]), torch.ones(1, 1), torch.zeros(1, 1))
+    result = anchors.moved(K, half)
     torch.testing.assert_close(result.pixel, torch.tensor([[[5.0, 10.0]]], dtype=torch.float64))
-    assert result.depth is given.depth
-    torch.testing.assert_close(result.moved(half, K).pixel, given.pixel.double())
+    assert result.depth is anchors.depth
+    torch.testing.assert_close(result.moved(half, K).pixel, anchors.pixel.double())
     with pytest.raises(ValueError, match=r"anchors.pixel must be \[B, N, 2\]"):
         Anchors(torch.zeros(4, 2), torch.ones(4), torch.ones(4)).moved(K, half)
 
@@ -111,13 +111,13 @@ class Biased(nn.Module):
 
 
 def half(image, intrinsics):
-    """Half the size, taking every second pixel."""
+    """Subsample every second pixel."""
     small = resize_intrinsics(intrinsics, (H, W), (H // 2, W // 2))
     return image[..., ::2, ::2], small
 
 
 def two_streams(frames=4):
-    """Depths [2, H, W], poses [2, 4, 4], K [2, 3, 3] and anchors of ground truth, 40 and 25 of them, of two walks."""
+    """Depths [2, H, W], poses [2, 4, 4], K [2, 3, 3] and 40 and 25 true anchors of two walks."""
     depths, poses, K_ = scenes.sequence(2 * frames, H, W, 0.0)
     rng, result = np.random.default_rng(0), []
     for i in range(frames):
@@ -147,9 +147,9 @@ def test_the_pipeline_takes_anchors_in_the_images_pixels(preprocess):
         for name in ("variance", "anchored", "bias"):
             torch.testing.assert_close(getattr(out.ufm, name), getattr(expected, name), equal_nan=True)
         assert torch.equal(out.ufm.statistics.anchors_used, expected.statistics.anchors_used)
-        given, fewer = out.ufm.statistics.anchors.tolist()
-        assert 38 <= given <= 40, "but for those that a pixel without depth takes at half the size"
-        assert 23 <= fewer <= 25
+        of_forty, of_twenty_five = out.ufm.statistics.anchors.tolist()
+        assert 38 <= of_forty <= 40, "all but the anchors at pixels without depth in the half-size image"
+        assert 23 <= of_twenty_five <= 25
     assert float(out.ufm.anchored[out.ufm.valid].mean()) > 0.05
     with pytest.raises(ValueError, match="anchors"):
         UncertainDepth(Biased())(image, pose, intrinsics, anchors=anchors)

@@ -1,4 +1,4 @@
-"""Networks of one's own: wrapping, saved programs, loading by name."""
+"""A user's networks: wrapping, saved programs, loading by name."""
 
 from __future__ import annotations
 
@@ -86,8 +86,8 @@ def test_forms_of_depth(image: Tensor, returned: Any, output: str | int | None) 
 
 @pytest.mark.parametrize("kind", SPREADS)
 def test_units_and_variances(image: Tensor, kind: Any) -> None:
-    """Millimetres with a spread in the same unit, whatever form it has, become metres and m^2."""
-    raw = image[:, 0] - 1  # logarithms may be negative
+    """Millimetres become metres, and a spread in millimetres, in any form, becomes m^2."""
+    raw = image[:, 0] - 1  # logarithms can be negative
     maps = {"d": image.sum(1), "s": raw, "v": image[:, :1]}
     declared = {"aleatoric": "s", "aleatoric_kind": kind, "epistemic": "v"}
     got = wrap_network(lambda x: maps, "d", scale=0.001, **declared)(image)
@@ -149,7 +149,7 @@ def test_the_intrinsics_pass_through_every_wrapper(image: Tensor, around: str) -
 
 
 class Sampling(Metric):
-    """With a dropout that a ``MonteCarloDropout`` can switch on, and that changes nothing here."""
+    """Has a dropout layer that ``MonteCarloDropout`` can enable, and that changes nothing here."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -216,7 +216,8 @@ DEFECTS: dict[str, tuple[Any, str]] = {
 
 
 def test_only_the_first_prediction_must_have_a_depth(image: Tensor) -> None:
-    """A network without any is refused; a later frame without any has no valid pixel, and the next one goes on."""
+    """Without a depth in the first prediction, the network is refused. A later frame without depth has no valid pixel;
+    the next frame is processed as usual."""
     network = wrap_network(lambda x: x[:, 0].log())
     with pytest.raises(ValueError, match="NaN, infinite or negative at every pixel"):
         network(0 * image)
@@ -264,7 +265,7 @@ class Malice:
 
 @pytest.mark.parametrize("attack", ["weight", "constant", "sample input", "object", "legacy", "old format"])
 def test_an_archive_that_would_be_unpickled_is_refused(tmp_path: Path, image: Tensor, attack: str) -> None:
-    """``torch.export.load`` alone unpickles what stands in these places, whatever it is."""
+    """``torch.export.load`` by itself unpickles any object in these members."""
     torch.export.save(torch.export.export(Sum().eval(), (image,)), tmp_path / "n.pt2")
     trap = tmp_path / "trap"
     evil, bad = io.BytesIO(), tmp_path / "bad.pt2"
@@ -299,8 +300,8 @@ def test_an_archive_that_would_be_unpickled_is_refused(tmp_path: Path, image: Te
 
 
 def two_directories(seen: bytes, hidden: bytes) -> bytes:
-    """One file of two archives whose members have the same names: Python's reader takes the directory before the end
-    record, torch's the one at the offset that the record states."""
+    """Two archives with the same member names in one file: Python's reader uses the directory before the end record,
+    torch's reader the directory at the offset in the record."""
     parts = []
     for content in (hidden, seen):
         size, offset = struct.unpack("<LL", content[-10:-2])
@@ -312,9 +313,9 @@ def two_directories(seen: bytes, hidden: bytes) -> bytes:
     while at < len(seen_list):
         name, extra, comment = struct.unpack("<HHH", seen_list[at + 28 : at + 34])
         # Python adds the gap between the two directories to every offset.
-        (place,) = struct.unpack("<L", seen_list[at + 42 : at + 46])
+        (stated,) = struct.unpack("<L", seen_list[at + 42 : at + 46])
         gap = len(hidden_list) + len(seen_files)
-        moved = place + len(hidden_files) + len(hidden_list) - gap
+        moved = stated + len(hidden_files) + len(hidden_list) - gap
         seen_list[at + 42 : at + 46] = struct.pack("<L", moved)
         at += 46 + name + extra + comment
     end = struct.pack("<LL", len(hidden_list), len(hidden_files))
@@ -323,7 +324,7 @@ def two_directories(seen: bytes, hidden: bytes) -> bytes:
 
 
 def test_a_file_with_two_directories_runs_nothing(tmp_path: Path, image: Tensor) -> None:
-    """The loaded archive is the checked one, although torch's reader by itself would unpickle the other."""
+    """The loaded archive is the checked one. torch's reader by itself would unpickle the other archive."""
     torch.export.save(torch.export.export(Sum().eval(), (image,)), tmp_path / "n.pt2")
     trap, evil = tmp_path / "trap", io.BytesIO()
     torch.save((Malice(trap), {}), evil)
@@ -363,7 +364,7 @@ def test_compressed_archives_are_refused(tmp_path: Path, image: Tensor) -> None:
 @pytest.mark.parametrize("suffix", ["pth", "safetensors"])
 @pytest.mark.parametrize("folded", [False, True])
 def test_fastdepth_from_a_checkpoint(tmp_path: Path, suffix: str, folded: bool) -> None:
-    """A checkpoint of whatever widths is the same network (ONNX files: test_fastdepth.py)."""
+    """A checkpoint with any channel counts loads as the same network (ONNX files: test_fastdepth.py)."""
     source = small_network().folded() if folded else small_network()
     path = tmp_path / f"w.{suffix}"
     save_checkpoint(path, {f"module.{k}": v for k, v in source.state_dict().items()})
@@ -380,7 +381,7 @@ def test_fastdepth_from_a_checkpoint(tmp_path: Path, suffix: str, folded: bool) 
 
 
 def test_midas_is_refused_and_can_be_aligned():
-    """From ``torch.hub`` it returns a map [B, H, W] as a metric network does, which is inverse depth."""
+    """``torch.hub``'s MiDaS returns inverse depth [B, H, W], in the same form as a metric network's depth."""
     kind = type(
         "DPTDepthModel", (nn.Module,), {"__module__": "midas.dpt_depth", "forward": lambda self, x: 1 + x[:, 0]}
     )

@@ -1,4 +1,4 @@
-"""The public API, pinned: a change here is a change for everyone who builds on the package."""
+"""Pins the public API: a change here affects every user of the package."""
 
 from __future__ import annotations
 

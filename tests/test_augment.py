@@ -1,4 +1,4 @@
-"""Augmentation: re-projection of known points, depth never mixed, seeds, colour as Pillow does it."""
+"""Augmentation: re-projection of known points, no interpolation of depth, seeds, colour changes equal to Pillow's."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ufmstar_torch.train import Augmentation, AugmentationConfig
 from ufmstar_torch.train.augment import Change, apply_colour, apply_geometry
 
 SIZE = (120, 160)
-# Pixels that are not square, a principal point far from the centre, and skew: nothing may hide in symmetry.
+# Non-square pixels, a principal point far from the centre, and skew, so that no error cancels by symmetry.
 K = torch.tensor([[130.0, 0.7, 70.0], [0.0, 141.0, 66.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 SIGMA = 3.0  # [px]
 
@@ -34,7 +34,7 @@ def project(point: Tensor, intrinsics: Tensor) -> Tensor:
 
 
 def seen_by_new_camera(point: Tensor, change: Change, zoom: str) -> Tensor:
-    """The point [3] in the changed camera's frame, from the words of the docstring: roll, mirror, come nearer."""
+    """The point [3] in the augmented camera's frame, computed from the documented steps: roll, mirror, zoom."""
     c, s = np.cos(change.angle), np.sin(change.angle)
     x, y, z = point.tolist()
     x, y = c * x - s * y, s * x + c * y
@@ -60,7 +60,7 @@ def centroid(image: Tensor) -> Tensor:
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
 @pytest.mark.parametrize("pixel", [(80.0, 60.0), (65.0, 72.0), (96.0, 48.0)], ids=str)
 def test_a_point_is_seen_where_the_new_intrinsics_project_it(pixel, change, zoom):
-    """Image, depth and K' of one known 3D point agree; a blob's centre of mass to .02 px."""
+    """Image, depth and K' of one known 3D point agree; the blob's centre of mass to .02 px."""
     point = torch.linalg.solve(K, torch.tensor([*pixel, 1.0], dtype=torch.float64)) * 2.5
     depth = torch.full(SIZE, 2.5, dtype=torch.float64)
     image, new_depth, new_K = apply_geometry(blob(torch.tensor(pixel)), depth, K, change, zoom)
@@ -73,20 +73,20 @@ def test_a_point_is_seen_where_the_new_intrinsics_project_it(pixel, change, zoom
 
 @pytest.mark.parametrize("zoom", ["depth", "focal"])
 def test_a_rendered_room_is_the_room_seen_by_the_rolled_camera(zoom):
-    """Ray-cast again with K' and the rolled pose, an exact depth image agrees off the edges (no flip: a mirrored
-    room is another room)."""
-    pose = scenes.look((0.2, 0.0, -0.1), 0.6, 0.1)
+    """The augmented depth equals a ray-cast with K' and the rolled pose, except at edges (no flip: a mirrored room is
+    another room)."""
+    pose = scenes.camera_pose((0.2, 0.0, -0.1), 0.6, 0.1)
     change = Change(scale=1.3, angle=0.08, shift=(5.0, 3.0))
     camera = K.clone()
-    camera[0, 1] = 0.0  # the renderer knows no skew
+    camera[0, 1] = 0.0  # the renderer does not support skew
     depth = torch.from_numpy(scenes.render(pose, camera.numpy(), *SIZE))
     _, new_depth, new_K = apply_geometry(torch.zeros(3, *SIZE, dtype=torch.float64), depth, camera, change, zoom)
-    # Columns of the new camera's axes in the old one: points turn by +angle, so the axes turn by -angle.
+    # The new camera's axes as columns in the old frame: points turn by +angle, so axes turn by -angle.
     roll = np.eye(4)
     cos, sin = np.cos(change.angle), np.sin(change.angle)
     roll[:2, :2] = [[cos, sin], [-sin, cos]]
     optics = new_K.clone()
-    if zoom == "depth":  # the same pixels with the camera that explains them without moving points
+    if zoom == "depth":  # the same pixels under a camera for which the points do not move
         optics[:2, :2] *= change.scale
     exact = torch.from_numpy(scenes.render(pose @ roll, optics.numpy(), *SIZE))
     expected = exact / change.scale if zoom == "depth" else exact
@@ -94,7 +94,7 @@ def test_a_rendered_room_is_the_room_seen_by_the_rolled_camera(zoom):
     error = (new_depth - expected).abs()[valid] / expected[valid]
     assert valid.float().mean() > 0.95
     assert error.median() < 2e-3
-    assert (error < 0.02).float().mean() > 0.93  # what is left are edges, half a pixel wide
+    assert (error < 0.02).float().mean() > 0.93  # the rest are edges, half a pixel wide
 
 
 def test_depth_is_copied_and_never_mixed():
@@ -107,7 +107,8 @@ def test_depth_is_copied_and_never_mixed():
 
 
 def test_the_rotation_is_applied_and_its_corners_have_no_depth():
-    """FastDepth's code discards its rotated image: here a rolled frame differs, and shows nothing in the corners."""
+    """The rolled frame differs from the original and has no depth in its corners (FastDepth's code discards its rotated
+    image)."""
     image, depth = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0)), torch.full(SIZE, 2.0)
     rolled, new_depth, _ = apply_geometry(image, depth, K, Change(angle=0.087))
     assert (rolled - image).abs().mean() > 0.1

@@ -1,4 +1,4 @@
-"""BatchEnsemble against loops over the formula, the plain networks its members are, and what conversions get wrong."""
+"""BatchEnsemble against loops over the formula, its members as plain networks, and typical conversion errors."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Tiny(Backbone):
 
 
 def tiny():
-    """A network in eval mode whose statistics are not the initial ones, and its ensemble with biases that differ."""
+    """A network in eval mode with non-initial statistics, and its ensemble with different biases."""
     torch.manual_seed(0)
     network = with_head(Tiny(), "aleatoric").double()
     network(torch.rand(8, 3, 6, 8, dtype=torch.float64))
@@ -70,7 +70,7 @@ def images(batch=2):
 
 
 def alone(layer, n):
-    """The layer, every image by member n."""
+    """The layer with member n for every image."""
 
     def call(x):
         layer.selection.members = torch.full((len(x),), n)
@@ -107,11 +107,11 @@ def test_a_convolution_is_the_formula(groups, kernel, padding, stride, dilation,
             for i in range(inputs // count):
                 j = o // (outputs // count) * (inputs // count) + i
                 weight[o, i] *= layer.s[n, o].item() * layer.r[n, j].item()
-        own = copy.deepcopy(plain)
-        own.weight = nn.Parameter(weight)
-        torch.testing.assert_close(alone(layer, n)(x), own(x), rtol=1e-12, atol=1e-12)
+        member = copy.deepcopy(plain)
+        member.weight = nn.Parameter(weight)
+        torch.testing.assert_close(alone(layer, n)(x), member(x), rtol=1e-12, atol=1e-12)
         torch.testing.assert_close(layer.weight_of(n), weight, rtol=1e-14, atol=0)
-        torch.testing.assert_close(layer.plain(n)(x), own(x), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(layer.plain(n)(x), member(x), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("shape", [(2, 5), (2, 4, 5), (2, 3, 4, 5)])
@@ -147,8 +147,8 @@ def test_autocast_does_not_widen_what_follows():
 
 
 class KeepsTwice(nn.Module):
-    """Modules in a dict that is not registered, in a tuple and as an attribute, besides a ModuleList: what made a
-    published conversion change nothing."""
+    """Holds modules in a ModuleList and also in an unregistered dict, a tuple and an attribute. On such modules a
+    published conversion had no effect."""
 
     def __init__(self):
         super().__init__()
@@ -174,14 +174,14 @@ def test_conversion_replaces_layers_wherever_they_are_kept():
     x = torch.randn(2, 3, 4, 4, dtype=torch.float64)
     network.again.selection.members = torch.tensor([0, 1])
     assert (network(x) - plain(x)).abs().max() > 0.01
-    for key, value in plain.state_dict().items():  # the argument is as it was, and shares nothing with the copy
+    for key, value in plain.state_dict().items():  # the argument is unchanged and shares nothing with the copy
         assert torch.equal(value, before[key])
     assert not {p.data_ptr() for p in plain.parameters()} & {p.data_ptr() for p in network.parameters()}
     assert not converted_layers(plain)
 
 
 class Standardised(nn.Conv2d):
-    """A convolution that computes something else with its weight."""
+    """A convolution that does not use its weight directly."""
 
 
 def test_layers_that_compute_something_else_are_refused():
@@ -221,18 +221,18 @@ def test_a_member_is_its_part_of_the_batched_pass_and_its_folded_network():
     together = ensemble.distribution(x)
     assert together.depth.shape == (2 * N, 6, 8)
     for n, member in enumerate(ensemble.all_members()):
-        own, plain = member.distribution(x), ensemble.folded(n)
+        prediction, plain = member.distribution(x), ensemble.folded(n)
         assert not converted_layers(plain)
         assert {type(m) for m in plain.modules()} >= {nn.Conv2d, nn.Linear, nn.BatchNorm2d}
         for name in ("depth", "log_variance"):
             part = getattr(together, name)[2 * n : 2 * n + 2]
-            torch.testing.assert_close(part, getattr(own, name), rtol=1e-12, atol=1e-12)
+            torch.testing.assert_close(part, getattr(prediction, name), rtol=1e-12, atol=1e-12)
             torch.testing.assert_close(getattr(plain.distribution(x), name), part, rtol=1e-12, atol=1e-12)
         with torch.no_grad():
             for value in plain.parameters():
                 value.zero_()  # independent of the ensemble
-        assert torch.equal(member.distribution(x).depth, own.depth)
-        assert torch.equal(ensemble.distribution(x, n).depth, own.depth)
+        assert torch.equal(member.distribution(x).depth, prediction.depth)
+        assert torch.equal(ensemble.distribution(x, n).depth, prediction.depth)
 
 
 @pytest.mark.parametrize("method", ["aleatoric", "evidential"])

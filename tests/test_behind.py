@@ -1,4 +1,5 @@
-"""Frames read ahead and sinks behind the loop: order, what is through when it ends, and where errors are raised."""
+"""Prefetched frames and sinks in the writer thread: order, completion at the loop's end, and where errors are
+raised."""
 
 from __future__ import annotations
 
@@ -28,7 +29,7 @@ def sequence(tmp_path_factory):
 
 
 class Slow(FrameSink):
-    """Takes its time, in a thread that is not the loop's; breaks at a frame."""
+    """A slow sink in the writer thread; fails at a given frame."""
 
     def __init__(self, at=None, error=None):
         self.at, self.error = at, error
@@ -51,7 +52,7 @@ def stream_of(sequence, network=None):
 
 
 def test_every_frame_comes_in_order_with_the_state_after_it(sequence):
-    """The states are those that a loop without a thread has after the same frames."""
+    """The states equal those of a loop without a thread after the same frames."""
     expected = []
 
     class States(FrameSink):
@@ -96,7 +97,7 @@ def test_whatever_ends_the_loop_all_frames_that_were_computed_are_through(sequen
 
 
 def test_only_a_few_frames_wait(sequence):
-    """The loop waits for sinks that are too far behind, so that memory is bounded."""
+    """The loop waits for slow sinks, so that memory is bounded."""
     behind_by = []
 
     class Count(FrameSink):
@@ -106,7 +107,7 @@ def test_only_a_few_frames_wait(sequence):
     slow = Slow()
     with WriterThread([slow]) as behind:
         stream_of(sequence).drive([behind, Count()])
-    assert max(behind_by) <= 6  # 5 that wait, and one in hand
+    assert max(behind_by) <= 6  # 5 queued, and one being written
 
 
 def test_frames_are_read_ahead_in_order_by_one_thread(sequence):

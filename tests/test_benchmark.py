@@ -31,7 +31,7 @@ def test_paired_ratio_cancels_a_common_slowdown():
 
 @pytest.fixture
 def work(monkeypatch):
-    """Move ``time.perf_counter``, which stands still otherwise, by a number of seconds."""
+    """Advance the fake ``time.perf_counter`` by a number of seconds."""
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
 
@@ -84,7 +84,7 @@ def test_threads_are_pinned_and_restored(fails):
 
 
 def bench(path, *words):
-    """A tiny run: its report."""
+    """The report of a tiny run."""
     words = [*words, "--frames", "2", "--history", "3", "--threads", "1", "--json", str(path)]
     before = threads()
     assert main(read(words)) == 0
@@ -99,7 +99,7 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     assert set(small["machine"]["versions"]) >= {"ufmstar_torch", "torch", "numba", "numpy", "python"}
     assert set(small["machine"]["hardware"]) >= {"cpu", "cores", "platform", "environment"}
     rows = {row["row"]: row for row in small["rows"]}
-    assert len(rows) == 7, "UfM, and three of UfM* for each backend"
+    assert len(rows) == 7, "UfM, and three rows of UfM* for each backend"
     plain, corners, posterior, reference = (
         rows[f"UfM*-{name}"]
         for name in ("DepthOnly", "Anchored-DepthOnly", "DepthOnly (anchors dense, posterior True)",
@@ -109,8 +109,8 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
         assert row["latency"]["multiview"]["count"] == row["ratios_to_depth"]["multiview"]["count"] == 2
         assert row["latency"]["multiview"]["min_ms"] > 0
     assert plain["stages"].keys() == {"stages", "stages_total"}
-    kept = [row["memory"]["multiview"]["bytes_end"] for row in (plain, corners, posterior)]
-    assert kept == sorted(kept), "landmarks and the posterior are kept besides"
+    sizes = [row["memory"]["multiview"]["bytes_end"] for row in (plain, corners, posterior)]
+    assert sizes == sorted(sizes), "landmarks and the posterior add to the mixture's memory"
     assert reference["memory"]["multiview"] == plain["memory"]["multiview"], "the same mixture"
     printed = capsys.readouterr()
     assert "UfM*-Anchored-DepthOnly" in printed.out

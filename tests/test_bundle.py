@@ -1,4 +1,4 @@
-"""Poses refined by tracked corners: against an oracle, on scenes of known poses, and on rendered rooms."""
+"""Pose refinement from tracked corners: against an oracle, on scenes with known poses, and in rendered rooms."""
 
 from __future__ import annotations
 
@@ -84,7 +84,8 @@ def test_moving_is_the_exponential_map(seed):
 
 
 def learnt(seed, degrees, frames=25):
-    """The refined poses' errors over the given ones', after some frames of a walk with noisy rotations."""
+    """Ratio of the refined poses' errors to the input poses' errors, after some frames of a walk with noisy
+    rotations."""
     rng, refinement, ratios, correlated = np.random.default_rng(seed), PoseRefinement(), [], []
     for _ in range(frames):
         truth, pixel = scene(rng, noise=0.2)
@@ -103,7 +104,7 @@ def test_noisy_rotations_become_four_times_smaller_and_their_noise_is_learnt(see
     refinement, ratios, correlated, _ = learnt(seed, 0.3)
     assert np.median(ratios[-8:]) < 0.25
     noise = np.deg2rad(0.3) * K[0, 0]
-    assert 0.5 * noise < refinement.given**0.5 < 2 * noise
+    assert 0.5 * noise < refinement.pose_variance**0.5 < 2 * noise
     assert np.median(correlated) < 0.3 * noise**2, "the errors of successive poses are independent"
 
 
@@ -111,18 +112,18 @@ def test_noisy_rotations_become_four_times_smaller_and_their_noise_is_learnt(see
 def test_right_poses_hardly_move(seed):
     refinement, _, _, after = learnt(seed, 0.0)
     assert after < 0.01
-    assert refinement.given**0.5 < 0.15
+    assert refinement.pose_variance**0.5 < 0.15
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_noise_of_the_first_poses_is_learnt_faster_than_that_of_later_ones(seed):
-    """Four exact ones: a mean of them and the prior, of whose variance a fifth remains."""
+    """After four exact poses, a fifth of the prior's variance remains."""
     rng, refinement = np.random.default_rng(seed), PoseRefinement()
-    first = refinement.given
+    first = refinement.pose_variance
     for _ in range(4):
         truth, pixel = scene(rng, noise=0.1)
         refinement.refine(pixel, np.ones(pixel.shape[:2], bool), truth, K, 2.0)
-    assert refinement.given < 0.35 * first
+    assert refinement.pose_variance < 0.35 * first
 
 
 def test_poses_that_lag_behind_have_correlated_errors():
@@ -159,8 +160,8 @@ def test_absurd_corners_and_poses_give_finite_poses(metres):
 
 
 @pytest.mark.parametrize("kind", [LandmarkTracker, DenseEvidence])
-def test_depths_stand_noisy_poses(kind):
-    """Half a degree of noise moves corners by 2 px; before poses were refined, all depths were refused."""
+def test_depths_survive_noisy_poses(kind):
+    """Half a degree of noise moves corners by 2 px. Without pose refinement all depths are rejected."""
     frames, rng = walk(), np.random.default_rng(0)
     noisy = turned(rng, np.stack([f.T_world_cam for f in frames]), 0.5)
     source, errors, found = kind(), [], 0
@@ -170,7 +171,7 @@ def test_depths_stand_noisy_poses(kind):
         errors.extend(np.abs(np.log(result.depth / true_depth(frame, result.pixel))))
     assert found >= 6
     assert np.median(errors) < 0.12
-    assert result.pose_error > 1, "the given poses' error is reported"
+    assert result.pose_error > 1, "the input poses' error is reported"
 
 
 def test_a_pose_that_jumps_once_starts_a_new_trajectory_and_teaches_nothing():
@@ -199,5 +200,5 @@ def test_depths_are_right_again_soon_after_the_poses_have_jumped(kind):
         if i >= 10:
             after.append(np.abs(np.log(result.depth / true_depth(frame, result.pixel))))
     assert len(after[0]) == 0, "nothing is measured across the jump"
-    assert all(len(errors) < 20 or np.median(errors) < 0.1 for errors in after), "and nothing wrong later"
+    assert all(len(errors) < 20 or np.median(errors) < 0.1 for errors in after), "later depths are right"
     assert len(after[-1]) > 20

@@ -47,7 +47,7 @@ def test_relative_pose(seed):
 
 
 def test_relative_pose_keeps_digits_far_from_the_world_origin():
-    """Two cameras 10 cm apart in coordinates of a city: the difference survives in full."""
+    """Two cameras 10 cm apart, at city-scale coordinates: their relative pose keeps full precision."""
     T_a, T_b = pose(0), pose(0)
     T_a[:3, 3] = torch.tensor([5e6, -3e6, 100.0], dtype=torch.float64)
     T_b[:3, 3] = T_a[:3, 3] + torch.tensor([0.125, 0.0, 0.0], dtype=torch.float64)
@@ -63,7 +63,7 @@ def test_nearest_rotation_is_the_polar_factor(seed, amount):
     skewed = R + amount * noise / noise.abs().max()
     U, _, Vh = torch.linalg.svd(skewed)
     torch.testing.assert_close(camera.nearest_rotation(skewed), U @ Vh, rtol=0, atol=1e-14)
-    greatest = R * (1.1**0.5)  # the greatest deviation that is accepted
+    greatest = R * (1.1**0.5)  # the largest accepted deviation
     assert camera.rotation_deviation(greatest).item() == pytest.approx(0.1)
     torch.testing.assert_close(camera.nearest_rotation(greatest), R, rtol=0, atol=1e-14)
 
@@ -78,5 +78,5 @@ def test_projected_covariance(seed):
     for i in range(3):
         m, S = oracle.project(mean[i].numpy(), cov[i].numpy(), K.numpy())
         np.testing.assert_allclose(image_mean[0, i].numpy(), m, rtol=1e-12)
-        own = image_cov[0, i].numpy() + oracle.PIXEL_VARIANCE * np.eye(2)
-        np.testing.assert_allclose(own, S, rtol=1e-11, atol=1e-11)
+        covariance = image_cov[0, i].numpy() + oracle.PIXEL_VARIANCE * np.eye(2)
+        np.testing.assert_allclose(covariance, S, rtol=1e-11, atol=1e-11)

@@ -1,4 +1,4 @@
-"""Pixels that were not measured do not read as certain, and unusable depth does not get in."""
+"""Unmeasured pixels are not reported as certain, and unusable depth is rejected."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.numerics
 
 
 def test_beyond_the_networks_range_nothing_is_certain():
-    """25 m, then 40 m from one pose: V was 0 everywhere."""
+    """25 m, then 40 m from one pose: V is NaN there, not 0."""
     ufm = UfMStar(CONFIG)
     for far in (25.0, 40.0):
         depth = torch.full((1, H, W), 2.0)
@@ -44,7 +44,7 @@ def test_beyond_the_networks_range_nothing_is_certain():
 
 
 class Ranged(torch.nn.Module):
-    """A network that predicts 3 m, but 60 m at the left, and states that it reaches ``max_depth``."""
+    """Predicts 3 m, but 60 m at the left, and states the range ``max_depth``."""
 
     def __init__(self, max_depth):
         super().__init__()
@@ -57,19 +57,19 @@ class Ranged(torch.nn.Module):
 
 
 @pytest.mark.parametrize(
-    ("ranges", "own", "expected"),
+    ("ranges", "max_depth", "expected"),
     [
         ([80.0], None, 80.0),
         ([None], None, None),
-        ([80.0], 20.0, 20.0),  # the user's own word
+        ([80.0], 20.0, 20.0),  # stated by the user
         ([10.0, 80.0], None, 80.0),
         ([80.0, None], None, None),
         (["80"], None, None),
         ([-1.0], None, None),
     ],
 )
-def test_the_pipeline_follows_the_networks_stated_range(ranges, own, expected):
-    model = UncertainDepth([Ranged(r) for r in ranges], UfMStarConfig(segment=replace(SPGF, max_depth=own)))
+def test_the_pipeline_follows_the_networks_stated_range(ranges, max_depth, expected):
+    model = UncertainDepth([Ranged(r) for r in ranges], UfMStarConfig(segment=replace(SPGF, max_depth=max_depth)))
     assert model.ufm.config.segment.max_depth == expected
     out = model(torch.rand(1, 3, H, W), torch.eye(4), K)
     left = out.ufm.valid[..., : W // 2]
@@ -122,7 +122,7 @@ def test_a_point_far_from_everything_reads_as_chosen():
 
 @pytest.mark.parametrize("choice", CHOICES)
 def test_a_large_noisy_image_without_a_segment_reads_as_chosen(choice):
-    """5 cm of noise between neighbours leave no segment of the length that a large image asks for."""
+    """With 5 cm of noise between neighbours, no segment reaches the minimum length of a large image."""
     size = (600, 900)
     noisy = 1 + 0.05 * torch.randn(2, 1, *size, generator=torch.Generator().manual_seed(0))
     camera = torch.tensor([[800.0, 0, 450], [0, 800, 300], [0, 0, 1]])
@@ -138,8 +138,8 @@ def test_a_large_noisy_image_without_a_segment_reads_as_chosen(choice):
 
 @pytest.mark.parametrize("choice", CHOICES)
 def test_what_was_not_measured_does_not_make_the_next_frame_certain(choice):
-    """The first view's M, 0 as the paper has it, halves that of the second by the moving average; chosen otherwise it
-    does not."""
+    """In the paper, M is 0 in the first view, so the moving average halves M in the second view. With another setting
+    it does not."""
     first, second = frame(0), frame(1)
     config = CONFIG.replace(unmeasured=choice, **CHOICES[choice])
     smoothed, plain = UfMStar(config), UfMStar(config.replace(ema_alpha=1.0))
@@ -165,9 +165,9 @@ def test_a_frame_without_a_segment_warns_once(caplog):
         assert int(out.statistics.beyond[0]) > 0
         assert int(out.statistics.valid_pixels[0]) == 0
         ufm(1000 * depth, pose, intrinsics)
-        UfMStar(CONFIG)(torch.zeros_like(depth), pose, intrinsics)  # nothing was given, so nothing is missing
-    (said,) = caplog.messages
-    assert re.match(r"stream 0: .*no segment.*beyond segment\.max_depth = 20\.0 m.*in metres", said)
+        UfMStar(CONFIG)(torch.zeros_like(depth), pose, intrinsics)  # no valid depth, so no segment is expected
+    (warning,) = caplog.messages
+    assert re.match(r"stream 0: .*no segment.*beyond segment\.max_depth = 20\.0 m.*in metres", warning)
 
 
 def test_the_papers_configuration():
@@ -175,7 +175,7 @@ def test_the_papers_configuration():
     assert (paper.segment.min_pixels, paper.segment.min_rows, paper.segment.prune) == (2000, 32, "either")
     assert (paper.regression, paper.near_radius, paper.far_radius) == ("neighbourhood", 0.1, 0.5)
     assert paper.unmeasured == "paper"
-    # SPGF's own t = a z^2 / f at the paper's 224 x 224, whatever the camera; the same in metres at 518 x 518.
+    # SPGF's t = a z^2 / f at the paper's 224 x 224 for any camera; the same length at 518 x 518.
     assert paper.segment.scaled_to(224, 224).slope(123.0) == pytest.approx(2.4 / 123)
     assert paper.segment.scaled_to(518, 518).slope(123.0 * 518 / 224) == pytest.approx(2.4 / 123)
     ours, theirs = flat(UfMStarConfig().to_dict()), flat(paper.to_dict())

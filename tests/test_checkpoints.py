@@ -1,4 +1,4 @@
-"""Weights in files: round trips, prefixes, strictness, damage, and writing that cannot half happen."""
+"""Weights in files: round trips, prefixes, strictness, damage, and atomic writing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FORMATS = ["w.pth", "w.pt", "w.safetensors"]
 
 
 class Small(nn.Module):
-    """Some parameters, a buffer and an integer."""
+    """A module with parameters, a buffer and an integer."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ def test_round_trip(tmp_path: Path, name: str) -> None:
     assert same(load_state_dict_file(tmp_path / name), source.state_dict())
     load_weights(target, tmp_path / name)
     assert same(target.state_dict(), source.state_dict())
-    assert [p.name for p in tmp_path.iterdir()] == [name]  # nothing temporary stays
+    assert [p.name for p in tmp_path.iterdir()] == [name]  # no temporary file remains
 
 
 def test_other_programs_read_weights_and_metadata(tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_other_programs_read_weights_and_metadata(tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("new", [True, False])
 def test_what_wrappers_add_is_taken_off(tmp_path: Path, wrap: Callable[[dict[str, Tensor]], Any], new: bool) -> None:
-    """The file may be of today or from before torch 1.6."""
+    """For torch's current format and for the format before 1.6."""
     source, target = Small(), Small()
     torch.save(wrap(dict(source.state_dict())), tmp_path / "w.pth", _use_new_zipfile_serialization=new)
     assert same(load_state_dict_file(tmp_path / "w.pth"), source.state_dict())
@@ -111,7 +111,7 @@ def test_metadata_nested_too_deeply_names_the_file(tmp_path: Path) -> None:
 @given(data=st.data())
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_cut_off_files_are_named(tmp_path: Path, name: str, data: st.DataObject) -> None:
-    """A file may end at any byte; the error names it."""
+    """A file truncated at any byte: the error names the file."""
     save_checkpoint(tmp_path / name, Small())
     whole = (tmp_path / name).read_bytes()
     broken = tmp_path / f"broken_{name}"
@@ -129,19 +129,19 @@ def test_arbitrary_bytes_are_named(tmp_path: Path, name: str, content: bytes) ->
         load_state_dict_file(tmp_path / name)
 
 
-# torch's own: it names its deprecated storage class in the message of the error that is tested here.
+# From torch itself: its error message, tested here, evaluates a deprecated storage class.
 @pytest.mark.filterwarnings("ignore:TypedStorage is deprecated:UserWarning")
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol:UserWarning")
-@example(place=852, value=0, kept=880)
-@given(place=st.integers(0, 2000), value=st.integers(0, 255), kept=st.integers(16, 3000))
+@example(position=852, value=0, length=880)
+@given(position=st.integers(0, 2000), value=st.integers(0, 255), length=st.integers(16, 3000))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_damage_to_the_format_of_old_releases(tmp_path: Path, place: int, value: int, kept: int) -> None:
-    """Files from before torch 1.6 are one pickle; damaged ones load with other values or name the file."""
+def test_damage_to_the_format_of_old_releases(tmp_path: Path, position: int, value: int, length: int) -> None:
+    """Before torch 1.6 a file was one pickle. A damaged file loads with other values, or the error names it."""
     path = tmp_path / "old.pth"
     torch.save(Small().state_dict(), path, _use_new_zipfile_serialization=False)
     content = bytearray(path.read_bytes())
-    content[place % len(content)] = value
-    path.write_bytes(content[:kept])
+    content[position % len(content)] = value
+    path.write_bytes(content[:length])
     message = ""
     try:
         load_state_dict_file(path)
@@ -197,7 +197,7 @@ def test_missing_files_and_unknown_suffixes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The disk fills up at the last moment: the old weights are still there, and nothing else."""
+    """If the disk is full at the end of writing, the old weights remain, and no other file."""
     old = Small()
     save_checkpoint(tmp_path / name, old)
 

@@ -1,4 +1,4 @@
-"""The command line: what users see, exit codes, options and configuration files, and the real command."""
+"""The command line: messages, exit codes, options and configuration files, and the installed command."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from ufmstar_torch.models import Preprocess
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    """A generic sequence of 6 frames, 48x64. Nobody may change it."""
+    """A generic sequence of 6 frames, 48x64. Tests must not change it."""
     return write_generic(tmp_path_factory.mktemp("scene"))[0]
 
 
 @pytest.fixture
 def brightness(monkeypatch, tmp_path):
-    """Make ``--model any --weights FILE`` load a network whose gain is the file's content.
+    """Make ``--model any --weights FILE`` load a :class:`Brightness` whose gain is the file's content.
 
     Returns the files and settings: the action of a network at a call, and the width of its images.
     """
@@ -76,7 +76,7 @@ def test_help_loads_nothing_beyond_the_package():
 
 NETWORK = "--model fastdepth --weights {path}/K.txt"
 EVAL = "ufmstar eval --suite depth-only --network depth_only=ground-truth:24x32 --root d={path} --out {out}"
-# The words behind ``ufmstar run SEQUENCE --out OUT``, or a whole line, and a part of the message.
+# Options of ``ufmstar run SEQUENCE --out OUT``, or a whole command line; and part of the message.
 MISTAKES = {
     "unknown command": ("ufmstar walk", "no command 'walk', there are demo, run, rank, eval,"),
     "no sequence": ("ufmstar run", "sequence"),
@@ -329,7 +329,7 @@ def test_fastdepth_on_a_real_sequence(tmp_path):
     summary = read_summary(tmp_path / "out")
     assert summary["frames"]["done"] == summary["frames"]["with_ground_truth"] == 3
     assert summary["prediction"]["size"] == [224, 224]
-    # As computed with ONNX Runtime, Pillow and NumPy alone, but for the pixel that stands for a ground truth.
+    # Reference values from ONNX Runtime, Pillow and NumPy alone, except the pixel of the ground truth.
     assert summary["metrics"]["abs_rel"] == pytest.approx(0.3756, abs=0.003)
     assert summary["metrics"]["delta1_ratio"] == pytest.approx(0.4987, abs=0.003)
     assert 20 < summary["mixture"]["components"] < 100

@@ -1,4 +1,4 @@
-"""A network's confidence in whatever unit: against the oracle, its invariance, when it is ignored, and its state."""
+"""A network's confidence in an arbitrary unit: oracle, invariance to the unit, when it is ignored, and its state."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ K = torch.tensor([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]], dtype=torch.float64)
 
 
 def frames(count, seed=0, n=150, dtype=torch.float64):
-    """Depth, the standard deviation of its relative error (known to nobody but the confidence), and anchors."""
+    """Depth, the standard deviation of its relative error (the source of the confidence), and anchors."""
     rng = np.random.default_rng(seed)
     for i in range(count):
         depth = 2 + 0.5 * np.sin(np.linspace(0, 3, W) + 0.1 * i)[None] * np.ones((H, 1))
@@ -53,28 +53,28 @@ def frames(count, seed=0, n=150, dtype=torch.float64):
         at = rng.choice(H * W, n, replace=False)
         pixel = np.stack([at % W, at // W], -1).astype(float)
         g = np.abs(depth.flat[at] * (1 + sigma.flat[at] * rng.standard_normal(n)))
-        given = Anchors(*(torch.from_numpy(x)[None] for x in (pixel, g, np.full(n, 1e-4))))
+        anchors = Anchors(*(torch.from_numpy(x)[None] for x in (pixel, g, np.full(n, 1e-4))))
         T = torch.eye(4, dtype=torch.float64)
         T[0, 3] = 0.05 * i
-        yield torch.from_numpy(depth)[None].to(dtype), torch.from_numpy(sigma)[None], given, T[None], at
+        yield torch.from_numpy(depth)[None].to(dtype), torch.from_numpy(sigma)[None], anchors, T[None], at
 
 
 def variances(config, unit, count=12, **how):
     ufm, maps = UfMStar(config, dtype=torch.float64), []
-    for depth, sigma, given, T, _ in frames(count, **how):
+    for depth, sigma, anchors, T, _ in frames(count, **how):
         c = None if unit is None else unit(sigma)
-        maps.append(ufm(depth, T, K, anchors=given, **({} if c is None else {"confidence": c})))
+        maps.append(ufm(depth, T, K, anchors=anchors, **({} if c is None else {"confidence": c})))
     return maps, ufm
 
 
 def test_values_against_the_oracle():
-    """Frames run from before the first anchor until it is used; V without the confidence is the plain module's."""
+    """From the first frame until the confidence is used. The input V is the plain module's."""
     state, plain = oracle.start(), variances(PLAIN, None, count=14)[0]
     maps, _ = variances(CONFIG, lambda sigma: 1 / (1 + sigma), count=14)
-    for out, before, (depth, sigma, given, _, at) in zip(maps, plain, frames(14), strict=True):
+    for out, before, (depth, sigma, anchors, _, at) in zip(maps, plain, frames(14), strict=True):
         c = (1 / (1 + sigma[0])).float().double().numpy()
         predicted = depth[0].numpy().flat[at]
-        values = (at, predicted, given.depth[0].numpy(), given.variance[0].numpy())
+        values = (at, predicted, anchors.depth[0].numpy(), anchors.variance[0].numpy())
         state, expected = oracle.update(state, c, before.variance[0].numpy(), *values)
         np.testing.assert_allclose(out.variance[0], expected, rtol=1e-9)
         np.testing.assert_allclose(float(out.statistics.confidence), oracle.gain(state), rtol=1e-6)
@@ -85,7 +85,7 @@ def test_values_against_the_oracle():
 
 
 def test_the_unit_does_not_count():
-    """A confidence, a logit, an exponential, a constant factor: the same V; the other way round nearly so."""
+    """Monotonic transforms of the confidence give the same V; a decreasing one gives nearly the same."""
     (expected, _), *others = (
         variances(CONFIG, unit)
         for unit in (torch.log, lambda s: s, lambda s: 40 * s - 3, lambda s: s**3, lambda s: s.log().exp().sqrt())
@@ -98,7 +98,7 @@ def test_the_unit_does_not_count():
 
 @pytest.mark.parametrize("kind", ["random", "constant", "absent", "NaN"])
 def test_what_says_nothing_is_ignored(kind):
-    """V is plain UfM*'s, to the bit."""
+    """V equals plain UfM*'s bit for bit."""
     generator = torch.Generator().manual_seed(1)
     units = {
         "random": lambda s: torch.rand(s.shape, generator=generator, dtype=s.dtype),
@@ -113,22 +113,22 @@ def test_what_says_nothing_is_ignored(kind):
 
 
 def test_what_the_confidence_meant_is_forgotten():
-    """A confidence that is inverted in the middle is soon ignored, and later used the other way round."""
+    """A confidence that changes its sign after 20 frames is soon ignored, and later used with the new sign."""
     ufm, used = UfMStar(CONFIG), []
-    for i, (depth, sigma, given, T, _) in enumerate(frames(60, dtype=torch.float32)):
-        out = ufm(depth, T, K, anchors=given, confidence=sigma.float() if i < 20 else -sigma.float())
+    for i, (depth, sigma, anchors, T, _) in enumerate(frames(60, dtype=torch.float32)):
+        out = ufm(depth, T, K, anchors=anchors, confidence=sigma.float() if i < 20 else -sigma.float())
         used.append(bool(out.statistics.confidence > 0))
     assert (used[19], used[-1]) == (True, True)
     assert not all(used[20:40])
 
 
 def test_state_is_saved_restored_and_loaded_as_a_whole():
-    given = list(frames(12, dtype=torch.float32))
+    inputs = list(frames(12, dtype=torch.float32))
     ufm, other = UfMStar(CONFIG), UfMStar(CONFIG)
-    for depth, sigma, anchors, T, _ in given[:-1]:
+    for depth, sigma, anchors, T, _ in inputs[:-1]:
         ufm(depth, T, K, anchors=anchors, confidence=sigma.float())
     other.load_state_dict(ufm.state_dict())
-    depth, sigma, anchors, T, _ = given[-1]
+    depth, sigma, anchors, T, _ = inputs[-1]
     sample = ufm.mean_uncertainty(depth, T, K, confidence=sigma.float(), average=False, fraction=1.0)
     ufm.load_state_dict(other.state_dict())
     assert sample.mean > 0
@@ -157,7 +157,7 @@ def test_streams_of_a_batch_are_independent_and_anchors_may_be_padded():
 
 
 def test_offline_from_truth(tmp_path):
-    """The factor is found from samples in whatever unit, and applied with or without anchors; it is saved as JSON."""
+    """The factor is fitted to samples in any unit, applied with or without anchors, and saved as JSON."""
     rng = np.random.default_rng(0)
     sigma, V = np.exp(rng.uniform(-3, 1, (2, 4000))), np.exp(rng.uniform(-2, 2, (2, 4000)))
     e = (sigma * rng.standard_normal(sigma.shape)) ** 2 * V
@@ -191,7 +191,7 @@ class Stated(nn.Module):
 
 
 def test_a_network_states_it():
-    """One declaration: through wrappers and ensembles into UfM*, which then learns where it has anchors."""
+    """One declaration passes through wrappers and ensembles to UfM*, which learns the factor from anchors."""
     network = wrap_network(Stated(), "depth", confidence="conf", preprocess=Preprocess(size=SIZE))
     assert network.states_confidence
     assert Ensemble([network, network]).states_confidence
@@ -206,14 +206,14 @@ def test_a_network_states_it():
         [network, copy.deepcopy(network)], UfMStarConfig(anchors=AnchorConfig()), preprocess=network.preprocess
     )
     assert model.ufm.config.confidence == ConfidenceConfig()
-    given = next(frames(1, dtype=torch.float32))[2]
-    out = model(image, torch.eye(4), K, anchors=given)
+    anchors = next(frames(1, dtype=torch.float32))[2]
+    out = model(image, torch.eye(4), K, anchors=anchors)
     assert torch.equal(out.prediction.confidence, image[:, 0])
     assert bool(model.ufm.confidence.any())
 
 
 def test_the_engine_passes_it(tmp_path):
-    """Through predictions on disk into the rows, and out as samples for ``ufmstar recalibrate``."""
+    """From cached predictions into the rows, and into samples for ``ufmstar recalibrate``."""
     network = wrap_network(Stated(), "depth", confidence="conf", preprocess=Preprocess(size=SIZE))
     source = NetworkSource(NetworksInTurn(network, preprocess=network.preprocess), CPU, {}, digest="a" * 64)
     method, sequence = Method.parse("UfM*-DepthOnly"), tour_sequence(seed=3, frames=3, size=(48, 64))
@@ -231,7 +231,8 @@ def test_the_engine_passes_it(tmp_path):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.jit:FutureWarning", "ignore:`torch.jit:DeprecationWarning")
 def test_the_commands_pass_it(tmp_path, capsys):
-    """``ufmstar run`` counts the frames in which it is used; ``eval`` and ``recalibrate`` fit a map of it to truth."""
+    """``ufmstar run`` counts the frames that use the confidence; ``eval`` and ``recalibrate`` fit its map to the
+    truth."""
     spec = {"outputs": {"kind": "metric", "depth": 0, "confidence": 1}, "preprocess": {"size": [48, 64]}}
     (tmp_path / "spec.json").write_text(json.dumps(spec))
     both = torch.jit.trace(Tuple(), torch.rand(1, 3, 48, 64))

@@ -1,4 +1,4 @@
-"""Forms of an image, a map, a pose and intrinsics that the core takes, and refusals: each error names the argument."""
+"""Accepted forms of images, maps, poses and intrinsics; and refusals, whose errors name the argument."""
 
 from __future__ import annotations
 
@@ -291,7 +291,8 @@ def test_arrays_that_a_network_returns_are_tensors():
 @pytest.mark.parametrize("output", [lambda depth: depth[:, None], lambda depth: {"depth": depth.numpy()}])
 @pytest.mark.parametrize("kind", ["module", "function", "wrapped"])
 def test_every_kind_of_network_is_the_same_network(kind, output):
-    """A module or a function gets bytes in [0, 1], and its only output is metric depth, as ``wrap_network`` has it."""
+    """A module or a function receives bytes scaled to [0, 1]; its only output is metric depth, as with
+    ``wrap_network``."""
 
     class Bright(nn.Module):
         def forward(self, image):

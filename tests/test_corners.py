@@ -1,4 +1,4 @@
-"""Corners: found away from those that are followed, and followed to where they went."""
+"""Corners: detected away from tracked corners, and tracked to their true positions."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ def apart(a, b):
 @pytest.mark.parametrize("size", [(120, 160), (360, 500)], ids=["whole", "halved"])
 def test_new_corners_keep_away_from_each_other_and_from_the_followed(size):
     image, rng = textured(*size), np.random.default_rng(1)
-    # Also in the corners of the image, where discs reach beyond it.
+    # Also at the image's corners, where discs extend beyond the image.
     edge = np.array([[0.0, 0.0], [size[1] - 1, size[0] - 1], [size[1] - 1, 0.0]])
     followed = np.concatenate([rng.uniform(0, np.array(size[::-1]) - 1, (20, 2)), edge])
     result = find(image, 4000, 9.0, followed)
     assert len(result) > 20
-    assert apart(result, followed).min() > 9 - 2.5, "a pixel of the searched image for rounding"
+    assert apart(result, followed).min() > 9 - 2.5, "a pixel at the search's resolution, for rounding"
     assert apart(result, result)[~np.eye(len(result), dtype=bool)].min() >= 9 - 1e-9
     alone = find(image, 4000, 9.0, np.zeros((0, 2)))
     assert len(alone) > len(result)
-    assert apart(alone, followed).min() < 5, "without them there would be some"
+    assert apart(alone, followed).min() < 5, "without existing corners some are found"
     np.testing.assert_array_equal(find(image, 7, 9.0, followed), result[:7])
 
 
@@ -48,9 +48,9 @@ def test_corners_move_with_the_image():
     inside = ((goal > 12) & (goal < [307, 227])).all(1)
     assert fine[inside].mean() > 0.95
     np.testing.assert_allclose(position[fine & inside], goal[fine & inside], atol=0.15)
-    assert not fine[(goal[:, 0] > 320) | (goal[:, 1] < -1)].any(), "what left the image is not believed"
+    assert not fine[(goal[:, 0] > 320) | (goal[:, 1] < -1)].any(), "tracks that leave the image are rejected"
     _, gone = follow(image, textured(240, 320, seed=5), start, 0.5)
-    assert gone.mean() < 0.2, "another image leads back to nowhere"
+    assert gone.mean() < 0.2, "with an unrelated image, backward tracking fails"
 
 
 @pytest.mark.parametrize(("right", "error", "gain"), [(70.0, (3, -2), 0.2), (4.0, (150, 40), -0.2)])

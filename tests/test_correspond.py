@@ -1,4 +1,4 @@
-"""Correspondence of every backend against the oracle, and its rules one by one."""
+"""Correspondence of every backend: against the oracle, and rule by rule."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ def test_agrees_with_the_oracle(backend, seed, eta, eta_occl):
         for c in range(7):
             expected = matches[c] if c < len(matches) else []
             assert found.match[b, c].nonzero().flatten().tolist() == expected
-            for k in range(14) if backend.name != "numba" else expected:  # which lists the pairs alone
+            for k in range(14) if backend.name != "numba" else expected:  # numba returns the pairs only
                 assert found.overlap[b, c, k].item() == pytest.approx(overlaps.get((c, k), 0.0), rel=1e-9, abs=1e-300)
 
 
 def test_any_number_of_pairs(backend):
-    """More than the kernels' lists and words hold at first, and many hidden members."""
+    """More pairs than the kernels' initial lists and words hold, and many hidden components."""
     count = 34 if backend.slow else 120
     many = mixture(1, count, 3, empty=0)
     many = many.replace(
@@ -79,7 +79,7 @@ def test_a_nearer_member_hides_a_farther_one_in_any_order(pairs):
     for order in ([near, far, aside], [far, aside, near], [aside, near, far]):
         found = pairs(blob(*order), blob((0, 0, 2.5, 0.125)), eta_occlusion=0.95)
         assert {order[k] for k in found.match[0, 0].nonzero().flatten().tolist()} == {near, aside}
-    # Alone, the farther one corresponds: its depth is wrong, which is what is to be measured.
+    # Alone, the farther component corresponds: its wrong depth is the disagreement to measure.
     assert pairs(blob(far), blob((0, 0, 2.0, 0.1))).match.all()
     assert pairs(blob((0, 0, 2, 0.1), (0, 0, 2, 0.1)), blob((0, 0, 2, 0.1))).match.all(), "equal depths hide nothing"
 

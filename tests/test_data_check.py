@@ -1,4 +1,4 @@
-"""ufmstar data check: right about good recordings, and about what people do to them; docs/data.md runs."""
+"""ufmstar data check on good and on spoilt recordings; and the commands of docs/data.md."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def exported(tmp_path_factory):
 
 @pytest.fixture
 def tour(exported, tmp_path):
-    """A copy that may be spoiled."""
+    """A copy that the test may change."""
     return shutil.copytree(exported, tmp_path / "home")
 
 
@@ -49,7 +49,7 @@ def spoil_depth(path, convert):
 
 
 def command(capsys, *words):
-    """Exit code and what was printed."""
+    """Exit code and printed text."""
     code = main(["data", "check", *map(str, words)])
     captured = capsys.readouterr()
     return code, captured.out + captured.err
@@ -67,7 +67,7 @@ def test_a_good_export_is_fine(exported, capsys):
 
 @pytest.mark.parametrize("written", ["world-to-camera", "ned", "opengl"])
 def test_other_conventions_are_named_with_their_option(tour, capsys, written):
-    """Poses as another program writes them; with the option that the check suggests, all is fine."""
+    """Poses in another program's convention; with the option that the check suggests, it finds no problem."""
     inverse = {
         "world-to-camera": np.linalg.inv,
         "ned": lambda T: T @ np.linalg.inv(layouts.NED_FROM_CAMERA),
@@ -99,7 +99,7 @@ def shrink_positions(path):
 @pytest.mark.parametrize(
     ("spoil", "options", "remedy", "factor"),
     [
-        # Depth a tenth as large would need 10 m per unit; only positions can be changed.
+        # Depth a tenth as large would need 10 m per unit; only the positions can be corrected.
         (lambda path: spoil_depth(path, lambda depth: depth / 10), {}, "divide the positions of the poses by ", 10),
         (shrink_positions, {"trajectory": "poses.txt"}, "a single camera's trajectory has no scale: divide the p", 0.2),
     ],
@@ -113,7 +113,7 @@ def test_positions_that_cannot_be_mended_by_the_depths_scale(tour, spoil, option
 
 
 def test_unregistered_depth(tour):
-    """Depth as a camera 8 cm beside the colour camera, with another focal length, sees it."""
+    """Depth of a camera 8 cm beside the colour camera, with another focal length."""
     K = np.loadtxt(tour / "K.txt")
     K_depth = K.copy()
     K_depth[0, 0], K_depth[1, 1] = 1.12 * K[0, 0], 1.12 * K[1, 1]
@@ -135,7 +135,7 @@ def test_broken_and_missing_frames_are_reported(tour, capsys):
     assert code == 1
     assert "23 of 24 frames usable" in out
     assert re.search(r"skipped +1 x non-finite pose", out)
-    # Every frame is read, also those that no compared pair holds.
+    # Every frame is read, also frames outside the compared pairs.
     assert re.search(r"PROBLEM +2 of the 23 frames read cannot be decoded, first .*000000\.png", out)
 
 

@@ -1,4 +1,4 @@
-"""``ufmstar demo``: an evaluation of the package's own networks on two kinds of rooms; its outputs and refusals."""
+"""``ufmstar demo``: an evaluation of the package's networks on two kinds of rooms; its outputs and refusals."""
 
 from __future__ import annotations
 

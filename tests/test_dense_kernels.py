@@ -17,7 +17,7 @@ SEARCH = Search(start=0.5, low=-0.01, high=2.0, sigmas=3.5, least_score=0.85, ri
 
 
 def plane(seed, T, z=2.0, shape=(72, 96)):
-    """The image of a textured plane at depth z of the world, seen by a camera T [4, 4], uint8."""
+    """Render a textured plane at world depth z from a camera T [4, 4], uint8."""
     texture = gaussian_filter(np.random.default_rng(seed).standard_normal((400, 400)), 4)
     texture = 127 + 45 * texture / texture.std()
     v, u = np.mgrid[: shape[0], : shape[1]]
@@ -59,15 +59,15 @@ def scene():
 def test_one_view_agrees_with_the_loops(scene):
     image, pixel, others = scene
     for k in range(3):
-        given = views(others[k : k + 1], MOVED[k : k + 1], np.eye(4))
+        view = views(others[k : k + 1], MOVED[k : k + 1], np.eye(4))
         search = Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0, 1.0)
-        result = measure(image, pixel, given, search)
+        result = measure(image, pixel, view, search)
         chosen = np.flatnonzero(result.agreed == 1)[:6]
         assert len(chosen) == 6
         for n in chosen:
-            rho, score = oracle_dense.along_line(image, others[k], pixel[n], given.H[0], given.b[0], 0.4, 0.6)
+            rho, score = oracle_dense.along_line(image, others[k], pixel[n], view.H[0], view.b[0], 0.4, 0.6)
             assert score > 0.95
-            ends = [oracle_dense.project(pixel[n], r, given.H[0], given.b[0]) for r in (0.4, 0.6)]
+            ends = [oracle_dense.project(pixel[n], r, view.H[0], view.b[0]) for r in (0.4, 0.6)]
             speed = np.linalg.norm(ends[1] - ends[0]) / 0.2
             assert abs(result.rho[n] - rho) * speed < 0.1, "a tenth of a pixel"
 
@@ -93,7 +93,7 @@ def test_the_variance_is_the_smallest_of_the_views_and_follows_the_poses_noise(s
     all_agree = (together.agreed == 3) & np.all([one.agreed > 0 for one in each], axis=0)
     assert all_agree.sum() > 20
     smallest = np.min([np.where(one.agreed > 0, one.variance, np.inf) for one in each], axis=0)
-    # the patch is warped at the depth known so far, so that residuals differ a little
+    # the patch is warped at the current depth estimate, so residuals differ slightly
     np.testing.assert_allclose(together.variance[all_agree], smallest[all_agree], rtol=0.5)
     noisy = measure(image, pixel, views(others[2:], MOVED[2:], np.eye(4), noise=0.25), SEARCH)
     clean = measure(image, pixel, views(others[2:], MOVED[2:], np.eye(4)), SEARCH)
@@ -112,20 +112,20 @@ def test_poses_that_are_wrong_show_across_the_line(scene):
 
 
 def test_a_view_that_might_show_the_match_outside_of_it_is_no_first_one(scene):
-    """The camera has moved to the right: what lies at the right border had been outside of the view, or at another
-    place than where the best window of the rest is."""
+    """The camera moves to the right: surfaces at the right border are outside of the earlier view, whose best matching
+    window is elsewhere."""
     image, _, _ = scene
     moved = pose(-0.5)
-    given = views([plane(0, moved)], [moved], np.eye(4))
+    first = views([plane(0, moved)], [moved], np.eye(4))
     pixel = np.array([[u, 30.0] for u in range(12, 84, 4)])
-    found = measure(image, pixel, given, SEARCH).agreed > 0
+    found = measure(image, pixel, first, SEARCH).agreed > 0
     far, near = pixel[:, 0], pixel[:, 0] + 90 * 0.5 * dense_cpu.WHOLE * SEARCH.start
     whole = (np.minimum(far, near) >= 3.5) & (np.maximum(far, near) <= 95 - 3.5)
     assert 0 < whole.sum() < len(whole)
     assert not found[~whole].any()
     assert found[whole].mean() > 0.5
-    also = views([plane(0, MOVED[0]), given.image[0]], [MOVED[0], moved], np.eye(4))
-    assert (measure(image, pixel, also, SEARCH).agreed[~whole] > 1).any(), "a depth that is known is looked up there"
+    both = views([plane(0, MOVED[0]), first.image[0]], [MOVED[0], moved], np.eye(4))
+    assert (measure(image, pixel, both, SEARCH).agreed[~whole] > 1).any(), "a depth from another view is verified there"
 
 
 def test_no_contrast_no_depth():
@@ -158,9 +158,9 @@ def test_a_landmark_is_sighted_where_it_projects_and_not_behind_something(scene)
     image, _, others = scene
     pixel = np.array([[40.0, 30.0], [60.0, 44.0]])
     point = np.concatenate([pixel, np.ones((2, 1))], 1) @ np.linalg.inv(K).T * 2.0
-    kept = (point, np.tile(np.eye(4), (2, 1, 1)), np.full(2, 0.01), patches(image, pixel), np.ones(2, np.bool_))
+    landmarks = (point, np.tile(np.eye(4), (2, 1, 1)), np.full(2, 0.01), patches(image, pixel), np.ones(2, np.bool_))
     for view, T in zip(others, MOVED, strict=True):
-        result, depth, spread, shown = sight(view, *kept, T, K)
+        result, depth, spread, shown = sight(view, *landmarks, T, K)
         cam = (point - T[:3, 3]) @ T[:3, :3]
         np.testing.assert_allclose(result, cam[:, :2] / cam[:, 2:] * 90 + K[:2, 2], atol=1e-9)
         np.testing.assert_allclose(depth, cam[:, 2], atol=1e-12)
@@ -168,19 +168,19 @@ def test_a_landmark_is_sighted_where_it_projects_and_not_behind_something(scene)
         assert shown.tolist() == [1, 1]
     hidden = others[0].copy()
     hidden[20:60, 30:50] = plane(9, np.eye(4))[20:60, 30:50]
-    assert sight(hidden, *kept, MOVED[0], K)[3].tolist() == [-1, 1]
-    assert sight(others[0], *kept, pose(turned=(0, np.pi, 0)), K)[3].tolist() == [0, 0], "behind the camera"
+    assert sight(hidden, *landmarks, MOVED[0], K)[3].tolist() == [-1, 1]
+    assert sight(others[0], *landmarks, pose(turned=(0, np.pi, 0)), K)[3].tolist() == [0, 0], "behind the camera"
 
 
 def test_a_search_along_the_last_row_reads_nothing_beyond_the_image():
     """Python checks bounds; compiled code would read memory behind the image."""
     height, width = 12, 24
     key = np.random.default_rng(0).integers(0, 256, (height, width), dtype=np.uint8)
-    windows, scores, place = np.empty((9, 8), np.uint64), np.empty(9, np.float32), np.empty(4)
+    windows, scores, match = np.empty((9, 8), np.uint64), np.empty(9, np.float32), np.empty(4)
     patch = key[-8:, 7:15].astype(np.float32).ravel()
     patch -= patch.mean()
     patch /= np.linalg.norm(patch)
     line = (6.5, height - 4.5, 1.0, np.array([8.0, 0.0, 0.0]), 0.0, 1.0)
-    assert dense_cpu._search(patch, dense_cpu.eights(key[None])[0], width, height, *line, windows, scores, place)
-    assert place[:2].tolist() == [10.5, height - 4.5]
-    assert place[2] == pytest.approx(1, abs=1e-5)
+    assert dense_cpu._search(patch, dense_cpu.eights(key[None])[0], width, height, *line, windows, scores, match)
+    assert match[:2].tolist() == [10.5, height - 4.5]
+    assert match[2] == pytest.approx(1, abs=1e-5)

@@ -1,4 +1,4 @@
-"""Errors of poses and camera in dense evidence, and anchors beside edges: against NumPy loops and closed forms."""
+"""Errors of poses and camera in dense evidence, and anchors near depth edges: against NumPy loops and closed forms."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def lines(pixel, rho, views):
 
 
 def measured(pixel, rho, views, error, noise, rng):
-    """The result of a search where the poses and the camera are wrong by ``error`` [3, 10], with noise [px]."""
+    """The result of a search with the errors ``error`` [3, 10] of poses and camera, and with noise [px]."""
     along, speed = lines(pixel, rho, views)
     off = np.zeros((*speed.shape, 2))
     for n, k in np.ndindex(speed.shape):
-        given = pixel[n], rho[n], views.H[k], views.b[k]
-        off[n, k] = oracle_dense.displaced(*given, K, error[k]) - oracle_dense.project(*given)
+        geometry = pixel[n], rho[n], views.H[k], views.b[k]
+        off[n, k] = oracle_dense.displaced(*geometry, K, error[k]) - oracle_dense.project(*geometry)
     off = off + rng.normal(0, noise, off.shape)
     normal = np.stack([-along[..., 1], along[..., 0]], -1)
     value, same = rho[:, None] + (off * along).sum(-1) / speed, np.full(speed.shape, noise**2)
@@ -77,18 +77,18 @@ def test_errors_and_depths_agree_with_the_whole_system(seed):
     variance[:, 0] = 1
     across_variance[rng.random((n, 3)) < 0.3] = np.inf
     root = rng.normal(size=(22, 22))
-    given = change, value, variance, across_change, across, across_variance
+    measurements = change, value, variance, across_change, across, across_variance
     prior = root @ root.T + np.eye(22), rng.normal(size=22)
-    solution = solved(Shown(*given), *prior)
-    error, covariance, rho, spread = oracle_dense.errors_and_depths(*given, *prior)
+    solution = solved(Shown(*measurements), *prior)
+    error, covariance, rho, spread = oracle_dense.errors_and_depths(*measurements, *prior)
     np.testing.assert_allclose(solution.error, error, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(solution.covariance, covariance, rtol=1e-7, atol=1e-10)
     np.testing.assert_allclose(solution.rho, rho, rtol=1e-8, atol=1e-10)
-    assert (solution.common <= spread).all(), "the rest is by the match alone"
+    assert (solution.common <= spread).all(), "the rest comes from the match alone"
 
 
-def known(frames=1, seed=0, noise=0.05, **wrong):
-    """A filter after some frames with the same errors, its last result, and the truth."""
+def filtered(frames=1, seed=0, noise=0.05, **wrong):
+    """The filter after frames with pose and camera errors, the last measurement, its correction, and the true rho."""
     rng, errors = np.random.default_rng(seed), PoseErrors(3, 0.8)
     for i in range(frames):
         pixel, rho, views = scene([seed, i])
@@ -104,15 +104,15 @@ def known(frames=1, seed=0, noise=0.05, **wrong):
 def test_wrong_poses_are_corrected_and_what_remains_is_stated():
     better, normalised = [], []
     for seed in range(10):
-        _, found, fit, rho = known(8, seed, turned=0.002, moved=0.004)
+        _, found, fit, rho = filtered(8, seed, turned=0.002, moved=0.004)
         better.append(np.median(np.abs(fit.rho - rho)) / np.median(np.abs(found.rho - rho)))
         normalised.append(np.median(np.abs(fit.rho - rho) / np.sqrt(fit.variance)) / 0.674)
     assert np.median(better) < 0.6
-    assert 0.5 < np.median(normalised) < 2.2, "of a few frames, which must also show how wrong poses usually are"
+    assert 0.5 < np.median(normalised) < 2.2, "few frames, which also estimate the usual pose errors"
 
 
 def test_what_remains_of_wrong_poses_is_stated_beyond_first_order():
-    """The usual errors are known here, and the camera: 8 mm of some 10 cm between the nearest views."""
+    """The poses' usual errors and the camera are known here: 8 mm of some 10 cm between the nearest views."""
     sizes = []
     for seed in range(40):
         rng, errors, error = np.random.default_rng(seed), PoseErrors(3, 0.8), np.zeros((3, 10))
@@ -130,14 +130,14 @@ def test_what_remains_of_wrong_poses_is_stated_beyond_first_order():
 
 
 def test_a_wrong_camera_is_learnt():
-    errors, *_ = known(20, camera=np.array([0.004, 1.0, -0.8, 0.0]))
-    # The views' K is not corrected here: what is learnt is added up to where the prior holds it.
+    errors, *_ = filtered(20, camera=np.array([0.004, 1.0, -0.8, 0.0]))
+    # The views' K is not corrected here, so the estimates add up until the prior limits them.
     assert np.sign(errors.camera(K) - K)[[0, 0, 1], [0, 2, 2]].tolist() == [1, 1, -1]
     assert errors.camera(K)[0, 0] > 1.002 * K[0, 0]
 
 
 def test_frames_that_contradict_their_poses_teach_nothing_of_the_camera():
-    errors, found, *_ = known(3, camera=np.array([0.004, 1.0, -0.8, 0.0]))
+    errors, found, *_ = filtered(3, camera=np.array([0.004, 1.0, -0.8, 0.0]))
     pixel, _, views = scene(5)
     before = errors.camera(K)
     errors.corrected(pixel, found, SHARES, views, K, 2.0, trusted=False)
@@ -145,7 +145,7 @@ def test_frames_that_contradict_their_poses_teach_nothing_of_the_camera():
 
 
 def test_nothing_measured_leaves_what_is_believed_of_the_poses():
-    errors, found, *_ = known(3)
+    errors, found, *_ = filtered(3)
     pixel, _, views = scene(5)
     empty = Measured(*(np.full_like(x, np.nan) if x.dtype == float and x.ndim > 1 else np.zeros_like(x)
                        for x in vars(found).values()))  # fmt: skip
@@ -156,7 +156,7 @@ def test_nothing_measured_leaves_what_is_believed_of_the_poses():
 
 
 def around(rho_right, rho_here):
-    """A gray step down the middle; anchors on a grid, the one in the middle on the step."""
+    """A vertical grey edge in the middle; anchors on a grid, the middle one on the edge."""
     image = np.full((120, 120), 60, np.uint8)
     image[:, 61:] = 180
     v, u = np.mgrid[5:120:10, 5:120:10]
@@ -202,15 +202,15 @@ def test_matches_of_one_view_hold_where_the_oracle_finds_support():
         expected = oracle_dense.confirmed(pixel, rho, variance, agreed, contradicted, 10)
         np.testing.assert_array_equal(result, expected)
         seen.append([np.mean(result[agreed == 1]), np.mean(~result[(agreed == 1) & (contradicted == 0)])])
-    assert np.mean(seen, 0).min() > 0.1, "some hold and some do not"
+    assert np.mean(seen, 0).min() > 0.1, "some measurements are accepted and some are not"
 
 
 @pytest.mark.parametrize("count", [0, 1, 30])
 def test_pixels_far_from_all_others(count):
     rng = np.random.default_rng(0)
-    pixel, taken = rng.uniform(0, 100, (40, 2)), rng.uniform(0, 100, (count, 2))
-    nearest = np.linalg.norm(pixel[:, None] - taken, axis=2).min(1, initial=np.inf)
-    np.testing.assert_array_equal(farther(pixel, taken, 9.0), nearest > 9.0)
+    pixel, others = rng.uniform(0, 100, (40, 2)), rng.uniform(0, 100, (count, 2))
+    nearest = np.linalg.norm(pixel[:, None] - others, axis=2).min(1, initial=np.inf)
+    np.testing.assert_array_equal(farther(pixel, others, 9.0), nearest > 9.0)
 
 
 def test_nothing_is_confirmed_where_nothing_was_measured():

@@ -1,4 +1,4 @@
-"""Depth Anything V2 and other models of ``transformers``: tiny random ones, saved and loaded as a user's checkpoint."""
+"""Depth Anything V2 and other models of ``transformers``: tiny random checkpoints, saved and loaded."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from layouts import write_generic
 from runs import read_summary
 from safetensors.torch import load_file, save_file
 
-from scenes import look, render
+from scenes import camera_pose, render
 from ufmstar_torch import UncertainDepth, cli
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.load import NetworkChoice, sha256
@@ -32,19 +32,19 @@ K = torch.tensor([[525.0, 0, 319.5], [0, 520.0, 239.5], [0, 0, 1]], dtype=torch.
 
 @pytest.fixture(scope="module")
 def metric(tmp_path_factory):
-    """A directory with a metric checkpoint. Nobody may change it."""
+    """A directory with a metric checkpoint. Tests must not change it."""
     return write_depth_anything(tmp_path_factory.mktemp("hub") / "metric", "metric")
 
 
 @pytest.fixture(scope="module")
 def relative(tmp_path_factory):
-    """A directory with a relative checkpoint. Nobody may change it."""
+    """A directory with a relative checkpoint. Tests must not change it."""
     return write_depth_anything(tmp_path_factory.mktemp("hub") / "relative", "relative")
 
 
 @pytest.fixture(scope="module")
 def other(tmp_path_factory):
-    """A GLPN, whose configuration does not say what its depth is."""
+    """A GLPN, whose configuration does not state the kind of its depth."""
     folder = write_other(tmp_path_factory.mktemp("hub") / "glpn", "glpn", 3)
     saying = {"image_processor_type": "GLPNImageProcessor", "size_divisor": 32, "resample": 2, "do_normalize": False}
     (folder / "preprocessor_config.json").write_text(json.dumps(saying))
@@ -59,7 +59,7 @@ def broken(metric, tmp_path):
 
 def photos(number=2, size=(48, 64), seed=0):
     """Images with edges and slopes: the rendered room, in colours by depth."""
-    poses = [look((-0.5 + 0.2 * i + 0.1 * seed, -0.2, -0.9), 0.05 * i, 0.05) for i in range(number)]
+    poses = [camera_pose((-0.5 + 0.2 * i + 0.1 * seed, -0.2, -0.9), 0.05 * i, 0.05) for i in range(number)]
     camera = torch.tensor([[size[1] * 0.9, 0, size[1] / 2], [0, size[1] * 0.9, size[0] / 2], [0, 0, 1]]).numpy()
     depth = torch.stack([torch.from_numpy(render(T, camera, *size)) for T in poses])
     return torch.stack([(40 * depth) % 256, 255 / (1 + depth), (90 * depth) % 256], 1).to(torch.uint8)
@@ -119,8 +119,9 @@ def test_a_relative_checkpoint_is_no_depth_network_until_it_is_aligned(relative)
 
 @pytest.mark.parametrize("keep_aspect", [False, True])
 def test_colours_are_the_own_processor_s_to_its_rounding(metric, keep_aspect):
-    """It resamples bytes, rounding and clipping after each axis. Of 255 levels observed: .05 on average, .6 at the
-    quantile .999, 12 at corners where the cubic overshoots twice (photographs of TUM RGB-D: .28, .97, 9)."""
+    """The image processor resamples bytes, rounding and clipping after each axis. Observed differences in levels of
+    255: .05 on average, .6 at the quantile .999, 12 at corners where the cubic filter overshoots twice (TUM RGB-D: .28,
+    .97, 9)."""
     image = photos(2, (480, 640))
     ours = DepthAnything.from_pretrained(metric, keep_aspect=keep_aspect).preprocess.apply_image(image)
     theirs = own_processor(metric, image, keep_aspect_ratio=keep_aspect)
@@ -282,7 +283,7 @@ def test_weights_that_a_model_does_not_use_may_be_missing(broken):
 
 @pytest.mark.parametrize("architecture", ["depth_anything", "depth_pro", "dpt", "glpn", "zoedepth"])
 def test_depth_is_what_transformers_own_post_processing_makes_of_it(architecture, tmp_path):
-    """Depth Pro's inverse depth with its field of view, ZoeDepth's padding; the others as they are."""
+    """Depth Pro's inverse depth with its field of view, ZoeDepth's padding; the others unchanged."""
     if architecture == "depth_anything":
         folder, size = write_depth_anything(tmp_path / "model", "metric"), (70, 70)
     else:
@@ -325,7 +326,7 @@ SHIPPED = transformers.models.auto.modeling_auto.MODEL_FOR_DEPTH_ESTIMATION_MAPP
 
 @pytest.mark.parametrize("architecture", [*sorted(set(SHIPPED) - set(COMPARED)), "bert", None])
 def test_other_architectures_are_refused_by_name(broken, architecture):
-    """All that ``AutoModelForDepthEstimation`` loads and that is not compared above, and what is no depth model."""
+    """Every other architecture of ``AutoModelForDepthEstimation``, and models that do not predict depth."""
     (broken / "config.json").write_text(json.dumps({"model_type": architecture}))
     with pytest.raises(CheckpointError, match=rf"broken \({architecture}\) cannot be loaded as a depth model: covered"):
         from_hugging_face(broken, kind="metric")

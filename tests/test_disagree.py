@@ -1,4 +1,4 @@
-"""The overlap disagreement: the oracle, planes however they are cut, and whole sequences in all tiers."""
+"""The overlap disagreement: against the oracle, on planes cut in different ways, and over sequences in all tiers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def piece(centre, spans, thickness=0.0):
 
 
 def on_plane(normal, offset, position, spans):
-    """A piece of the plane normal.x = offset: its centre over ``position`` (x/z, y/z), its extent from ``spans``."""
+    """A piece of the plane normal.x = offset, with its centre at ``position`` (x/z, y/z) and the extent ``spans``."""
     ray = np.array([*position, 1.0])
     centre = ray * offset / (normal @ ray)
     flat = [np.array(s) - normal * (normal @ np.array(s)) / (normal @ normal) for s in spans]
@@ -61,7 +61,7 @@ def test_two_cuts_of_one_tilted_plane_agree(normal, first, second, spans):
     if min(areas) < 1e-3:  # a line is no plane
         return
     assert float(overlap_disagreement(*a, *b)) < 1e-12
-    # W2^2 counts the two cuts' difference; the same cut twice is equal to it.
+    # W2^2 is not 0 for two different cuts of a plane; it is 0 for the same cut.
     shift = float(((a[0] - b[0]) ** 2).sum())
     assert float(wasserstein_squared(*a, *b)) >= shift - 1e-9
 

@@ -1,4 +1,4 @@
-"""docs/anchors.md: every piece of code on the page runs, in order, and finds what it should."""
+"""docs/anchors.md: the code blocks run in order and give the stated results."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def blocks(language: str) -> list[str]:
 
 
 def seen_points(truth, K, v, u):
-    """[N, 3] what the pixels (u, v) of a depth map show, in the camera's frame."""
+    """[N, 3] points at the pixels (u, v) of a depth map, in the camera's frame."""
     z = truth[v, u]
     return np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=-1)
 
 
 def video():
-    """Images of a rendered room, and depth at half their size that is a quarter too far."""
+    """Images of a rendered room, and depth at half their size, 25 % too far."""
     from ufmstar_torch.eval.sequences.open import open_sequence
 
     for frame in open_sequence("tour:5?frames=6&size=120x160"):
@@ -44,14 +44,14 @@ def two_cameras():
     rng = np.random.default_rng(0)
     v, u = rng.permutation(np.argwhere(depths[0] > 0))[:30].T
     in_world = seen_points(depths[0], K, v, u) @ poses[0][:3, :3].T + poses[0][:3, 3]
-    T_cam_lidar = scenes.look((0.1, -0.05, 0.02), 0.1)
+    T_cam_lidar = scenes.camera_pose((0.1, -0.05, 0.02), 0.1)
     row, columns = H // 2, np.linspace(4, W - 5, 20).astype(int)
     in_camera = seen_points(depths[1], K, np.full(20, row), columns)
     in_lidar = (in_camera - T_cam_lidar[:3, 3]) @ T_cam_lidar[:3, :3]
     ranges = np.linalg.norm(in_lidar, axis=1)
     beams = in_lidar / ranges[:, None]
     ranges[[3, 7]] = np.nan
-    given = {
+    arrays = {
         "depth": TOO_FAR * np.stack(depths),
         "pose": np.stack(poses),
         "K_map": K,
@@ -62,20 +62,20 @@ def two_cameras():
         "ranges": ranges,
     }
     expected = [(u, v, depths[0][v, u]), (columns, np.full(20, row), depths[1][row, columns])]
-    return {name: torch.from_numpy(value) for name, value in given.items()}, expected
+    return {name: torch.from_numpy(value) for name, value in arrays.items()}, expected
 
 
 def test_every_piece_of_code_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    tracked, own, again = blocks("python")
+    track, two_sources, next_start = blocks("python")
     scope = {"video": list(video())}
-    exec(compile(tracked, PAGE.name, "exec"), scope)
+    exec(compile(track, PAGE.name, "exec"), scope)
     assert scope["out"].statistics.anchors_used.item() > 0
     assert float(scope["out"].anchored.nan_to_num(0).max()) > 0
 
-    given, expected = two_cameras()
-    scope = dict(given)
-    exec(compile(own, PAGE.name, "exec"), scope)
+    inputs, expected = two_cameras()
+    scope = dict(inputs)
+    exec(compile(two_sources, PAGE.name, "exec"), scope)
     actual = scope["anchors"]
     assert actual.valid.sum(1).tolist() == [30, 18]
     for stream, (u, v, z) in enumerate(expected):
@@ -85,12 +85,12 @@ def test_every_piece_of_code_runs(tmp_path, monkeypatch, capsys):
         np.testing.assert_allclose(actual.depth[stream, : len(z)].numpy()[use], z[use], rtol=1e-9)
     out = scope["out"]
     assert "[30, 18]" in capsys.readouterr().out
-    # Both streams learn of r = 1/1.25 - 1 = -.2, less what shrinkage leaves of few anchors.
+    # Both streams estimate r = 1/1.25 - 1 = -.2, reduced by the shrinkage for few anchors.
     for stream in (0, 1):
         assert -0.21 < float(out.bias[stream].nanmean()) < -0.13
 
-    exec(compile(again, PAGE.name, "exec"), scope)
-    first = scope["ufm"](given["depth"], given["pose"], given["K_map"])
+    exec(compile(next_start, PAGE.name, "exec"), scope)
+    first = scope["ufm"](inputs["depth"], inputs["pose"], inputs["K_map"])
     assert float(first.bias.nanmean()) == pytest.approx(float(out.bias.nanmean()), rel=0.2)
     assert first.statistics.unmeasured.tolist() == first.statistics.valid_pixels.tolist(), "a first view"
 

@@ -1,4 +1,4 @@
-"""The scripts behind docs/results: closed forms of what they measure, and one run on a tiny tour."""
+"""The scripts of docs/results: closed forms of their figures, and runs on a tiny tour."""
 
 from __future__ import annotations
 
@@ -30,42 +30,42 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def resting(script: Any, error: np.ndarray) -> Any:
-    """A clip of a camera at rest before a wall 2 m away, whose frames are wrong by ``error`` [N] m."""
+    """A clip of a resting camera before a wall 2 m away; frame n's depth has the error ``error[n]`` [m]."""
     truth = np.full((len(error), 48, 64), 2.0, np.float32)
     depth = (truth + error[:, None, None]).astype(np.float32)
     return script("clips").Clip("wall", depth, None, truth, np.tile(np.eye(4), (len(error), 1, 1)), K)
 
 
 def test_controls_keep_what_they_say(script: Any) -> None:
-    """A scaled variance has the wanted mean, a shuffled one the same values frame by frame, at other pixels."""
+    """The scaled variance has the target mean; the shuffled one permutes the values within each frame."""
     disagreement, rng = script("measure_disagreement"), np.random.default_rng(0)
     variance = rng.uniform(0.1, 1, (3, 8, 9)).astype(np.float32)
-    known = rng.random((3, 8, 9)) < 0.7
-    scaled = disagreement.scaled_to(2.5, variance, known)
-    assert scaled[known].mean() == pytest.approx(2.5, rel=1e-6)
-    mixed = disagreement.shuffled(variance, known)
+    has_truth = rng.random((3, 8, 9)) < 0.7
+    scaled = disagreement.scaled_to(2.5, variance, has_truth)
+    assert scaled[has_truth].mean() == pytest.approx(2.5, rel=1e-6)
+    mixed = disagreement.shuffled(variance, has_truth)
     for i in range(3):
-        np.testing.assert_array_equal(np.sort(mixed[i][known[i]]), np.sort(variance[i][known[i]]))
-        np.testing.assert_array_equal(mixed[i][~known[i]], variance[i][~known[i]])
-    assert (mixed[known] != variance[known]).mean() > 0.5
+        np.testing.assert_array_equal(np.sort(mixed[i][has_truth[i]]), np.sort(variance[i][has_truth[i]]))
+        np.testing.assert_array_equal(mixed[i][~has_truth[i]], variance[i][~has_truth[i]])
+    assert (mixed[has_truth] != variance[has_truth]).mean() > 0.5
 
 
 def test_places_divide_the_pixels(script: Any) -> None:
-    """Thirds of depth, and border, edges and the rest, are each all pixels with ground truth."""
+    """The thirds of depth, and border, edges and the rest, each cover all pixels with ground truth."""
     clip = resting(script, np.linspace(0, 1, 5))
     clip.depth[:, 20:30, 20:40] *= 2
     places = script("measure_disagreement").places(clip)
     count = {name: int(mask.sum()) for name, mask in places.items()}
     assert sum(count[f"{name} third"] for name in ("nearest", "middle", "farthest")) == count["all"]
     assert count["border (16 px)"] + count["depth edges"] + count["the rest"] == count["all"]
-    # The step's outline inside the border: the row and column where the block begins, and those after its end.
+    # The outline of the block inside the border: its first row and column, and those after its last.
     inside = np.zeros((48, 64), dtype=bool)
     inside[20, 20:40] = inside[30, 20:40] = inside[20:30, 20] = inside[20:30, 40] = True
     assert count["depth edges"] == 5 * int(inside.sum())
 
 
 def test_the_tables_of_a_tour(script: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """Every table of a tour of six frames, from its beginning to its end."""
+    """Every table of a tour of six frames."""
     clip, ensemble = script("clips").clips(argparse.Namespace(root=None, tours="200:201", frames=6, fov=None))
     assert clip.aleatoric is None
     assert ensemble.aleatoric is not None
@@ -78,7 +78,7 @@ def test_the_tables_of_a_tour(script: Any, capsys: pytest.CaptureFixture[str]) -
 
 @pytest.mark.slow
 def test_a_constant_of_the_posterior_variance_leaves_the_depth(script: Any) -> None:
-    """A tiny tour and the network that is made of the truth: the depth stays, the variance follows the constant."""
+    """With a network of corrupted truth, the constant changes the variance and not the depth."""
     posterior = script("measure_posterior")
     prepared = posterior.prepare("tour:1?frames=6&size=96x128", True)
     for kind in (posterior.DENSE, posterior.NEAR):
@@ -91,7 +91,7 @@ def test_a_constant_of_the_posterior_variance_leaves_the_depth(script: Any) -> N
 
 @pytest.mark.slow
 def test_the_table_of_confidences(script: Any, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
-    """A tiny tour: every unit and source has a row, and what is not used yet changes nothing."""
+    """Every unit and source has a row, and an unused confidence changes nothing."""
     words = ["measure_confidence.py", "--tours", "1?style=home", "--frames", "2"]
     monkeypatch.setattr("sys.argv", words)
     script("measure_confidence").main()
@@ -103,7 +103,7 @@ def test_the_table_of_confidences(script: Any, capsys: pytest.CaptureFixture[str
 
 
 def test_distances_of_clouds(script: Any, tmp_path: Path) -> None:
-    """A plane 3 cm before the truth's, as exported clouds are written; a tenth of its points is 50 cm off."""
+    """An exported plane 3 cm before the true one; a tenth of its points are 50 cm off."""
     from ufmstar_torch.eval.run.gaussians import vertex_table, write_ply
 
     plane = np.stack([*np.meshgrid(np.arange(20) / 100, np.arange(20) / 100), np.ones((20, 20))], -1).reshape(-1, 3)

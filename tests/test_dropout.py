@@ -1,4 +1,4 @@
-"""MC-Dropout: closed forms for a linear decoder, and only the decoder samples."""
+"""MC-Dropout: closed forms for a linear decoder; only the decoder is stochastic."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def closed_form(backbone: Linear, image: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def test_moments_of_a_linear_decoder() -> None:
-    """The multi-inference baseline against its limit. Tolerances are 5 standard errors: of the mean
+    """The moments over many passes against their limits. Tolerances are 5 standard errors: of the mean
     sqrt(V / T), of the variance V sqrt(2.25 / T), since a sum of two Bernoullis has a kurtosis below 3.25."""
     backbone, count = Linear(dropout=P), 4000
     image = 1 + torch.rand(2, 3, 4, 6, generator=seeded(1))
@@ -69,8 +69,8 @@ def test_moments_of_a_linear_decoder() -> None:
 
 
 def test_one_batch_draws_independently() -> None:
-    """Passes that run as one batch share no mask: neither with each other nor between images. Within an image a channel
-    has one: no pixel differs from its neighbour by a draw of its own."""
+    """Passes in one batch share no mask, nor do images. Within an image the mask is per channel, so neighbouring pixels
+    do not differ."""
     backbone, count = Linear(dropout=P), 4000
     network = MonteCarloDropout(with_head(backbone, "depth"), generator=seeded(3)).eval()
     with torch.no_grad():
@@ -95,14 +95,14 @@ def test_aleatoric_variance_is_averaged_and_evidence_added() -> None:
         depth = torch.stack([p.depth for p in single])
         aleatoric = torch.stack([p.aleatoric_variance for p in single if p.aleatoric_variance is not None])
         between = depth.var(0, correction=0)
-        own = torch.stack(
+        epistemic = torch.stack(
             [torch.zeros_like(p.depth) if p.epistemic_variance is None else p.epistemic_variance for p in single]
         )
         assert float(between.min()) >= 0
         assert float(between.max()) > 0
         torch.testing.assert_close(together.depth, depth.mean(0))
         torch.testing.assert_close(together.aleatoric_variance, aleatoric.mean(0))
-        torch.testing.assert_close(together.epistemic_variance, between + own.mean(0))
+        torch.testing.assert_close(together.epistemic_variance, between + epistemic.mean(0))
 
 
 def backbones() -> list[Backbone]:
@@ -112,7 +112,7 @@ def backbones() -> list[Backbone]:
 
 
 def test_the_encoder_does_not_sample() -> None:
-    """Two passes: the encoder's output is the same to the bit, the depth is not; no statistic moves."""
+    """In two passes the encoder's output is equal bit for bit, the depth differs, and no statistic changes."""
     for backbone in backbones():
         seen: list[Tensor] = []
         last = [m for m in backbone.encoder.modules() if isinstance(m, nn.BatchNorm2d)][-1]

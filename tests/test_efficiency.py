@@ -1,4 +1,4 @@
-"""Costs of uncertainty: times and energies of networks whose cost is known, rows that do not disturb each other."""
+"""Costs of uncertainty: times and energies of networks with known costs, independent rows."""
 
 from __future__ import annotations
 
@@ -73,15 +73,15 @@ def test_stages_add_up_and_warm_up_is_not_counted(timed):
     sums = np.sum([times[timed.warm_up :] for times in staged.stages.values()], axis=0)
     assert staged.summary(warm_up=timed.warm_up)["stages_total"]["median_ms"] == pytest.approx(np.median(sums))
     for owner, part in (("ensemble", DEPTH), ("ensemble", ONCE), ("ensemble", EVERY), ("UfM-Ensemble", MULTIVIEW)):
-        assert len(timed.ms(owner, part)) == 6, "less the warm-up"
-    assert timed.ms("aleatoric", EVERY) == []  # nobody asked for it
+        assert len(timed.ms(owner, part)) == 6, "without the warm-up"
+    assert timed.ms("aleatoric", EVERY) == []  # energy is not requested
 
 
 LOG: list[float] = []
 
 
 class Slow(Linear):
-    """Every inference takes 4 ms, and is written down."""
+    """Every inference takes 4 ms, and is recorded."""
 
     def features(self, image):
         LOG.append(self.offset)
@@ -96,7 +96,7 @@ def test_further_members_cost_what_they_take_and_parts_take_turns(sequence):
     timed = parts_of(rows_of("Ensemble", "UfM-Ensemble"), one, list(sequence)[:4], warm_up=0)
     assert min(timed.ms("ensemble", DEPTH)) >= 4
     assert min(timed.ms("ensemble", EVERY)) >= 12
-    # Depth, the member whose turn it is, all of them; and the reverse for odd frames.
+    # Depth, the current member, all members; in reverse order for odd frames.
     every, expected = [0.2, 1.2, 2.2], []
     for n in range(4):
         turn = [0.2, every[n % 3], *every] if n % 2 == 0 else [*every, every[n % 3], 0.2]

@@ -1,4 +1,4 @@
-"""Memory of networks and of what is kept between images, against closed forms and the paper's own figures."""
+"""Memory of networks and of the state between images, against closed forms and the paper's figures."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from ufmstar_torch.prediction import DepthPrediction
 
 
 def step_memory(name, size, K):
-    """The bytes that the table counts for the multiview step of a row after one frame."""
+    """The bytes in the table for the multiview step of a row after one frame."""
     step = MultiviewStep(Row(Method.parse(name)), torch.device("cpu"))
     depth, variance, K = torch.full((1, *size), 2.0), torch.full((1, *size), 0.01), torch.tensor([K]).double()
     prediction = DepthPrediction(depth, aleatoric_variance=variance, intrinsics=K)
@@ -72,7 +72,7 @@ def test_a_batch_ensemble_adds_its_factors_and_the_head():
     factors = sum(factor.nbytes for factor in ensemble.factors())
     biases = sum(layer.bias.nbytes for layer in converted_layers(ensemble.network) if layer.bias is not None)
     plain = fast_depth("aleatoric")
-    head = plain.head.weight.nbytes  # its bias is among the members' biases
+    head = plain.head.weight.nbytes  # its bias is one of the members' biases
     memory = one.memory()
     assert memory["depth"] == weight_bytes(plain.backbone)
     assert memory["uncertainty"] == factors + biases + head

@@ -1,4 +1,4 @@
-"""Energy: windows of a monitor with known joules, and the reasons where zeus finds no meter."""
+"""Energy: windows of a monitor with known joules, and the reasons if zeus has no meter."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from ufmstar_torch.eval.bench.energy import CPU, GPU, NO_GPU, NO_ZEUS, EnergyMet
 
 
 class Monitor:
-    """zeus's monitor of a machine on which work takes time and joules that are known."""
+    """Stand-in for zeus's monitor, with known time and energy per work."""
 
     def __init__(self, **units):
-        self.units = units  # what a window reports, by the name of zeus's field: a function of joules
+        self.units = units  # by zeus's field name: the value that a window reports, a function of joules
         self.now = self.joules = 0.0
 
     def run(self, seconds, joules):
@@ -28,13 +28,13 @@ class Monitor:
 
     def end_window(self, name):
         seconds, joules = self.now - self.began[0], self.joules - self.began[1]
-        own = {"gpu_energy": {}, "cpu_energy": None, "soc_energy": None}
-        return SimpleNamespace(time=seconds, **(own | {key: of(joules) for key, of in self.units.items()}))
+        empty = {"gpu_energy": {}, "cpu_energy": None, "soc_energy": None}
+        return SimpleNamespace(time=seconds, **(empty | {key: of(joules) for key, of in self.units.items()}))
 
 
 @pytest.fixture
 def monitor(monkeypatch):
-    """Two processor packages with a quarter and three quarters of the energy, and a GPU with twice as much."""
+    """Two CPU packages with a quarter and three quarters of the energy, and a GPU with twice the energy."""
     one = Monitor(cpu_energy=lambda j: {0: j / 4, 1: 3 * j / 4}, gpu_energy=lambda j: {0: 2 * j})
     monkeypatch.setattr(time, "perf_counter", lambda: one.now)
     monkeypatch.setattr(time, "sleep", lambda seconds: one.run(seconds, 1.0))
@@ -54,7 +54,7 @@ def test_energy_per_frame(monitor):
     added = difference(measured["once"], measured["depth"])
     expected = {"millijoules": 200.0, "q1": 200.0, "q3": 200.0, "seconds": 0.01}
     assert summary(added) == {"gross": pytest.approx(expected), "windows": 2}
-    # Two calls reach a window's length, one of the longer part; the second turn runs in the reverse order.
+    # A window needs two calls, or one of the slower part; the second round runs in reverse order.
     assert log == ["depth"] * 2 + ["once"] + ["depth"] * 4 + ["once"] + ["depth"] * 2
 
 

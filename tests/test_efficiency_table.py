@@ -1,4 +1,4 @@
-"""The table of what uncertainty costs: the paper's own lines, and words where nothing was measured."""
+"""The table of the cost of uncertainty: the paper's lines, and text where nothing was measured."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def part(ms, millijoules=None, low=None):
 
 
 def line(depth=(27.0, 206.3), dnn=(252.0, 1857.0), mvd=None, memory=None, overhead=90.0):
-    """A measurement with one row of given medians [ms, mJ]."""
+    """A measurement with one row with these medians [ms, mJ]."""
     parts = {"depth": part(*depth), "network_uncertainty": part(*dnn)} | ({"multiview": part(*mvd)} if mvd else {})
     sizes = {"depth_bytes": 138.3e6, "network_uncertainty_bytes": 1245e6, "mvd": 0} | (memory or {})
     state = sizes.pop("mvd")

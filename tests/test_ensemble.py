@@ -1,4 +1,4 @@
-"""Members of an ensemble that are loaded when needed and kept off the device (their mixture: test_pipeline.py)."""
+"""Ensemble members that are loaded on demand and stored off the device (their mixture: test_pipeline.py)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ POSE, K = torch.eye(4), torch.tensor([[8.0, 0, 4.5], [0, 8, 3.5], [0, 0, 1]])
 
 
 class Gain(DepthNetwork):
-    """Depth and variance proportional to brightness; remembers on which device its weights were when called."""
+    """Depth and variance proportional to brightness; records the device of its weights at each call."""
 
     def __init__(self, gain):
         super().__init__()
@@ -87,7 +87,7 @@ def test_an_offloaded_member_keeps_nothing_on_the_device():
     for turn in range(3):
         out = networks[turn % 2](image().to("meta"))
         assert out.depth.device.type == "meta"
-        # On the device in their turn, and on the host again after it, the very same tensors.
+        # Each member is on the device during its turn only, and returns to the host as the same tensors.
         assert networks[turn % 2].network().seen[-1][:2] == ("meta", "meta")
         held = [m.network() for m in members if m.loaded]
         tensors = [t for n in held for t in (*n.parameters(), *n.buffers())]
@@ -137,5 +137,5 @@ def test_a_member_that_cannot_be_loaded_is_named(error):
     pipeline(image(1), POSE, K)
     with pytest.raises(CheckpointError, match=rf"weights/b.safetensors, member 1 cannot be loaded: {error}"):
         pipeline(image(1), POSE, K)
-    fail.clear()  # the alternation has not advanced, and the next attempt loads it
+    fail.clear()  # the member index has not advanced, and the next call loads the member
     assert pipeline(image(1), POSE, K).member == 1

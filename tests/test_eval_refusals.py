@@ -1,4 +1,4 @@
-"""Calls and commands that the evaluation refuses, and the argument that the message names."""
+"""Invalid calls and commands of the evaluation: the message names the argument."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
         for name in ("rotation_drift", "translation_drift")
         for value in (-1.0, INF, NAN)
     ],
-    (lambda: measure([row("UfM*-DepthOnly", rotation_drift=0.1)], {"depth_only": object()}, None), "no matter of"),
+    (lambda: measure([row("UfM*-DepthOnly", rotation_drift=0.1)], {"depth_only": object()}, None), "do not affect"),
     (lambda: UfM(0), "max_points must be None or at least 1"),
     # suites
     (lambda: Suite("x", "", rows_of("Ensemble") * 2), "has a row twice: Ensemble"),

@@ -1,4 +1,4 @@
-"""``ufmstar export``: other programs read what the run wrote, and pixels beyond the limits are left out."""
+"""``ufmstar export``: other programs can read its files, and pixels beyond the limits are left out."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["stand_in"]
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A run with perfect depth, whose variance is then set to (2 % of the depth)^2, and above the horizon to 1 m^2."""
+    """A run with exact depth; its variance is replaced by (2 % of the depth)^2, and above the horizon by 1 m^2."""
     path, truth = layouts.write_generic(tmp_path_factory.mktemp("data"))
     out = tmp_path_factory.mktemp("run") / "out"
     run(own_depth_job(path), out)
@@ -53,9 +53,9 @@ def test_depth_is_gated(finished):
     assert (depth[:20] == 0).all()
     np.testing.assert_array_equal(sigma > 0, depth > 0)
     np.testing.assert_allclose(sigma, 0.02 * depth, atol=1e-4)
-    kept = 0.02 * truth.depths[2][20:] <= 0.0499
-    assert 0 < kept.sum() < kept.size
-    np.testing.assert_allclose(depth[20:][kept], truth.depths[2][20:][kept], atol=1e-3)
+    certain = 0.02 * truth.depths[2][20:] <= 0.0499
+    assert 0 < certain.sum() < certain.size
+    np.testing.assert_allclose(depth[20:][certain], truth.depths[2][20:][certain], atol=1e-3)
     assert (depth[20:][0.02 * truth.depths[2][20:] > 0.0501] == 0).all()
     assert cli.main(["export", str(out), "--to", "depth", "--max-relative-sigma", "0.01"]) == 0
     assert (read_depth(out / "export" / "depth" / "9.png") == 0).all()
@@ -77,7 +77,7 @@ def test_the_cloud_lies_on_the_surfaces(finished):
     points = np.stack([cloud[name] for name in "xyz"], -1).astype(float)
     assert 500 < len(points) < 6 * 28 * 64
     assert len(np.unique(np.floor(points / 0.05 + 1e-4), axis=0)) > 0.98 * len(points), "one point a voxel"
-    # each point, seen from the frame in the middle, is no nearer than its surface, up to a voxel
+    # in the middle frame, no point is nearer than the surface, up to a voxel
     T = np.linalg.inv(truth.T_world_cam[3])
     x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
     u, v = (truth.K @ np.stack([x, y, z]))[:2] / z
@@ -89,7 +89,7 @@ def test_the_cloud_lies_on_the_surfaces(finished):
     np.testing.assert_allclose(cloud["sigma"][inside][near], 0.02 * z[inside][near], rtol=0.3)
     colours = np.stack([cloud[name] for name in ("red", "green", "blue")], -1)[inside][near].astype(int)
     image = truth.images[3][np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)][near]
-    assert np.median(np.abs(colours - image)) < 12  # the paint darkens with the distance from each camera
+    assert np.median(np.abs(colours - image)) < 12  # the colour darkens with the distance from each camera
 
 
 def test_merging_weighs_by_the_inverse_variance(tmp_path):
@@ -191,7 +191,7 @@ def test_a_bag_that_cannot_be_written_leaves_the_one_before(finished, tmp_path):
 
 
 def test_a_rerun_recording(finished):
-    """Its own program reads it: every entity of a frame is there six times, the Gaussians and the blueprint once."""
+    """rerun's reader opens it: every entity of a frame exists six times, the Gaussians and the blueprint once."""
     pytest.importorskip("rerun")
     out, _, _ = finished
     assert cli.main(["export", str(out), "--to", "rrd", "--max-sigma", "0.9"]) == 0
@@ -211,8 +211,8 @@ def printed(file):
 
 
 def test_anchors_have_a_line_to_the_depth_of_their_pixel(stand_in, tmp_path):
-    """The run keeps the anchors of every frame; in the world of a recording, a line is as long as depth and anchor
-    differ."""
+    """The run stores the anchors of every frame. In the recording, each line's length is the difference of depth and
+    anchor."""
     path, out = "tour:1?frames=8&size=96x128", tmp_path / "out"
     assert cli.main(["run", path, "--depth", "self", "--anchors", "--no-video", "--no-sheet", "--out", str(out)]) == 0
     assert cli.main(["export", str(out), "--to", "rrd"]) == 0

@@ -1,4 +1,4 @@
-"""FastDepth: the paper's sizes, agreement with ONNX Runtime, what the import refuses, fine-tuning."""
+"""FastDepth: the paper's sizes, agreement with ONNX Runtime, refused files, fine-tuning."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def tum_frames(step: int) -> list[tuple[Tensor, Tensor]]:
     ids=["full", "pruned"],
 )
 def test_weights_and_operations_are_the_papers(widths: FastDepthWidths, weights: float, macs: float) -> None:
-    """Wofk et al. state 3.93 M weights and 0.74 G multiply-adds, pruned 1.34 M and 0.37 G, at 224 x 224."""
+    """Wofk et al. state 3.93 M weights and 0.74 G multiply-adds at 224 x 224; pruned, 1.34 M and 0.37 G."""
     network = FastDepth(widths).eval()
     counted = {"weights": 0, "macs": 0}
 
@@ -72,13 +72,14 @@ def test_published_weights_agree_with_onnx_runtime(network: FastDepth) -> None:
     with torch.inference_mode():
         depth = network(image).depth
     expected = run_onnx(require_shared(WEIGHTS), image)[:, 0]
-    assert float(depth.std()) > 0.1  # not a constant that agrees by itself
+    assert float(depth.std()) > 0.1  # not a constant, which would agree trivially
     torch.testing.assert_close(depth, expected, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("folded", [False, True])
 def test_import_of_other_widths_and_folded_norms(tmp_path: Path, folded: bool) -> None:
-    """A graph of a newer opset, any widths, batch norms kept or folded, comes back as the same function."""
+    """A graph with a newer opset, other channel counts, and separate or folded batch norms imports as the same
+    function."""
     source = small_network()
     source = source.folded() if folded else source
     path = write_fastdepth(tmp_path / "small.onnx", source)
@@ -86,7 +87,7 @@ def test_import_of_other_widths_and_folded_norms(tmp_path: Path, folded: bool) -
     assert loaded.widths == source.widths
     assert not loaded.training
     assert any(isinstance(m, nn.BatchNorm2d) for m in loaded.modules()) is not folded
-    for key, value in loaded.state_dict().items():  # the graph has no counters, which start again
+    for key, value in loaded.state_dict().items():  # the graph has no counters; they start at 0
         assert torch.equal(value, source.state_dict()[key] * (not key.endswith("num_batches_tracked"))), key
     image = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(1))
     with torch.inference_mode():
@@ -117,9 +118,9 @@ def node(model: onnx.ModelProto, kind: str, index: int) -> onnx.NodeProto:
 
 
 def drop_weights(model: onnx.ModelProto, names: list[str]) -> None:
-    kept = [t for t in model.graph.initializer if t.name not in names]
+    remaining = [t for t in model.graph.initializer if t.name not in names]
     del model.graph.initializer[:]
-    model.graph.initializer.extend(kept)
+    model.graph.initializer.extend(remaining)
 
 
 def other_stride(model: onnx.ModelProto) -> None:
@@ -194,7 +195,7 @@ def test_width_multiplier(multiplier: float, stem: int, last: int) -> None:
 @pytest.mark.parametrize("norm", [True, False])
 @pytest.mark.parametrize("positive", ["relu", "softplus"])
 def test_fastdepth_starts_in_a_room(positive: str, norm: bool) -> None:
-    """Untrained, every pixel has a depth of a few metres and thus a gradient, with either activation."""
+    """Without training, every pixel's depth is a few metres, so its gradient is not 0, with either activation."""
     torch.manual_seed(0)
     network = FastDepth(FastDepthWidths.scaled(0.25), positive=positive, norm=norm, size=(64, 96)).train()
     assert network.preprocess.size == (64, 96)

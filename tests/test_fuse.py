@@ -1,4 +1,4 @@
-"""Fusion of every backend against the oracle, its conservation laws, and the floor of covariances."""
+"""Fusion of every backend: against the oracle, conservation laws, and the covariance floor."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ pytestmark = pytest.mark.numerics
 @pytest.mark.parametrize("weighted", [False, True], ids=["w2", "weighted and given"])
 @given(seed=st.integers(0, 10**6))
 def test_agrees_with_the_oracle(backend, weighted, seed):
-    """Several c on one k are fused in increasing c. ``weighted``: by overlap, with distances in place of W2^2."""
+    """Several c that match one k are fused in increasing c. ``weighted``: by overlap, with distances instead of
+    W2^2."""
     previous, current = mixture(2, 6, seed, features=2), mixture(2, 5, seed + 50, empty=1, features=2)
     pairs = random_pairs(2, previous, current, seed)
     if weighted:
@@ -91,7 +92,7 @@ def test_the_floor_lifts_eigenvalues_below_it_and_nothing_else(backend):
     floor = torch.linspace(1e-8, 1e-2, 20, dtype=torch.float64).expand(3, 20)
     before, after = (torch.linalg.eigvalsh(value) for value in (cov, floored(cov, floor)))
     torch.testing.assert_close(after, before.maximum(floor[..., None]), rtol=0, atol=1e-15)
-    for share in (0.5, 1 - 1e-6, 1 + 1e-6, 2.0):  # unchanged to the last bit below the least eigenvalue, and only there
+    for share in (0.5, 1 - 1e-6, 1 + 1e-6, 2.0):  # smaller floors leave the covariance unchanged bit for bit
         lifted = floored(cov, share * before[..., 0])
         assert (lifted == cov).all(-1).all(-1).eq(share < 1).all()
     lifted = floored(torch.zeros(1, 3, 3, dtype=torch.float64), torch.tensor([1e-6], dtype=torch.float64))
@@ -99,7 +100,7 @@ def test_the_floor_lifts_eigenvalues_below_it_and_nothing_else(backend):
 
 
 def test_thin_wide_plates_survive_many_fusions_in_float32(backend):
-    """A tilted plate 3000 times wider than thick stays above what float32 rounds off of its trace."""
+    """A tilted plate, 3000 times wider than thick, keeps a thickness above float32's rounding of its trace."""
     one = torch.ones(1, 1, dtype=torch.float64)
     tilt = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.5, 0.3], [0.5, 0.0, -0.8], [-0.3, 0.8, 0.0]]).double())
     cov = tilt @ torch.diag(torch.tensor([1.0, 1.0, 1e-7], dtype=torch.float64)) @ tilt.T

@@ -1,6 +1,6 @@
-"""Tests that need a CUDA device: no synchronisation, many streams, flat memory, the graph. ``pytest -m gpu``.
+"""Tests that need a CUDA device: no synchronisation, many streams, constant memory, CUDA graphs. ``pytest -m gpu``.
 
-The kernels themselves are in the tests of ``conftest.backend``, which run on the device as well.
+The tests with the fixture ``backend`` test the kernels, also on the device.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FIXED = {"on_bad_frame": "skip", "initial_capacity": 256, "max_components": 256}
 
 
 def frames(streams: int, count: int):
-    """Depth, pose and intrinsics on the device, the first ones of a walk and back again."""
+    """Depth, pose and intrinsics on the device, for the first frames of a walk and back again."""
     present = [tuple(v.cuda() for v in frame[:3]) for frame in walks(streams, 8)]
     present += present[::-1]
     return [present[i % len(present)] for i in range(count)]
@@ -37,15 +37,15 @@ def frames(streams: int, count: int):
 @pytest.mark.parametrize("growing", [False, True])
 def test_a_thousand_frames_with_flat_memory_and_no_synchronisation_but_of_the_warnings(growing):
     settings = {"on_bad_frame": "skip", "initial_capacity": 8} if growing else FIXED
-    ufm, given = UfMStar(UfMStarConfig(segment=SPGF, **settings)), frames(2, 16)
-    for frame in given:
+    ufm, inputs = UfMStar(UfMStarConfig(segment=SPGF, **settings)), frames(2, 16)
+    for frame in inputs:
         ufm(*frame)
     torch.cuda.synchronize()
     before = torch.cuda.memory_allocated()
     try:
         for i in range(16, 1016):
             torch.cuda.set_sync_debug_mode("default" if (i + 1) % EVERY == 0 else "error")
-            ufm(*given[i % 16])
+            ufm(*inputs[i % 16])
     finally:
         torch.cuda.set_sync_debug_mode("default")
     torch.cuda.synchronize()
@@ -54,9 +54,9 @@ def test_a_thousand_frames_with_flat_memory_and_no_synchronisation_but_of_the_wa
 
 
 def test_256_streams_equal_themselves_alone_and_leave_each_other_alone():
-    ufm, given = UfMStar(UfMStarConfig(segment=SPGF)), [f[:3] for f in walks(4, 6)]
+    ufm, inputs = UfMStar(UfMStarConfig(segment=SPGF)), [f[:3] for f in walks(4, 6)]
     alone, broken = UfMStar(UfMStarConfig(segment=SPGF)), UfMStar(UfMStarConfig(segment=SPGF))
-    for depth, pose, K in given:
+    for depth, pose, K in inputs:
         many = [v.repeat(64, *[1] * (v.dim() - 1)).cuda() for v in (depth, pose, K)]
         other = many[0].clone()
         other[1] = torch.nan
@@ -70,12 +70,12 @@ def test_256_streams_equal_themselves_alone_and_leave_each_other_alone():
 
 
 def test_the_graph_equals_the_step():
-    ufm, given = UfMStar(UfMStarConfig(segment=SPGF, **FIXED)), frames(2, 12)
-    for _ in range(EVERY - 1):  # the capture is the frame in which the warnings look
-        ufm(*given[0])
+    ufm, inputs = UfMStar(UfMStarConfig(segment=SPGF, **FIXED)), frames(2, 12)
+    for _ in range(EVERY - 1):  # the capture runs in the frame that checks for warnings
+        ufm(*inputs[0])
     plain = copy.deepcopy(ufm)
-    captured = Captured(ufm, *given[0])
-    for i, frame in enumerate(given):
+    captured = Captured(ufm, *inputs[0])
+    for i, frame in enumerate(inputs):
         if i == 8:
             ufm.reset([1])
             plain.reset([1])
@@ -91,14 +91,14 @@ def test_large_images(size):
     depths, poses, K = scenes.sequence(3, *size, 0.03)
     gpu, cpu = UfMStar(), UfMStar()
     for depth, pose in zip(depths, poses, strict=True):
-        given = torch.tensor(depth)[None].float(), torch.tensor(pose), torch.tensor(K)
-        a, b = gpu(*(v.cuda() for v in given)), cpu(*given)
+        inputs = torch.tensor(depth)[None].float(), torch.tensor(pose), torch.tensor(K)
+        a, b = gpu(*(v.cuda() for v in inputs)), cpu(*inputs)
         torch.testing.assert_close(a.variance.cpu(), b.variance, rtol=1e-3, atol=1e-6, equal_nan=True)
     assert a.variance.shape == (1, *size)
 
 
 def test_the_posterior_equals_the_cpu_s():
-    """It runs on the host; the evidence of anchors, which it needs, does not."""
+    """The posterior runs on the host; its input, the evidence of anchors, is computed on the device."""
     config = UfMStarConfig(segment=SPGF, anchors=AnchorConfig(), posterior=PosteriorConfig())
     gpu, cpu = UfMStar(config), UfMStar(config)
     generator = torch.Generator().manual_seed(0)
@@ -122,10 +122,10 @@ def test_networks_on_the_gpu_and_ufmstar_on_the_cpu():
 
     members = [Scaled(1.0), Scaled(1.1)]
     split = UncertainDepth(members, CONFIG, multiview_device="cpu").cuda()
-    given = [(image(i).cuda(), POSES[i], K) for i in range(5)]
-    outputs = list(split.stream(given))
+    inputs = [(image(i).cuda(), POSES[i], K) for i in range(5)]
+    outputs = list(split.stream(inputs))
     plain = UncertainDepth(members, CONFIG).cpu()
-    for out, frame in zip(outputs, given, strict=True):
+    for out, frame in zip(outputs, inputs, strict=True):
         expected = plain(*(v.cpu() for v in frame))
         assert out.variance.device.type == "cpu"
         torch.testing.assert_close(out.variance, expected.variance, rtol=1e-5, atol=1e-8, equal_nan=True)

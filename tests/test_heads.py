@@ -1,4 +1,4 @@
-"""Uncertainty heads and their distributions: closed forms, extreme inputs in every precision, depth untouched."""
+"""Uncertainty heads and their distributions: closed forms, extreme inputs in every precision, unchanged depth."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_soft_range_is_monotone_and_bounded(x: float, more: float) -> None:
 
 @pytest.mark.parametrize("x", [-60.0, -20.0, 0.0, 20.0, 60.0])
 def test_soft_range_keeps_a_gradient(x: float) -> None:
-    """A clamp's is 0 outside; this one's falls as e^-distance."""
+    """A clamp's gradient is 0 outside of the range; the soft range's falls as e^-distance."""
     value = torch.tensor(x, requires_grad=True)
     soft_range(value, LOW, HIGH).backward()
     assert value.grad is not None
@@ -65,7 +65,8 @@ def test_soft_range_keeps_a_gradient(x: float) -> None:
 @pytest.mark.parametrize("raw", [-1e4, -100.0, 0.0, 100.0, 1e4])
 @pytest.mark.parametrize("method", ["aleatoric", "evidential"])
 def test_extremes_stay_finite(method: str, raw: float, dtype: torch.dtype) -> None:
-    """Variances positive and finite, gradients finite, computed in single precision whatever the network's."""
+    """Variances are positive and finite, gradients finite, computed in single precision for networks of any
+    precision."""
     network = with_head(Linear(), method).to(dtype)
     head = network.head
     constant_head(head, (raw,) * head.out_channels)
@@ -96,7 +97,7 @@ def test_evidence_against_its_closed_form() -> None:
 
 @pytest.mark.parametrize("method", list(HEADS))
 def test_a_head_shares_the_features(method: str) -> None:
-    """They are computed once, and both depth and head are trained through them."""
+    """The features are computed once, and gradients of depth and head reach them."""
     backbone = small_network()
     calls = []
     backbone.decoder.register_forward_pre_hook(lambda *_: calls.append(1))
@@ -111,7 +112,8 @@ def test_a_head_shares_the_features(method: str) -> None:
 
 @pytest.mark.parametrize(("method", "size"), [("aleatoric", 8_656), ("evidential", 25_968)])
 def test_heads_at_four_scales_as_the_paper_has_them(method: str, size: int) -> None:
-    """8.7 and 26 kB on ResNet50-Monodepth2's decoder (.01 and .03 MB in the paper), instead of .58 and 1.7 kB."""
+    """With four scales, 8.7 and 26 kB on ResNet50-Monodepth2's decoder (.01 and .03 MB in the paper); with one, .58 and
+    1.7 kB."""
     backbone = MonodepthResNet(18)
     for scales, expected in ((4, size), (1, {"aleatoric": 580, "evidential": 1_740}[method])):
         parameters = with_head(backbone, method, scales).named_parameters()
@@ -120,7 +122,8 @@ def test_heads_at_four_scales_as_the_paper_has_them(method: str, size: int) -> N
 
 @pytest.mark.parametrize("method", ["aleatoric", "evidential"])
 def test_coarse_heads_learn_and_do_not_predict(method: str) -> None:
-    """Training has four predictions per image with one depth; eval mode is the network with one head, to the bit."""
+    """Training has four predictions per image with one depth; eval mode equals the network with one head bit for
+    bit."""
     network = with_head(small_network(), method, 4)
     single = with_head(network.backbone, method).eval()
     single.head.load_state_dict(network.head.state_dict())

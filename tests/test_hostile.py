@@ -1,9 +1,8 @@
-"""Frames that nobody should send, and damaged recordings, thousands of them: state, streams and errors stay in order.
+"""Thousands of invalid frames and damaged recordings: the state stays valid, streams independent, errors documented.
 
-``pytest -m slow tests/test_hostile.py`` takes in 1,000 frames, ``UFMSTAR_HOSTILE_FRAMES=10000`` as many as it says.
-Frames come in sessions of 20, one seed each, so that a failure repeats by its session's number alone. Damaged files:
-300 of each layout, likewise by seed.
-"""
+``pytest -m slow tests/test_hostile.py`` runs 1,000 frames, ``UFMSTAR_HOSTILE_FRAMES=10000`` that many. Every session of
+20 frames has its number as seed, so that a failure can be repeated. Damaged files: 300 of each layout, also with a seed
+each."""
 
 from __future__ import annotations
 
@@ -35,11 +34,11 @@ def spread(rng, shape):
 
 
 def depth_map(rng):
-    """[H, W] a scene at any scale, a plane, steps, noise or rubbish, with holes and extreme pixels."""
+    """[H, W] a scene at any scale, a plane, steps, noise or random values, with holes and extreme pixels."""
     v, u = np.mgrid[:H, :W]
     kind = rng.integers(6)
     if kind == 0:
-        depth = scenes.render(scenes.look(rng.normal(size=3) * 0.2, rng.normal() * 0.3), K, H, W)
+        depth = scenes.render(scenes.camera_pose(rng.normal(size=3) * 0.2, rng.normal() * 0.3), K, H, W)
     elif kind == 1:
         depth = 1 + rng.normal() * 0.02 * u + rng.normal() * 0.02 * v
     elif kind == 2:
@@ -54,13 +53,13 @@ def depth_map(rng):
 
 
 def pose(rng, i):
-    """[4, 4] along a path, or far away, turned about, not rigid, not finite."""
-    T = scenes.look([0.02 * i, 0, 0], 0.01 * i)
+    """[4, 4] on a path, or far away, randomly rotated, not rigid, not finite."""
+    T = scenes.camera_pose([0.02 * i, 0, 0], 0.01 * i)
     kind = rng.integers(12)
     if kind == 0:
         T[:3, 3] = rng.normal(size=3) * 10 ** rng.uniform(0, 11)
     elif kind == 1:
-        T = scenes.look(rng.normal(size=3), rng.uniform(-4, 4), rng.uniform(-4, 4))
+        T = scenes.camera_pose(rng.normal(size=3), rng.uniform(-4, 4), rng.uniform(-4, 4))
     elif kind == 2:
         T[:3, :3] += rng.normal(size=(3, 3)) * 10 ** rng.uniform(-6, 0)
     elif kind == 3:
@@ -71,7 +70,7 @@ def pose(rng, i):
 
 
 def camera(rng):
-    """[3, 3] as it is, or off in one entry."""
+    """[3, 3] valid, or wrong in one entry."""
     matrix = K.copy()
     if rng.integers(8) == 0:
         matrix[rng.integers(3), rng.integers(3)] = rng.choice([*EXTREME, 5.0, 31.0, 400.0])
@@ -97,25 +96,25 @@ def one_stream(rng, i, config, dtype):
     }  # fmt: skip
     exact = ("pose", "intrinsics")
     with np.errstate(over="ignore"):
-        given = {n: torch.tensor(value, dtype=torch.float64 if n in exact else dtype) for n, value in made.items()}
-    given["valid"] = torch.tensor(rng.random((H, W)) < rng.choice([0.0, 0.5, 1.0]))
-    given["anchors"] = tuple(torch.tensor(part) for part in anchors(rng, 30))
-    return given
+        arguments = {n: torch.tensor(value, dtype=torch.float64 if n in exact else dtype) for n, value in made.items()}
+    arguments["valid"] = torch.tensor(rng.random((H, W)) < rng.choice([0.0, 0.5, 1.0]))
+    arguments["anchors"] = tuple(torch.tensor(part) for part in anchors(rng, 30))
+    return arguments
 
 
 def batch(streams, names):
-    """Arguments of UfMStar for several streams; those optional ones that are named."""
-    given = {
+    """Arguments of UfMStar for several streams, with the optional arguments ``names``."""
+    arguments = {
         n: torch.stack([one[n] for one in streams]) for n in ("depth", "pose", "intrinsics", *names) if n != "anchors"
     }
     if "anchors" in names:
         parts = zip(*(one["anchors"] for one in streams), strict=True)
-        given["anchors"] = Anchors(*(torch.stack(part) for part in parts))
-    return given
+        arguments["anchors"] = Anchors(*(torch.stack(part) for part in parts))
+    return arguments
 
 
 def configuration(rng):
-    """Any of the settings that change what happens to a frame."""
+    """A random configuration over the settings that affect a frame."""
     return UfMStarConfig(
         segment=SPGFConfig(
             min_pixels=int(rng.choice([1, 20])), min_rows=1, prune=str(rng.choice(["both", "none"])),
@@ -138,36 +137,36 @@ def configuration(rng):
     )  # fmt: skip
 
 
-def spoil(rng, given):
+def spoil(rng, arguments):
     """One argument of a wrong kind, size or device."""
-    name = str(rng.choice(list(given)))
-    value = given[name]
+    name = str(rng.choice(list(arguments)))
+    value = arguments[name]
     wrong = ["a map", 3, None, [1.0], np.ones((2, 3))]
     if isinstance(value, torch.Tensor):
         wrong += [value[:1, 1:], value.flatten(), value.to(torch.complex64), value.to("meta"), value[:0]]
-    return given | {name: wrong[rng.integers(len(wrong))]}
+    return arguments | {name: wrong[rng.integers(len(wrong))]}
 
 
 def assert_in_order(ufm, session):
-    """The state is one that a run may have."""
+    """Assert that the state is valid."""
     try:
         ufm.state.require(ufm.config, ufm.state)
     except ValueError as error:
         raise AssertionError(f"session {session}: {error}") from error
 
 
-def assert_sound(out, given, config, session):
-    """The pixels used are those of the accepted ranges, every other is counted; no NaN where a pixel was used, unless
-    it was asked for; no value below 0."""
-    depth, fine = given["depth"], (out.statistics.fault == 0)[:, None, None]
+def assert_sound(out, arguments, config, session):
+    """Assert that exactly the pixels in the accepted ranges are used and all others counted, that used pixels have no
+    NaN unless configured, and that no value is negative."""
+    depth, fine = arguments["depth"], (out.statistics.fault == 0)[:, None, None]
     depth = depth if depth.dtype == torch.float64 else depth.float()
-    mask = given.get("valid", torch.ones_like(depth, dtype=torch.bool)) & fine
+    mask = arguments.get("valid", torch.ones_like(depth, dtype=torch.bool)) & fine
     use = mask & (depth >= 1e-6) & (depth <= config.segment.depth_limit)
     for name in ("aleatoric", "epistemic"):
-        value = given.get(name, torch.zeros_like(depth)).to(depth.dtype)
+        value = arguments.get(name, torch.zeros_like(depth)).to(depth.dtype)
         use &= (value >= 0) & (value <= 1e12)
     if config.features:
-        use &= (given["features"].to(depth.dtype).abs() <= 1e12).all(1)
+        use &= (arguments["features"].to(depth.dtype).abs() <= 1e12).all(1)
     counts = out.statistics
     assert torch.equal(out.valid, use), session
     positive = (mask & (depth > 0) & depth.isfinite()).sum((1, 2))
@@ -181,33 +180,33 @@ def assert_sound(out, given, config, session):
 
 
 def run_session(session):
-    """20 frames of two streams, beside a twin whose first stream sees other frames."""
+    """Run 20 frames of two streams; a twin's first stream has other frames."""
     rng = np.random.default_rng(session)
     config, dtype = configuration(rng), [torch.float32, torch.float64, torch.float16, torch.bfloat16][rng.integers(4)]
     ufm, twin = UfMStar(config), UfMStar(config)
-    taken, compared = 0, config.on_bad_frame == "skip"
+    accepted, compared = 0, config.on_bad_frame == "skip"
     for i in range(LENGTH):
         hostile, watched, other = (one_stream(rng, i, config, dtype) for _ in range(3))
         names = [n for n in ("aleatoric", "epistemic", "valid", "anchors") if rng.integers(2)]
         names = [n for n in names if n != "anchors" or config.anchors is not None] + ["features"] * config.features
-        given, spoilt = batch([hostile, watched], names), rng.integers(6) == 0
+        arguments, spoilt = batch([hostile, watched], names), rng.integers(6) == 0
         before = {name: value.clone() for name, value in ufm.state_dict().items()}
         try:
-            out = ufm(**(spoil(rng, given) if spoilt else given))
+            out = ufm(**(spoil(rng, arguments) if spoilt else arguments))
         except DOCUMENTED:
             after = ufm.state_dict()
             assert all(same(after[name], value) for name, value in before.items()), f"session {session}, {i}"
             continue
-        taken += 1
+        accepted += 1
         assert_in_order(ufm, session)
         if not spoilt:
-            assert_sound(out, given, config, session)
-        compared = compared and not spoilt  # an optional argument that was left out is taken in, but by one of them
+            assert_sound(out, arguments, config, session)
+        compared = compared and not spoilt  # spoiling an absent optional argument adds it to one of the two only
         if compared:
-            beside = twin(**batch([other, watched], names))
+            reference = twin(**batch([other, watched], names))
             for name in ("variance", "disagreement"):
-                assert same(*(getattr(one, name)[1] for one in (out, beside))), f"session {session}, {i}: {name}"
-    return taken
+                assert same(*(getattr(one, name)[1] for one in (out, reference))), f"session {session}, {i}: {name}"
+    return accepted
 
 
 @pytest.mark.parametrize("session", range(2))
@@ -220,8 +219,8 @@ def test_a_few_hostile_frames(session):
 @pytest.mark.parametrize("part", range(10))
 def test_thousands_of_hostile_frames(part):
     sessions = range(part, max(FRAMES // LENGTH, 10), 10)
-    taken = sum(run_session(session) for session in sessions)
-    assert taken > 0.3 * LENGTH * len(sessions), "most frames must get as far as the algorithm"
+    accepted = sum(run_session(session) for session in sessions)
+    assert accepted > 0.3 * LENGTH * len(sessions), "most frames must reach the algorithm"
 
 
 # ---- damaged recordings ----
@@ -236,20 +235,21 @@ WRITERS = {
 
 
 def damage(rng, content):
-    """The bytes cut off, doubled, or some of them changed."""
+    """The bytes truncated, doubled, or partly changed."""
     kind, data = rng.integers(4), bytearray(content)
     if kind == 0:
         return bytes(data[: rng.integers(len(data) + 1)])
     if kind == 1:
         return content + content
     at = rng.integers(0, max(1, min(len(data), 400) if kind == 2 else len(data)), rng.integers(1, 9))
-    for place in at[at < len(data)]:
-        data[place] = rng.integers(256)
+    for index in at[at < len(data)]:
+        data[index] = rng.integers(256)
     return bytes(data)
 
 
 def read_damaged(layout, folder, seeds):
-    """Damage a file of a recording at a time, and read all: how often it was refused whole, or in part."""
+    """Damage one file of a recording at a time, and read all frames: the number of damaged copies refused, wholly or in
+    part."""
     path, refused = WRITERS[layout](folder), 0
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     for seed in seeds:
@@ -284,12 +284,12 @@ def test_hundreds_of_damaged_recordings(layout, tmp_path):
 
 @pytest.mark.slow
 def test_covariances_are_positive_definite_after_3000_fusions():
-    """A camera that moves to and fro before noisy boxes."""
+    """A camera moves to and fro before noisy boxes."""
     segment = SPGFConfig(min_pixels=10, min_rows=1, prune="none")
     ufm = UfMStar(UfMStarConfig(segment=segment, merge=MergeConfig()))
     rng, fusions = np.random.default_rng(0), 0
     for i in range(400):
-        T = scenes.look([0.3 * np.sin(0.2 * i), 0.02 * np.cos(0.3 * i), 0], 0.1 * np.sin(0.11 * i))
+        T = scenes.camera_pose([0.3 * np.sin(0.2 * i), 0.02 * np.cos(0.3 * i), 0], 0.1 * np.sin(0.11 * i))
         depth = scenes.render(T, K, H, W) * (1 + 0.02 * rng.normal(size=(H, W)))
         out = ufm(torch.tensor(depth)[None], torch.tensor(T), torch.tensor(K))
         fusions += int(out.statistics.pairs)

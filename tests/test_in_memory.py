@@ -1,4 +1,4 @@
-"""Objects in memory as input: kornia's camera, models and pipelines of ``transformers``."""
+"""In-memory objects as input: kornia's cameras, models and pipelines of ``transformers``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ def kornia_camera(extrinsics, intrinsics=K4):
 
 
 def test_kornias_camera_is_pose_and_intrinsics():
-    """Its matrix is world-to-camera; it may be given once for both arguments, also to ``UncertainDepth``."""
+    """The camera's matrix is world-to-camera. One camera can be passed as pose and intrinsics, also to
+    ``UncertainDepth``."""
     camera = kornia_camera(torch.linalg.inv(POSE.double()))
     expected = UfMStar(CONFIG)(DEPTH, POSE, K)
     torch.testing.assert_close(UfMStar(CONFIG)(DEPTH, camera, camera).variance, expected.variance, equal_nan=True)
@@ -68,13 +69,13 @@ def test_a_pipeline_brings_its_image_processor(tmp_path):
         expected = pipe(Image.fromarray(image))["predicted_depth"]
     torch.testing.assert_close(depth.mean(), expected.mean(), rtol=0.05, atol=0)
     networks = [pipe, pipe.model, pipe.model, network]
-    given = [{}, {"preprocess": pipe.image_processor}, {"preprocess": network.preprocess}, {}]
-    for member, own in zip(networks, given, strict=True):
-        assert torch.equal(UncertainDepth(member, CONFIG, **own)(image, torch.eye(4), CAMERA).depth, depth)
+    options = [{}, {"preprocess": pipe.image_processor}, {"preprocess": network.preprocess}, {}]
+    for member, keywords in zip(networks, options, strict=True):
+        assert torch.equal(UncertainDepth(member, CONFIG, **keywords)(image, torch.eye(4), CAMERA).depth, depth)
 
 
 def test_depth_pro_takes_the_cameras_focal_length(tmp_path):
-    """inverse depth [1/m] times fx/W, whatever the field of view that the network estimates, if any."""
+    """Inverse depth [1/m] times fx/W, with or without the network's estimate of the field of view."""
     folder = write_other(tmp_path / "n", "depth_pro", use_fov_model=False)
     model = transformers.AutoModelForDepthEstimation.from_pretrained(folder)
     with pytest.raises(ValueError, match=r"not the field of view .*declare takes_intrinsics=True"):

@@ -1,4 +1,4 @@
-"""Networks as ``run`` and ``eval`` run them: the runtime, its effect and its records; ONNX Runtime and LiteRT."""
+"""Inference in ``run`` and ``eval``: the runtime, its effect and its records; ONNX Runtime and LiteRT."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_without_onnx_runtime_torch_runs_and_says_so(weights: Path, monkeypatch:
 
 
 def test_a_graph_of_another_size_runs_in_torch(tmp_path: Path) -> None:
-    """FastDepth's input is 224 x 224, whatever size the graph was exported for."""
+    """FastDepth's input is 224 x 224, also for graphs exported at another size."""
     small = write_fastdepth(tmp_path / "small.onnx", small_network(), 64)
     depth, about = predicted("fastdepth", small, Inference())
     assert (about["name"], depth.shape) == ("torch", (224, 224))
@@ -110,7 +110,7 @@ def test_a_graph_of_another_size_runs_in_torch(tmp_path: Path) -> None:
     ids=["folded", "head", "dropout", "resnet"],
 )
 def test_torch_gets_its_faster_form(network: torch.nn.Module) -> None:
-    """Channels last, and the same function; the network that was given stays as it was."""
+    """The optimised copy uses channels last and computes the same function; the original network is unchanged."""
     before = {name: value.clone() for name, value in network.state_dict().items()}
     fast = Inference().ready(network, Path("net.pth"), CPU)
     x = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(1))
@@ -127,7 +127,8 @@ def test_torch_gets_its_faster_form(network: torch.nn.Module) -> None:
 
 
 def test_bf16_is_near_single_precision(trained: Path) -> None:
-    """Predictions stay in single precision, of about 8 bits; digests tell the two apart."""
+    """Predictions are single precision tensors with about 8 significant bits; the digests of the two runtimes
+    differ."""
     depth, about = predicted("trained", trained, Inference(precision="bf16"))
     expected, _ = predicted("trained", trained, Inference())
     assert about["precision"] == "bf16"
@@ -203,7 +204,7 @@ def test_int8_is_close_to_the_network_that_it_was_made_of():
     x, _ = network.preprocess(image, torch.eye(3)[None])
     depth, reference = network(x).depth, expected(x).depth
     assert depth.shape == (1, 224, 224)
-    assert float((depth - reference).abs().median()) < 0.15  # [m] two of its steps
+    assert float((depth - reference).abs().median()) < 0.15  # [m] two quantisation steps
     np.testing.assert_allclose(depth / 0.07169981300830841, (depth / 0.07169981300830841).round(), atol=1e-3)
     torch.testing.assert_close(network(x.expand(2, -1, -1, -1)).depth, depth.expand(2, -1, -1))
     again = pickle.loads(pickle.dumps(network))

@@ -1,4 +1,4 @@
-"""The choice of kernels, and properties of all: threads, warnings, registers."""
+"""The selection of kernels, and properties of all kernels: threads, warnings, registers."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_seam_of_the_gpu_kernels(monkeypatch):
 
 
 def test_several_threads_at_once():
-    """Streams in several Python threads give what one gives alone."""
+    """Streams in several Python threads give the same result as a single thread."""
 
     def run(_: int) -> list[torch.Tensor]:
         ufm = UfMStar()
@@ -87,13 +87,13 @@ def test_several_threads_at_once():
 
 
 def test_tensors_move_and_nothing_else_is_copied():
-    given = SegmentInput(torch.ones(1, 2, 3), torch.eye(3)[None], SPGFConfig(), None)
-    there, number = moved((given, 3), "meta")
+    segment_input = SegmentInput(torch.ones(1, 2, 3), torch.eye(3)[None], SPGFConfig(), None)
+    on_meta, number = moved((segment_input, 3), "meta")
     assert number == 3
-    assert there.depth.device.type == there.intrinsics.device.type == "meta"
-    assert there.config is given.config
-    assert moved(given.config, "meta") is given.config
-    assert torch.equal(on_host(lambda at: at.depth + 1)(given), given.depth + 1)
+    assert on_meta.depth.device.type == on_meta.intrinsics.device.type == "meta"
+    assert on_meta.config is segment_input.config
+    assert moved(segment_input.config, "meta") is segment_input.config
+    assert torch.equal(on_host(lambda at: at.depth + 1)(segment_input), segment_input.depth + 1)
 
 
 def test_importing_the_package_leaves_the_warnings_alone():
@@ -105,9 +105,9 @@ def test_importing_the_package_leaves_the_warnings_alone():
 @pytest.mark.slow
 def test_every_kernel_compiles_for_hopper():
     pytest.importorskip("triton", reason="needs triton, which torch brings along on Linux")
-    here = Path(__file__).parent
-    environment = {**os.environ, "PYTHONPATH": str(here)} | {"TRITON_INTERPRET": "0"}
-    command = [sys.executable, str(here / "triton_compile.py"), "-v"]
+    folder = Path(__file__).parent
+    environment = {**os.environ, "PYTHONPATH": str(folder)} | {"TRITON_INTERPRET": "0"}
+    command = [sys.executable, str(folder / "triton_compile.py"), "-v"]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=280)
     assert done.returncode == 0, done.stderr[-3000:]
     for name in KERNELS:

@@ -1,6 +1,5 @@
-"""``ufmstar eval``, ``report`` and ``train`` killed at any moment: finished work stays, and a second start
-completes as if nothing had happened. (``ufmstar run``: tests/test_run.py.)
-"""
+"""``ufmstar eval``, ``report`` and ``train`` killed at any moment: finished work remains, and a second start completes
+the rest with the same results. (``ufmstar run``: tests/test_run.py.)"""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ from contextlib import suppress
 import pytest
 import torch
 from forked import start_program
-from tiny_suite import TRUTH, kept, write_rooms
+from tiny_suite import TRUTH, stored_results, write_rooms
 from trainings import write_frames
 
 from ufmstar_torch.models.checkpoints import read_safetensors
@@ -41,8 +40,8 @@ def finish(words):
 
 
 def kill_at(words, out, files, delay):
-    """SIGKILL to the process and its children, ``delay`` [s] after it has written so many files to ``out``; whether it
-    was still at it."""
+    """SIGKILL the process and its children ``delay`` [s] after it has written ``files`` files to ``out``. Return
+    whether it was still running."""
     began, process = time.time(), start_program(words)
     while process.is_alive() and written_since(out, began) < files:
         time.sleep(0.02)
@@ -66,23 +65,23 @@ def killed_and_finished(words, again, out, whole, seed, finished):
     """Kill a command a few times at random moments of its work, then let it finish.
 
     Args:
-        words: of the first start.
-        again: of the others.
-        out: its folder.
-        whole: the folder of an undisturbed one.
-        seed: of the moments.
-        finished: what is finished so far, by name: it must stay as it is.
+        words: command of the first start.
+        again: command of later starts.
+        out: the command's output folder.
+        whole: the output folder of an undisturbed run.
+        seed: seed of the random moments.
+        finished: returns the finished files by name; they must not change.
     """
-    draw, kills, known = random.Random(seed), 0, {}
+    draw, kills, done = random.Random(seed), 0, {}
     files = written_since(whole, 0)
     for _ in range(KILLS):
         at, delay = 1 + draw.randrange(max(1, int(0.6 * files))), draw.uniform(0, 0.3)
         kills += kill_at(again if kills else words, out, at, delay)
         after = finished()
-        assert {name: after.get(name) for name in known} == known, "finished work is lost"
-        known = after
+        assert {name: after.get(name) for name in done} == done, "finished work is lost"
+        done = after
     finish(again)
-    assert {name: finished().get(name) for name in known} == known, "finished work was done again otherwise"
+    assert {name: finished().get(name) for name in done} == done, "finished work has changed"
     assert kills > 0
 
 
@@ -94,14 +93,15 @@ def content(folder, *patterns):
 
 @pytest.fixture(scope="module")
 def evaluation(tmp_path_factory):
-    """Words of an evaluation without report but for its folder, and that folder after an undisturbed one."""
-    place = tmp_path_factory.mktemp("evaluation")
-    rooms = write_rooms(place / "rooms", frames=6)
-    (place / "kills.toml").write_text(SUITE)
-    words = ["eval", "--suite", place / "kills.toml", "--network", TRUTH, "--root", f"rooms={rooms}"]
+    """The command of an evaluation without report and without ``--out``, and the output folder of an undisturbed
+    run."""
+    folder = tmp_path_factory.mktemp("evaluation")
+    rooms = write_rooms(folder / "rooms", frames=6)
+    (folder / "kills.toml").write_text(SUITE)
+    words = ["eval", "--suite", folder / "kills.toml", "--network", TRUTH, "--root", f"rooms={rooms}"]
     words += ["--threads", 1, "--no-report"]
-    finish([*words, "--out", place / "whole"])
-    return words, place / "whole"
+    finish([*words, "--out", folder / "whole"])
+    return words, folder / "whole"
 
 
 def test_eval(evaluation, tmp_path):
@@ -109,7 +109,7 @@ def test_eval(evaluation, tmp_path):
     out = tmp_path / "out"
     words = [*words, "--out", out]
     killed_and_finished(words, [*words, "--resume"], out, whole, 0, lambda: content(out, "records/*/*/*.json"))
-    assert kept(out) == kept(whole)
+    assert stored_results(out) == stored_results(whole)
     assert not list(out.rglob(".*.tmp"))
 
 
@@ -129,12 +129,12 @@ def test_report(evaluation, tmp_path):
 
 @pytest.fixture(scope="module")
 def training(tmp_path_factory):
-    """Words of a training but for its folder, and that folder after an undisturbed one."""
-    place = tmp_path_factory.mktemp("training")
-    frames = write_frames(place / "frames")
+    """The command of a training, up to the value of ``--out``, and the output folder of an undisturbed run."""
+    folder = tmp_path_factory.mktemp("training")
+    frames = write_frames(folder / "frames")
     words = ["train", *TRAINING.split(), "--root", frames, "--threads", 1, "--out"]
-    finish([*words, place / "whole"])
-    return words, place / "whole"
+    finish([*words, folder / "whole"])
+    return words, folder / "whole"
 
 
 def test_train(training, tmp_path):

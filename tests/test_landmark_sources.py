@@ -61,13 +61,13 @@ def test_a_standing_and_a_turning_camera_have_no_anchors(tour, kind):
     frame, gray = tour[3], np.tile(tour[3].image[:, :, 0], (1, 3))
     assert sum(len(r.depth) for r in run(landmark_source(kind), [frame] * 6)) == 0
     source, K = landmark_source(kind), np.array([[1000.0, 0, 119.5], [0, 1000, 89.5], [0, 0, 1]])
-    for step in range(8):  # as a camera with a long focal length sees a turn: the image moves sideways
+    for step in range(8):  # like a turn seen with a long focal length: the image moves sideways
         T = np.eye(4)
         T[:3, :3] = Rotation.from_rotvec([0, np.arctan(6 * step / 1000), 0]).as_matrix()
         image = np.ascontiguousarray(gray[:, 40 + 6 * step : 280 + 6 * step])
         assert len(source.update(image, T, K).depth) == 0
     if kind == "corners":
-        assert source.update(image, T, K).tracked > 20, "there was something to follow"
+        assert source.update(image, T, K).tracked > 20, "there were corners to track"
 
 
 DEFECTS = {
@@ -85,7 +85,7 @@ def test_images_that_contradict_the_poses_give_no_depth_and_a_warning(tour, kind
     assert streams.last[0].contradicted
     assert anchors.valid.sum() == 0
     assert anchors.pose_error > 0.01 * 240
-    assert sum("poses contradict the images" in record.message for record in caplog.records) == 1, "once a stream"
+    assert sum("poses contradict the images" in record.message for record in caplog.records) == 1, "once per stream"
     assert streams.last[0].none.startswith("poses contradict the images")
 
 
@@ -200,7 +200,7 @@ def test_stated_variances_are_those_of_the_errors(kind):
 
 
 def test_after_a_jump_of_the_poses_landmarks_from_before_are_not_believed(tour):
-    """A loop closure moves all later poses: they are off from the earlier ones by 15 cm and 4 degrees."""
+    """A loop closure moves all later poses by 15 cm and 4 degrees relative to the earlier ones."""
     frames, jump = [*tour, *tour[::-1], *tour], np.eye(4)
     jump[:3, :3], jump[:3, 3] = Rotation.from_rotvec([0, 0, np.deg2rad(4)]).as_matrix(), [0.1, -0.1, 0.05]
     poses = [jump @ f.T_world_cam if i >= 14 else f.T_world_cam for i, f in enumerate(frames)]
@@ -209,7 +209,7 @@ def test_after_a_jump_of_the_poses_landmarks_from_before_are_not_believed(tour):
         wrong.extend(surprise(frame, result) > 5)
         counts.append(len(result.depth))
     assert np.mean(wrong) < 0.1
-    assert np.median(counts[-14:]) > 40, "evidence comes back"
+    assert np.median(counts[-14:]) > 40, "evidence recovers"
 
 
 def wrong_focal_length(frames, seed):
@@ -229,7 +229,7 @@ def drifting(frames, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize(("disturbed", "seeds"), [(noisy, 3), (drifting, 3), (wrong_focal_length, 1)])
 def test_on_worse_recordings_errors_are_as_large_as_stated(disturbed, seeds):
-    # One drift gives .9 to 1.8, and rounding in the last place moves it by .2: the mean is over several.
+    # A single drift gives .9 to 1.8, and rounding changes it by .2; hence the mean over several.
     middle, outliers = [], []
     for frames, seed in itertools.product(long_walks(), range(seeds)):
         results = run(DenseEvidence(), disturbed(frames, seed))
@@ -250,13 +250,13 @@ def test_a_thing_that_moves_by_itself_gives_hardly_any_anchors(tour):
         image[v : v + 60, u : u + 76] = thing
         images.append(image)
         where.append((u, v))
-    on_it, beside = 0, 0
+    on_square, elsewhere = 0, 0
     for (u, v), result in zip(where, run(DenseEvidence(), frames, images=images), strict=True):
-        # Windows reach 4 px: at its rim lie points of the background.
+        # Windows extend 4 px: pixels at the square's border show the background.
         inside = ((result.pixel >= [u + 4, v + 4]) & (result.pixel < [u + 72, v + 56])).all(1)
-        on_it, beside = on_it + inside.sum(), beside + (~inside).sum()
-    assert beside > 500
-    assert on_it < 0.02 * beside, "it covers a tenth of the image and has more contrast than the rest"
+        on_square, elsewhere = on_square + inside.sum(), elsewhere + (~inside).sum()
+    assert elsewhere > 500
+    assert on_square < 0.02 * elsewhere, "the square covers a tenth of the image and has more contrast than the rest"
 
 
 @pytest.mark.parametrize("value", [0, 255])
@@ -288,7 +288,7 @@ def test_a_state_that_is_not_finite_is_refused(tour, name):
 
 
 def test_images_of_another_size_are_refused_however_small():
-    """A frame that UfM* refuses is forgotten, with its size: only then may another size follow."""
+    """UfM* rolls back a refused frame together with its image size, so a frame of another size can follow."""
     K, sizes = np.eye(3), [(1, 1), (2, 1), (1, 2), (8, 8)]
     for first, other in itertools.permutations(sizes, 2):
         streams = StreamLandmarks("dense")
@@ -305,7 +305,7 @@ def test_images_of_another_size_are_refused_however_small():
 
 
 def test_surfaces_without_fine_texture_are_measured_by_wider_windows():
-    """A plane whose shades change by less than a window's least contrast over 8 px, and by more over 16 px."""
+    """A plane whose contrast is below the minimum in 8 px windows, and above it in 16 px windows."""
     texture = gaussian_filter(np.random.default_rng(0).standard_normal((700, 900)), 9)
     texture, K = 127 + 3.5 * texture / texture.std(), np.array([[200.0, 0, 159.5], [0, 200, 119.5], [0, 0, 1]])
     v, u = np.mgrid[:240, :320]
@@ -320,7 +320,7 @@ def test_surfaces_without_fine_texture_are_measured_by_wider_windows():
         patch = np.stack([image[y - 4 : y + 4, x - 4 : x + 4].std() for x, y in pixel.astype(int)])
         fine += int((patch > LEAST_CONTRAST).sum())
     depth, sigma = (np.concatenate(x) for x in zip(*((f.depth, np.sqrt(f.variance)) for f in found[4:]), strict=True))
-    assert len(depth) > 2 * fine, "most of these windows have no contrast of their own"
+    assert len(depth) > 2 * fine, "most of these windows have too little contrast"
     assert np.median(np.abs(depth / 2 - 1)) < 0.03
     assert np.mean(np.abs(depth - 2) < 3 * sigma) > 0.95
 
@@ -347,7 +347,7 @@ def test_the_second_image_shows_the_far_wall_too_and_not_the_near_thing_alone():
         result = evidence.update(view(x), T, K)
     far = (result.pixel[:, 0] < 45) | (result.pixel[:, 0] > 275)
     assert (~far).sum() > 50
-    assert far.sum() > 50, "the wall is no less measured than the plate"
+    assert far.sum() > 50, "the wall has as many measurements as the plate"
     inverse = 1 / result.depth[far]
     sigma = np.sqrt(result.variance[far]) * inverse**2
     assert np.median(np.abs(inverse - 1 / 6) / sigma) < 2, "by as much as stated"

@@ -1,4 +1,4 @@
-"""Landmarks from a file: what is read, which of them an image sees, and that a run and an evaluation use them."""
+"""Landmarks from a file: reading, visibility in an image, and their use in runs and evaluations."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def tour():
 
 
 def survey(sequence, every=7):
-    """True surface points [P, 3] of the sequence in the world, by loops."""
+    """True surface points [P, 3] of the sequence in the world, computed in loops."""
     points = []
     for frame in list(sequence)[::2]:
         K, T = frame.intrinsics, frame.T_world_cam
@@ -111,18 +111,18 @@ def test_other_files_are_refused(tmp_path):
 def test_words_and_files_become_sources(file, tmp_path):
     assert isinstance(landmark_source("corners"), LandmarkTracker)
     assert isinstance(landmark_source(file), LandmarkMap)
-    own = LandmarkMap.read(file)
-    assert landmark_source(own) is own
+    loaded = LandmarkMap.read(file)
+    assert landmark_source(loaded) is loaded
     assert isinstance(landmark_source("dense"), DenseEvidence)
     with pytest.raises(ValueError, match=r"'lidar' is neither 'corners', 'dense' nor a file \.csv"):
         landmark_source("lidar")
     for value in (True, "corners"):
         assert isinstance(landmarks_of(value, None), LandmarkTracker)
-    assert landmarks_of(file.name, file.parent).identity == own.identity
+    assert landmarks_of(file.name, file.parent).identity == loaded.identity
     with pytest.raises(FileNotFoundError, match=r"none.csv \(neither in .* nor in the working folder\)"):
         landmarks_of("none.csv", file.parent)
     with pytest.raises(ValueError, match="state must be empty"):
-        own.load_state({"view": torch.zeros(1)})
+        loaded.load_state({"view": torch.zeros(1)})
 
 
 # ---- projection ----

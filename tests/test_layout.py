@@ -1,4 +1,4 @@
-"""The house: layers point one way, the folders on disk are the packages, a bare import stays light."""
+"""The structure of the package: import order of layers, packages and folders, a lightweight bare import."""
 
 from __future__ import annotations
 
@@ -61,18 +61,18 @@ def test_layers_import_leftward_only():
     wrong = []
     for path in sources():
         if path.name == "cli.py":
-            continue  # the roof: imports everything
-        own = LAYERS[layer_of(path)]
+            continue  # the command line imports everything
+        rank = LAYERS[layer_of(path)]
         for module, names in imported(path):
             layer = target_layer(module, names)
-            if layer is not None and LAYERS[layer] > own:
+            if layer is not None and LAYERS[layer] > rank:
                 wrong.append(f"{path} (layer {layer_of(path)}) imports {module}")
             if module == "ufmstar_torch.cli" or (module == "ufmstar_torch" and "cli" in names):
                 wrong.append(f"{path} imports the roof")
     assert not wrong
 
 
-# Inside eval/, imports go one way too: a package may import from its own line and the lines above.
+# Imports inside eval/ are ordered too: a package may import from its line and the lines above.
 EVAL_ORDER = (
     ("sequences", "metrics"),
     ("tour", "methods", "check"),
@@ -88,25 +88,25 @@ def test_imports_inside_eval_go_one_way():
     rank = {name: number for number, names in enumerate(EVAL_ORDER) for name in names}
     result = set()
     for path in sorted((ROOT / "eval").rglob("*.py")):
-        own = path.relative_to(ROOT / "eval").with_suffix("").parts
-        if own == ("__init__",):
+        importer = path.relative_to(ROOT / "eval").with_suffix("").parts
+        if importer == ("__init__",):
             continue
         for module, names in imported(path):
             parts = module.split(".")
             if parts[:2] != ["ufmstar_torch", "eval"]:
                 continue
             for target in [parts[2]] if len(parts) > 2 else names:
-                if rank[target] > rank[own[0]] or (rank[target] == rank[own[0]] and target != own[0]):
-                    result.add(f"{'.'.join(own)} -> {'.'.join(parts[2:]) or target}")
+                if rank[target] > rank[importer[0]] or (rank[target] == rank[importer[0]] and target != importer[0]):
+                    result.add(f"{'.'.join(importer)} -> {'.'.join(parts[2:]) or target}")
     assert not result, result
 
 
 def test_no_modules_import_each_other_in_a_circle():
-    """Neither at import nor inside functions."""
+    """Includes imports inside functions."""
     names = {module_of(path): path for path in sources() if path.name != "__init__.py"}
 
     def targets(path: Path) -> set[str]:
-        each = [(module, name) for module, own in imported(path) for name in own or [""]]
+        each = [(module, name) for module, imports in imported(path) for name in imports or [""]]
         return {full if (full := f"{module}.{name}") in names else module for module, name in each} & names.keys()
 
     graph = {name: targets(path) - {name} for name, path in names.items()}
@@ -159,11 +159,11 @@ def test_kernels_import_back_only_plain_types():
     }
     for path in (ROOT / "ufmstar_torch" / "kernels").glob("*_cpu.py"):
         if path.stem in ("step_cpu", "anchors_cpu", "neighbours_cpu"):
-            continue  # puts the kernels together; what is no kernel is the reference's own
+            continue  # calls the kernels; all else is the reference's code
         for module, names in imported(path):
             if module.startswith("ufmstar_torch.") and not module.startswith("ufmstar_torch.kernels"):
-                own = {n for n in names if n in plain or module == "ufmstar_torch.segment_input"}
-                assert set(names) == own, f"{path} imports {names} from {module}"
+                allowed = {n for n in names if n in plain or module == "ufmstar_torch.segment_input"}
+                assert set(names) == allowed, f"{path} imports {names} from {module}"
 
 
 def test_folders_on_disk_are_the_packages():
@@ -215,7 +215,7 @@ def test_the_module_and_the_step_are_read_at_once():
         assert len((ROOT / "ufmstar_torch" / name).read_text().splitlines()) < most, name
 
 
-def test_no_utility_rooms_no_blanket_excepts():
+def test_no_utility_modules_no_blanket_excepts():
     for path in sources():
         assert path.stem not in ("utils", "helpers", "common", "misc"), path
         for node in ast.walk(tree(path)):

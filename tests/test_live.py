@@ -1,4 +1,4 @@
-"""``LiveDepth``: which image is taken, what is dropped and why, late and lost poses, errors, saving, signals."""
+"""``LiveDepth``: processed and dropped images, late and missing poses, errors, saving, signals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PICTURE = np.zeros((48, 64, 3), np.uint8)
 
 
 class Network(torch.nn.Module):
-    """Predicts 2 m everywhere; ``gate`` holds it up, ``entered`` is set when it is called."""
+    """Predicts 2 m everywhere. A call sets ``entered`` and waits for ``gate``."""
 
     def __init__(self):
         super().__init__()
@@ -59,7 +59,7 @@ def at(x):
 
 
 def show(live, stamp, picture=PICTURE, x=0.0):
-    """Push a pose and an image of its stamp, and wait until nothing is left to do."""
+    """Push a pose and an image with its stamp, and wait until both are processed."""
     live.push_pose(stamp, at(x))
     live.push_image(stamp, picture)
     assert live.wait_idle(20)
@@ -76,7 +76,7 @@ def require_all_counted(live):
 
 
 def test_a_result_has_the_pose_at_its_stamp(model):
-    """Poses come in any order, and a later one of a stamp replaces the earlier."""
+    """Poses arrive in any order. A later pose with the same stamp replaces the earlier one."""
     results = []
     with LiveDepth(model, results.append, K) as live:
         for stamp, x in ((0.1, 1), (0.0, 5), (0.0, 0)):
@@ -97,7 +97,7 @@ def test_a_late_pose_is_waited_for_and_others_go_on_being_pushed(model):
     results = []
     with LiveDepth(model, results.append, K, max_wait=20) as live:
         live.push_pose(0.0, at(0))
-        for n in range(1, 40):  # more than it keeps; the oldest has its pose first
+        for n in range(1, 40):  # more images than the queue holds; the oldest image's pose arrives first
             live.push_image(n / 100, PICTURE)
         time.sleep(0.05)
         assert not results
@@ -106,7 +106,7 @@ def test_a_late_pose_is_waited_for_and_others_go_on_being_pushed(model):
             time.sleep(0.001)
         assert stamps(results) == [0.01]
         live.push_pose(0.15, at(2))
-        live.push_pose(0.4, at(2))  # a gap around the newest one
+        live.push_pose(0.4, at(2))  # a gap around the newest image
         assert live.wait_idle(20)
         assert live.statistics.skipped == {GAP: 1}
     assert stamps(results) == [0.01, 0.15]
@@ -149,13 +149,13 @@ def test_why_images_are_skipped(model, caplog):
         assert live.statistics.skipped == {LATE: 1}
         for stamp, T in ((1.0, at(0)), (1.05, np.full((4, 4), np.nan)), (1.1, at(0)), (1.5, at(0))):
             live.push_pose(stamp, T)
-        for stamp in (0.9, 1.02, 1.07, 1.3):  # before all, beside a lost one twice, in a gap
+        for stamp in (0.9, 1.02, 1.07, 1.3):  # before all poses, twice beside a lost pose, in a gap
             live.push_image(stamp, PICTURE)
             assert live.wait_idle(20)
-        for stamp in (1.3, 0.2):  # not after the one before
+        for stamp in (1.3, 0.2):  # its stamp is not after the previous one
             live.push_image(stamp, PICTURE)
         live.push_image(1.5, PICTURE)
-        live.push_image(1.504, PICTURE)  # its next pose never comes: the one within 5 ms
+        live.push_image(1.504, PICTURE)  # its next pose never arrives: use the pose within 5 ms
         assert live.wait_idle(20)
     assert stamps(results) == [1.5, 1.504]
     assert require_all_counted(live).skipped == {LATE: 1, GAP: 2, LOST: 2, BACKWARDS: 2}
@@ -168,7 +168,7 @@ def test_a_reset_forgets_views_and_times(model):
     with LiveDepth(model, results.append, K, max_wait=0.02) as live:
         show(live, 9)
         live.reset()
-        live.push_image(1, PICTURE)  # the old pose would be no help, and is gone
+        live.push_image(1, PICTURE)  # the old pose is discarded
         assert live.wait_idle(20)
         show(live, 2)
     assert stamps(results) == [9, 2]
@@ -177,7 +177,7 @@ def test_a_reset_forgets_views_and_times(model):
 
 
 def test_a_reset_after_an_image_was_taken_holds_for_the_next_one(model):
-    """The image that is being computed belongs to the old poses."""
+    """The image in progress belongs to the old poses."""
     with LiveDepth(model, lambda _: None, K) as live:
         process = live._process
 
@@ -223,7 +223,7 @@ def test_an_error_reaches_every_thread_that_pushes(model, what):
     for call in (lambda: live.push_image(1, PICTURE), lambda: live.push_pose(1, at(0)), live.reset, live.close):
         with pytest.raises(expected):
             call()
-    with pytest.raises(KeyError), live:  # an error of the block's own is not replaced
+    with pytest.raises(KeyError), live:  # an error raised inside the with block is not replaced
         raise KeyError
 
 
@@ -242,7 +242,7 @@ def test_closing_while_busy_waits_for_the_image_and_drops_the_rest(model, networ
     assert closing.is_alive()
     network.gate.set()
     closing.join(20)
-    live.push_image(2, PICTURE)  # a camera's callback that comes after the end
+    live.push_image(2, PICTURE)  # a camera callback after the end
     live.push_pose(2, at(0))
     live.close()
     assert stamps(results) == [0]
@@ -338,7 +338,7 @@ def test_the_state_goes_on_where_it_ended(model, network, tmp_path):
     )
     assert [path.name for path in tmp_path.iterdir()] == ["state.pt"]
     with LiveDepth(model, print, K, state=tmp_path / "other.pt"):
-        pass  # nothing has changed: nothing is written over
+        pass  # no change, so no file is overwritten
     assert not (tmp_path / "other.pt").exists()
 
 
@@ -352,7 +352,7 @@ def test_a_state_that_cannot_be_written_is_an_error(model, tmp_path):
 
 @pytest.mark.slow
 def test_sigterm_as_an_exception_saves_the_state(tmp_path):
-    """As docs/live.md says."""
+    """As in docs/live.md."""
     script = textwrap.dedent(
         f"""
         import signal, sys, time

@@ -1,4 +1,4 @@
-"""The examples on ``LiveDepth``, with stand-ins for the camera and for ROS; the demo on board."""
+"""The examples of ``LiveDepth``, with stand-ins for the camera and ROS; the onboard demo."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Flat(torch.nn.Module):
 
 
 class Node:
-    """Keeps the callbacks, and what is published."""
+    """Stores the callbacks and the published messages."""
 
     def __init__(self):
         self.callbacks, self.published = {}, {}
@@ -86,7 +86,7 @@ def test_the_camera_is_shown(tmp_path, monkeypatch):
     weights = write_fastdepth(tmp_path / "net.onnx", small_network(), 224)
 
     class Capture:
-        """Grey pictures, and a SLAM that is always in time."""
+        """A camera with grey images, and a SLAM that is never late."""
 
         def __init__(self, index):
             assert index == 2
@@ -133,14 +133,14 @@ def test_a_quantised_network_is_close_to_it(tmp_path):
 
 
 def test_low_aleatoric_and_high_disagreement():
-    own, M = np.meshgrid(np.arange(4.0), np.arange(4.0))
-    error = np.where((own <= 1) & (M > 2.25), 3.0, 1.0)
+    aleatoric, M = np.meshgrid(np.arange(4.0), np.arange(4.0))
+    error = np.where((aleatoric <= 1) & (M > 2.25), 3.0, 1.0)
     usable = np.ones((4, 4), bool)
-    contrast = onboard.Contrast(np.zeros((4, 4, 3), np.uint8), own, M, error, usable)
+    contrast = onboard.Contrast(np.zeros((4, 4, 3), np.uint8), aleatoric, M, error, usable)
     assert onboard.contrast_figures([contrast]) == pytest.approx(
         {"share": 2 / 16, "rmse_high": 3, "rmse_low": 1, "aleatoric_sigma_high": np.sqrt(0.5), "disagreement_high": 3}
     )
-    nothing = onboard.Contrast(contrast.image, own, M, error, ~usable)
+    nothing = onboard.Contrast(contrast.image, aleatoric, M, error, ~usable)
     assert np.isnan(onboard.contrast_figures([nothing])["rmse_high"])
 
 

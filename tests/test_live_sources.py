@@ -1,4 +1,4 @@
-"""``ufmstar live`` and its sources: recordings at their pace, files that grow, lines of JSON, options and output."""
+"""``ufmstar live`` and its sources: recordings in real time, growing files, lines of JSON, options and output."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def ufmstar(capsys, weights):
 
 
 def malicious(folder):
-    """A file of torch.save that makes FOLDER/ran when its objects are loaded."""
+    """A torch.save file that creates FOLDER/ran when its objects are unpickled."""
 
     class Code:
         def __reduce__(self):
@@ -103,11 +103,11 @@ def test_poses_are_read_as_their_lines_are_completed(tmp_path):
 def test_a_folder_that_grows(tmp_path):
     folder, image = tmp_path / "images", np.full((8, 8, 3), 7, np.uint8)
     folder.mkdir()
-    (folder / "1.0.png").write_bytes(content(image))  # was there before
+    (folder / "1.0.png").write_bytes(content(image))  # existed before
     begun, found = threading.Event(), []
 
     def clock():
-        begun.set()  # the folder's content is known
+        begun.set()  # the folder has been listed
         return time.monotonic()
 
     events = growing_folder(folder, PoseFile(tmp_path / "poses.txt"), idle=5, clock=clock)
@@ -126,7 +126,7 @@ def test_a_folder_that_grows(tmp_path):
     thread.join(20)
     assert [event.stamp for event in found[:3]] == [2.5, 2.0, 3.0]
     assert found[0].image is None
-    assert abs(found[3].stamp - time.time()) < 60  # that of the file
+    assert abs(found[3].stamp - time.time()) < 60  # the file's metadata
     assert list(growing_folder(folder, PoseFile(tmp_path / "none"), idle=0.05)) == []
     with pytest.raises(FileNotFoundError, match="no such folder"):
         next(growing_folder(tmp_path / "nowhere", PoseFile(tmp_path / "none")))
@@ -195,7 +195,7 @@ def test_a_recording_live(ufmstar, tmp_path):
     assert images == summary["results"]
     code, _, err = ufmstar(TOUR, "--state", tmp_path / "state.pt", "--speed", "0.2")
     assert code == 0, err
-    assert int(torch.load(tmp_path / "state.pt")["image_index"]) > images  # it went on
+    assert int(torch.load(tmp_path / "state.pt")["image_index"]) > images  # the run continued
     before = sorted((tmp_path / "out").iterdir())
     code, _, err = ufmstar(TOUR, "--out", tmp_path / "out")
     assert code == 2
@@ -229,7 +229,7 @@ def test_lines_on_standard_input_live(ufmstar, tmp_path, monkeypatch):
     code, out, err = ufmstar("-", *intrinsics, "--out", tmp_path / "out")
     assert code == 1
     assert "line 11: no JSON" in err
-    assert "of 5 images" in out, "the table of what was done"
+    assert "of 5 images" in out, "the summary table"
     summary = json.loads((tmp_path / "out" / "realtime.json").read_text())
     assert (summary["state"], summary["reason"]) == ("failed", "line 11: no JSON: no JSON")
     monkeypatch.setattr(sys, "stdin", io.StringIO(lines[1]))

@@ -1,4 +1,4 @@
-"""Losses: closed forms (SciPy), masks that nothing leaks through, sums that processes can share, extreme inputs."""
+"""Losses: closed forms (SciPy), masks, sums over processes, extreme inputs."""
 
 from __future__ import annotations
 
@@ -53,7 +53,8 @@ def test_gaussian_is_scipys():
 
 @given(nu=st.floats(1e-4, 1e4), alpha=st.floats(1.0001, 1e5), beta=st.floats(1e-6, 1e4), error=st.floats(-100, 100))
 def test_evidential_is_scipys_student_t(nu, alpha, beta, error):
-    """Double precision agrees to 1e-7 over the whole range of evidence (the series for large alpha is worth 5e-8)."""
+    """Double precision agrees to 1e-7 over the whole range of evidence (the series for large alpha has an error of
+    5e-8)."""
     tensors = [torch.tensor(x, dtype=torch.float64) for x in (3.0, nu, alpha, beta, 3.0 + error)]
     scale = math.sqrt(beta * (1 + nu) / (nu * alpha))
     expected = -stats.t.logpdf(tensors[4].item(), 2 * alpha, 3.0, scale)
@@ -70,7 +71,7 @@ def test_the_gradient_is_the_derivative(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_mean_is_over_the_valid_pixels(kind):
-    """Not over all pixels and not over the invalid ones; 3 of 70 are valid here."""
+    """3 of 70 pixels are valid here."""
     values, target = parameters(kind), uniform(0.5, 8, 9)
     valid = torch.zeros(SHAPE, dtype=torch.bool)
     valid[0, 1, 2] = valid[1, 4, 6] = valid[1, 0, 0] = True
@@ -85,7 +86,7 @@ def test_the_mean_is_over_the_valid_pixels(kind):
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("kind", KINDS)
 def test_nothing_invalid_reaches_value_or_gradient(kind, bad, dtype):
-    """Neither a target nor a prediction: NaN times 0 is NaN, so the gradient is cut before the loss, not behind it."""
+    """Invalid targets and predictions: NaN times 0 is NaN, so the mask is applied before the loss."""
     values, target = parameters(kind, dtype), uniform(0.5, 8, 9, dtype=dtype)
     valid = uniform(0, 1, 10) < 0.6
     clean = loss_of(distribution(kind, values), target, valid)
@@ -136,7 +137,7 @@ def test_extreme_inputs_have_finite_values_and_gradients(kind, error, precision)
 
 
 def test_beyond_its_limits_the_log_variance_is_still_pulled_back():
-    """A clamp would leave such a pixel without a gradient for ever."""
+    """A clamp would give such a pixel no gradient."""
     s = torch.tensor([-1e4, 1e4], requires_grad=True)
     gradient = torch.autograd.grad(gaussian_nll(torch.zeros(2), s, torch.ones(2)).sum(), s)[0]
     assert gradient[0] < -1
@@ -145,7 +146,7 @@ def test_beyond_its_limits_the_log_variance_is_still_pulled_back():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_half_precision_outputs_lose_nothing_in_the_loss(kind):
-    """bfloat16 parameters give the loss of the same numbers in single precision, also under autocast."""
+    """bfloat16 parameters give the same loss as the same values in single precision, also under autocast."""
     values = {name: x.detach().to(torch.bfloat16) for name, x in parameters(kind).items()}
     target, valid = uniform(0.5, 8, 9, dtype=torch.float32), uniform(0, 1, 10) < 0.6
     with torch.autocast("cpu", torch.bfloat16):

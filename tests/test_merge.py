@@ -1,4 +1,4 @@
-"""Merging against the oracle and its closed forms: what it keeps, and what it may not touch."""
+"""Merging: against the oracle, closed forms, conserved sums, and unaffected components."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ALL = torch.tensor([True, True])
 
 
 def crowd(seed: int, capacity: int = 14) -> tuple[GaussianMixture, torch.Tensor]:
-    """Two streams of components that overlap, with features, and sums of anchors beside them."""
+    """Two streams of overlapping components with features, and their sums over anchors."""
     m = mixture(2, capacity, seed, features=2)
     generator = torch.Generator().manual_seed(seed)
     shape = covariances(2 * capacity, seed, decades=1.0, largest=0.3).view(2, capacity, 3, 3)
@@ -61,11 +61,11 @@ def merge_one(m: GaussianMixture, **changes: float) -> GaussianMixture:
 def test_agrees_with_the_oracle(seed, apart):
     before, sums = crowd(seed)
     before = before.replace(mean=apart * before.mean)
-    after, left = merge(before, sums, ALL, CONFIG)
+    after, merged_sums = merge(before, sums, ALL, CONFIG)
     for b in range(2):
-        given_ = as_dicts(before, sums, b)
-        expected = oracle_merge.merge(given_, CONFIG.merge.loss, CONFIG.merge.share, CONFIG.prior_weight)
-        ours = as_dicts(after, left, b)
+        components = as_dicts(before, sums, b)
+        expected = oracle_merge.merge(components, CONFIG.merge.loss, CONFIG.merge.share, CONFIG.prior_weight)
+        ours = as_dicts(after, merged_sums, b)
         assert len(ours) == len(expected)
         for mine, theirs in zip(ours, expected, strict=True):
             assert mine["count"] == theirs["count"]
@@ -76,9 +76,10 @@ def test_agrees_with_the_oracle(seed, apart):
 @given(st.integers(0, 10**6))
 @settings(max_examples=10)
 def test_sums_over_the_mixture_stay(seed):
-    """Both rules keep the sums of pi, pi m, pi h and of the anchors' evidence; joining those of the moments too."""
+    """Both rules conserve the sums of pi, pi m, pi h and of the anchors' evidence. Joining also conserves the
+    moments."""
     before, sums = crowd(seed)
-    after, left = merge(before, sums, ALL, CONFIG)
+    after, merged_sums = merge(before, sums, ALL, CONFIG)
     assert int(after.components.sum()) < int(before.components.sum())
     joined, _ = merge(before, sums, ALL, CONFIG.with_values({"merge.share": 0.0}))
 
@@ -92,7 +93,7 @@ def test_sums_over_the_mixture_stay(seed):
 
     torch.testing.assert_close(zeroth(after), zeroth(before), rtol=1e-12, atol=1e-9)
     torch.testing.assert_close(moments(joined), moments(before), rtol=1e-11, atol=1e-9)
-    torch.testing.assert_close(left.sum(1), sums.sum(1), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(merged_sums.sum(1), sums.sum(1), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("step", [-1e-3, 1e-3])
@@ -104,19 +105,19 @@ def test_the_limit_is_the_divergence_of_the_lighter_from_the_heavier(step):
 
 
 def test_what_was_seen_from_one_view_stays_unmeasured():
-    """Two first views that join were compared with nothing, and a measured component does not join a heavier one of
-    one view, which would read as measured."""
-    place = [[0.0, 0.0, 2.0], [0.01, 0.0, 2.0]]
-    firsts = merge_one(one(place, [0.01, 0.01], [50.0, 40.0], [0.0, 0.0], [1, 1]))
+    """The join of two single-view components is unmeasured. A measured component does not join a heavier single-view
+    component, which would then count as measured."""
+    means = [[0.0, 0.0, 2.0], [0.01, 0.0, 2.0]]
+    firsts = merge_one(one(means, [0.01, 0.01], [50.0, 40.0], [0.0, 0.0], [1, 1]))
     assert firsts.components.tolist() == [1]
     assert firsts.count[0, 0] == 1
-    assert int(merge_one(one(place, [0.01, 0.01], [50.0, 40.0], [0.0, 0.2], [1, 2])).components) == 2
-    assert int(merge_one(one(place, [0.01, 0.01], [40.0, 50.0], [0.0, 0.2], [1, 2])).components) == 1
+    assert int(merge_one(one(means, [0.01, 0.01], [50.0, 40.0], [0.0, 0.2], [1, 2])).components) == 2
+    assert int(merge_one(one(means, [0.01, 0.01], [40.0, 50.0], [0.0, 0.2], [1, 2])).components) == 1
 
 
 def test_a_superseded_component_is_dissolved_and_a_lonely_one_is_not():
-    """A thin fragment inside of a wide component: its share falls as the wide one is observed, but far from it the
-    fragment is all there is, however light."""
+    """A thin fragment inside a wide component is dissolved when the wide one has been observed often. Away from other
+    components it stays, at any weight."""
     for weight, distance, left in ((2e4, 0.0, 2), (1e9, 0.0, 1), (1e9, 9.0, 2)):
         two = one([[0.0, 0.0, 2.0], [distance, 0.0, 2.0]], [0.25, 0.001], [weight, 100.0], [0.1, 0.0], [9, 1])
         after = merge_one(two)
@@ -130,7 +131,8 @@ def test_a_superseded_component_is_dissolved_and_a_lonely_one_is_not():
 @given(st.integers(0, 10**6))
 @settings(max_examples=8)
 def test_the_map_stays_within_the_stated_bound_where_components_are_dissolved(seed):
-    """A feature in [0, 1] at a dissolved component's own point moves by little more than its share; joining is off."""
+    """At a dissolved component's points, a feature in [0, 1] changes by little more than the component's share. Joining
+    is off."""
     before, _ = crowd(seed)
     config = UfMStarConfig(merge=MergeConfig(loss=1e-9, share=0.05), features=2)
     after, _ = merge(before, before.mean.new_zeros(*before.weight.shape, 0), ALL, config)
@@ -142,25 +144,25 @@ def test_the_map_stays_within_the_stated_bound_where_components_are_dissolved(se
 
 
 def test_nothing_else_is_touched():
-    """A stream that is not due, and components that take no part, keep their bits; the caller's tensors too."""
+    """Streams that are not due, components without partners, and the caller's tensors are unchanged bit for bit."""
     before, sums = crowd(5)
     before = before.to(torch.float32)
     copy = {name: value.clone() for name, value in before.tensors().items()}
     lonely = before.replace(mean=before.mean + torch.tensor([1e3, 0, 0]) * (torch.arange(14) == 2)[:, None])
-    after, left = merge(lonely, sums, torch.tensor([True, False]), CONFIG)
+    after, merged_sums = merge(lonely, sums, torch.tensor([True, False]), CONFIG)
     assert int(after.components[0]) < 12
     for name, value in lonely.tensors().items():
         assert torch.equal(getattr(after, name)[1], value[1]), name
         assert torch.equal(getattr(before, name), copy[name]), name
     k = int((after.mean[0, :, 0] > 500).nonzero()[0, 0])
     assert torch.equal(after.covariance[0, k], lonely.covariance[0, 2])
-    assert torch.equal(left[1], sums[1])
+    assert torch.equal(merged_sums[1], sums[1])
     occupied = after.weight > 0
     assert not (occupied[:, 1:] & ~occupied[:, :-1]).any()
 
 
 def test_a_thin_plate_stays_positive_definite_in_float32():
-    """Two tilted plates at the floor of float32, side by side: the joint covariance must survive the rounding."""
+    """Two tilted plates side by side, at float32's covariance floor: their joint covariance stays positive definite."""
     tilt = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.5, 0.3], [0.5, 0.0, -0.8], [-0.3, 0.8, 0.0]]).double())
     plate = (tilt * torch.tensor([1.0, 1.0, 2e-6]).double()) @ tilt.T
     two = one([[0.0, 0.0, 2.0], [0.9, 0.9, 2.0]], [1.0, 1.0], [50.0, 50.0], [0.1, 0.1], [2, 2])

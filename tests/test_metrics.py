@@ -1,4 +1,4 @@
-"""Streaming metrics against independent implementations, closed forms and the field's known faults; rankings."""
+"""Streaming metrics against independent implementations, closed forms and known errors of other code; rankings."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class TestAgainstIndependentImplementations:
         # Asymmetric levels: symmetric ones hide a residual with its sign flipped.
         levels = [0.03, 0.1, 0.2, 0.6]
         d, v, g = maps(40, 50)
-        g = g + 0.1  # biased, so that the sign of the residual shows
+        g = g + 0.1  # biased, to test the sign of the residual
         got = figures(ECEQuantile(levels), d, v, g)
         observed = [np.mean(g.numpy() <= stats.norm.ppf(q, d.numpy(), np.sqrt(v.numpy()))) for q in levels]
         assert all(o < q for o, q in zip(observed, levels, strict=True))
@@ -93,7 +93,7 @@ class TestAgainstIndependentImplementations:
         np.testing.assert_array_equal(got["entropy_counts"].numpy(), counts)
 
     def test_the_authors_bins(self) -> None:
-        """100 bins of the confidence; 101 levels, of which 0 and 1 are right by definition."""
+        """100 bins of the confidence; 101 levels, of which 0 and 1 are exact by definition."""
         d, v, g = maps(30, 40, scale=1.7)
         metrics = SequenceMetrics(bins="authors")
         metrics.update(d, v, g)
@@ -118,11 +118,11 @@ class TestAgainstIndependentImplementations:
         used[5] = False
         metrics = SequenceMetrics()
         metrics.update(d, v, g, used)
-        kept = used.clone()
-        kept[0, :3] = False
-        oracle = stats.norm(0, np.sqrt(v[kept].numpy())).entropy()
+        counted = used.clone()
+        counted[0, :3] = False
+        oracle = stats.norm(0, np.sqrt(v[counted].numpy())).entropy()
         assert metrics.compute()["entropy"] == pytest.approx(oracle.mean())
-        assert sum(metrics.curves()["entropy_counts"]) == int(kept.sum())
+        assert sum(metrics.curves()["entropy_counts"]) == int(counted.sum())
         assert metrics.compute()["pixels"] == 200
 
 
@@ -155,14 +155,14 @@ class TestZeroVariance:
 class TestMasks:
     @pytest.mark.parametrize("kind", ALL)
     def test_true_means_use(self, kind: type[SumMetric]) -> None:
-        """Metrics on the invalid pixels, or divided by their number, because the mask meant the opposite."""
+        """True in the mask means use: an inverted mask would evaluate the invalid pixels."""
         d, v, g = maps(20, 30)
         valid = torch.zeros(20, 30, dtype=torch.bool)
         valid[3:9, 4:20] = True
-        kept = figures(kind(), d[valid], v[valid], g[valid])
+        expected = figures(kind(), d[valid], v[valid], g[valid])
         poisoned = torch.where(valid, d, 1e6)
         for name, value in figures(kind(), poisoned, v, g, valid).items():
-            torch.testing.assert_close(value, kept[name], rtol=0, atol=0, equal_nan=True)
+            torch.testing.assert_close(value, expected[name], rtol=0, atol=0, equal_nan=True)
 
     @pytest.mark.parametrize("kind", ALL)
     def test_nothing_valid_is_nan_and_no_crash(self, kind: type[SumMetric]) -> None:
@@ -254,15 +254,15 @@ class TestErrors:
         ],
     )
     def test_maps(self, kind: type[SumMetric], change: dict[str, torch.Tensor | None], match: str) -> None:
-        given = dict(zip(("depth", "variance", "target"), maps(4, 5), strict=True)) | change
+        arguments = dict(zip(("depth", "variance", "target"), maps(4, 5), strict=True)) | change
         if "variance" in change and kind not in UNCERTAIN:
             return
         with pytest.raises(ValueError, match=match):
-            kind().update(**given)
+            kind().update(**arguments)
 
 
 def loop(d: np.ndarray, v: np.ndarray, g: np.ndarray, use: np.ndarray) -> dict[str, float]:
-    """All sums of scalars by plain loops."""
+    """All sums as scalars in plain loops."""
     sums: Counter[str] = Counter()
     for x, w, t, chosen in zip(d.flat, v.flat, g.flat, use.flat, strict=True):
         predicted, true = math.isfinite(x) and 0 <= w < math.inf, 0 < t < math.inf
@@ -287,7 +287,7 @@ def loop(d: np.ndarray, v: np.ndarray, g: np.ndarray, use: np.ndarray) -> dict[s
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_hostile_maps_add_up_to_what_loops_say(dtype: torch.dtype) -> None:
-    """Everything that is left out, or stands at the end of a range; and a mask. Sums are never changed in place."""
+    """Excluded values, values at the ends of ranges, and a mask. Sums are never changed in place."""
     d, v, g = maps(30, 40, scale=1.5)
     for value, at in ((d, 0), (v, 1), (g, 2)):
         for row, special in enumerate((math.nan, math.inf, -math.inf, 0.0, -1.0, 1e-9, 1e-8, 1e4, 1e15)):
@@ -316,10 +316,10 @@ def test_hostile_maps_add_up_to_what_loops_say(dtype: torch.dtype) -> None:
 
 
 def sparsification(key: np.ndarray, error: np.ndarray, root: bool) -> np.ndarray:
-    """The curve by sorting all pixels; ties in the order in which they stand."""
+    """The curve from sorting all pixels; ties stay in their original order."""
     ordered = error[np.argsort(key, kind="stable")]
-    kept = [ordered[: round((1 - j / 50) * len(ordered))].mean() for j in range(50)]
-    return np.sqrt(kept) if root else np.array(kept)
+    means = [ordered[: round((1 - j / 50) * len(ordered))].mean() for j in range(50)]
+    return np.sqrt(means) if root else np.array(means)
 
 
 def area(curve: np.ndarray) -> float:
@@ -334,14 +334,14 @@ class TestRanking:
         e = (((d - g) ** 2) if root else (d - g).abs() / g).numpy().ravel()
         by_variance, oracle = sparsification(v.numpy().ravel(), e, root), sparsification(e, e, root)
         got = figures(Sparsification(), d, v, g)
-        # Bins of .7 %; seen: 1e-4.
+        # Bins of .7 %; observed error: 1e-4.
         np.testing.assert_allclose(got[f"sparsification_{name}"].numpy(), by_variance, rtol=3e-3)
         assert float(got[f"ause_{name}"]) == pytest.approx(area(by_variance) - area(oracle), rel=1e-3)
         assert float(got[f"aurg_{name}"]) == pytest.approx(by_variance[0] - area(by_variance), rel=1e-3)
         assert float(got[f"aurg_{name}"]) > 0
 
     def test_ties_are_broken_at_random(self) -> None:
-        """The same variance everywhere gains nothing and costs nothing, however the pixels are ordered."""
+        """A constant variance has an AURG of 0 for any order of the pixels."""
         d, _, g = maps(100, 100)
         order = (d - g).abs().flatten().argsort()
         for index in (order, order.flip(0)):

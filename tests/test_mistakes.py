@@ -1,4 +1,4 @@
-"""Plausible mistakes in what a user gives: each is named or caught, and right input raises no alarm."""
+"""Plausible mistakes in a user's input: each is reported, and correct input causes no warning."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ufmstar_torch.models import load_network
 H, W = 48, 64
 K = scenes.intrinsics(H, W)
 CONFIG = UfMStarConfig(segment=SPGFConfig(min_pixels=20, min_rows=1))
-WALK = [scenes.look([0.1 * i, 0.02 * i, -0.04 * i], 0.05 * i) for i in range(14)]
+WALK = [scenes.camera_pose([0.1 * i, 0.02 * i, -0.04 * i], 0.05 * i) for i in range(14)]
 
 
 def scaled(T, factor):
@@ -34,21 +34,21 @@ def scaled(T, factor):
     return out
 
 
-def said(caplog, change=lambda T: T, config=CONFIG, anchors=None, frames=WALK):
-    """Warnings during a walk before rendered boxes, with two streams of which the second has right poses."""
+def warnings_on_walk(caplog, change=lambda T: T, config=CONFIG, anchors=None, frames=WALK):
+    """Warnings during a walk in front of rendered boxes, with two streams; the second has correct poses."""
     caplog.clear()
     ufm = UfMStar(config)
     for T in frames:
         depth = torch.tensor(scenes.render(T, K, H, W))[None].repeat(2, 1, 1)
         poses = torch.tensor(np.stack([change(T), T]))
-        given = {} if config.anchors is None else {"anchors": anchors}
-        out = ufm(depth, poses, torch.tensor(K), **given)
+        options = {} if config.anchors is None else {"anchors": anchors}
+        out = ufm(depth, poses, torch.tensor(K), **options)
     return caplog.messages, out.statistics
 
 
 @pytest.mark.parametrize("factor", [100, 1000])
 def test_views_that_never_meet_are_named_once_a_stream(caplog, factor):
-    messages, statistics = said(caplog, lambda T: scaled(T, factor))
+    messages, statistics = warnings_on_walk(caplog, lambda T: scaled(T, factor))
     assert len(messages) == 1
     assert re.match(r"stream 0: after 8 frames \d+ of \d+ Gaussians were seen in one view alone", messages[0])
     assert "millimetres" in messages[0]
@@ -57,32 +57,32 @@ def test_views_that_never_meet_are_named_once_a_stream(caplog, factor):
 
 
 def test_right_input_is_not_warned_of(caplog):
-    assert said(caplog)[0] == []
-    assert said(caplog, frames=WALK[:1] * 14)[0] == [], "a camera that stands still"
+    assert warnings_on_walk(caplog)[0] == []
+    assert warnings_on_walk(caplog, frames=WALK[:1] * 14)[0] == [], "a camera that stands still"
 
 
 def test_moving_frames_without_anchors_are_named(caplog):
     config = CONFIG.replace(anchors=AnchorConfig())
-    messages, _ = said(caplog, config=config)
+    messages, _ = warnings_on_walk(caplog, config=config)
     assert [re.match(r"stream (\d): 0 anchors were used in 10 frames of a moving camera", m)[1] for m in messages] == [
         "0",
         "1",
     ]
-    assert said(caplog, config=config, frames=WALK[:1] * 14)[0] == []
+    assert warnings_on_walk(caplog, config=config, frames=WALK[:1] * 14)[0] == []
     rng, n = np.random.default_rng(0), 40
     pixel = torch.tensor(np.stack([rng.uniform(0, W - 1, (2, n)), rng.uniform(0, H - 1, (2, n))], -1))
     far = Anchors(pixel, torch.full((2, n), 2.0).double(), torch.full((2, n), 1e-2).double())
-    assert said(caplog, config=config, anchors=far)[0] == []
+    assert warnings_on_walk(caplog, config=config, anchors=far)[0] == []
 
 
 def turned_K(factor):
-    """K as if for an image ``factor`` times as large."""
+    """K for an image ``factor`` times as large."""
     return K * [[factor], [factor], [1]]
 
 
 SWAPPED = np.array([[K[0, 0], 0, K[1, 2]], [0, K[1, 1], K[0, 2]], [0, 0, 1]])
 STEPS = 18
-# By name: depth [H, W], pose, K and further arguments of frame i, made of right ones; and how it is named.
+# By name: a function from frame i's correct depth [H, W] and pose to wrong depth, pose, K and options; and the warning.
 SPOILT = {
     "cx and cy swapped": (lambda i, d, T: (d, T, SWAPPED, {}), "0.38 of the width and 0.67 .* are cx and cy swapped"),
     "K of a smaller image": (lambda i, d, T: (d, T, turned_K(0.35), {}), "or are these the intrinsics of an image of"),
@@ -116,11 +116,11 @@ SPOILT = {
 @pytest.mark.parametrize("mistake", SPOILT)
 def test_what_frames_show_is_named_once(caplog, mistake):
     change, words = SPOILT[mistake]
-    walk = [scenes.look([0.1 * i, 0.02 * i, -0.04 * i], 0.05 * i) for i in range(STEPS)]
+    walk = [scenes.camera_pose([0.1 * i, 0.02 * i, -0.04 * i], 0.05 * i) for i in range(STEPS)]
     ufm = UfMStar(CONFIG)
     for i, T in enumerate(walk):
-        depth, pose, camera, given = change(i, scenes.render(T, K, H, W), T)
-        ufm(depth[None], pose, camera, **{name: value[None] for name, value in given.items()})
+        depth, pose, camera, options = change(i, scenes.render(T, K, H, W), T)
+        ufm(depth[None], pose, camera, **{name: value[None] for name, value in options.items()})
     assert len([text for text in caplog.messages if re.search(words, text)]) == 1, caplog.messages
 
 
@@ -152,7 +152,7 @@ def late(sequence, frames):
 
 
 def of_size(sequence, factor):
-    """Intrinsics for images ``factor`` times as large; raises ValueError as opening such a sequence does."""
+    """Intrinsics for images ``factor`` times as large. Raises ValueError as opening such a sequence does."""
     K = sequence.intrinsics * np.array([[factor], [factor], [1]])
     check_intrinsics("intrinsics", K, sequence.image_size)
     entries = tuple(replace(entry, intrinsics=None) for entry in sequence.entries)
@@ -163,7 +163,7 @@ def same(x):
     return x
 
 
-# By name: the sequence that is made of a right one, its depth, and the words in which it is named.
+# By name: a function that spoils the sequence, one that spoils its depth, and part of the reported problem.
 MISTAKES = {
     "world-to-camera poses": (lambda s: posed(s, np.linalg.inv), same, "poses look|images belong together under no"),
     "OpenGL axes": (lambda s: posed(s, lambda T: T @ OPENGL), same, "poses look|images belong together under no"),
@@ -180,7 +180,8 @@ MISTAKES = {
     "depth in millimetres": (same, lambda d: 1000 * d, "not in metres"),
     "inverse depth": (same, lambda d: 1 / np.maximum(d, 1e-3) * (d > 0), "is it inverse depth"),
 }
-# On tours, of which some move so evenly that poses of another frame fit as well; of six.
+# The lowest number of six tours in which the mistake is found; on some tours the motion is so even that poses of
+# another frame fit as well.
 LATE = {"trajectory 1 frame late": 2, "trajectory 2 frames late": 3, "trajectory 3 frames late": 4}
 
 
@@ -197,7 +198,7 @@ def followed(name):
 
 
 def problems(name, change=same, spoil=same):
-    """The problem that is found in a sequence with changed poses or intrinsics and spoilt depth."""
+    """The problem reported for a sequence with changed poses or intrinsics and changed depth."""
     sequence, corners, depth = followed(name)
     try:
         sequence = change(sequence)
@@ -231,20 +232,20 @@ def test_each_mistake_is_named(mistake):
 
 
 def rigid(R, t):
-    """[4, 4] of a rotation and a position."""
+    """[4, 4] pose from a rotation and a position."""
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = R, t
     return out
 
 
 def noisy(T, rng, degrees):
-    """The pose turned about a random axis."""
+    """The pose rotated about a random axis."""
     turn = Rotation.from_rotvec(np.radians(degrees) * rng.normal(size=3)).as_matrix()
     return rigid(T[:3, :3] @ turn, T[:3, 3])
 
 
 def wxyz(T):
-    """The pose whose quaternion was read in the other order."""
+    """The pose after its quaternion is read in the wrong order."""
     return rigid(Rotation.from_quat(np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), 1)).as_matrix(), T[:3, 3])
 
 
@@ -270,7 +271,7 @@ def test_corrupted_poses_are_named(kind, seed):
         problem = problems(name, change)
         assert "poses disagree with the images" in problem, name
         for still in re.findall(r"corners fit to ([\d.]+) px then", problem):
-            assert float(still) <= max(1, 0.005 * followed(name)[0].image_size[1]), "what does not fit is no remedy"
+            assert float(still) <= max(1, 0.005 * followed(name)[0].image_size[1]), "a misfit is no remedy"
 
 
 @pytest.mark.slow

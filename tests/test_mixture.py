@@ -1,4 +1,4 @@
-"""The figures of a posterior as the mixture that it states."""
+"""The metrics of the posterior's two-component mixture."""
 
 from __future__ import annotations
 

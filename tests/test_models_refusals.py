@@ -1,4 +1,4 @@
-"""Refusals of the networks' settings and calls: the call, and the argument that the message names."""
+"""Invalid settings and calls of the networks: the message names the argument."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ resnet = partial(MonodepthResNet, 18)
 
 
 def members(*sizes: int) -> list[DepthNetwork]:
-    """Networks whose inputs have these heights [px]."""
+    """Networks with inputs of these heights [px]."""
     return [wrap_network(Linear(), preprocess=Preprocess(size=(size, 8))) for size in sizes]
 
 

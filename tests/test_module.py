@@ -1,4 +1,4 @@
-"""UfMStar as a user of nn.Module expects it: state, devices, dtypes, bad input, subsets, queries."""
+"""UfMStar as an nn.Module: state, devices, dtypes, bad input, subsets, queries."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ pytestmark = pytest.mark.numerics
 
 @pytest.mark.parametrize("cut", [1, 4])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["depth32", "depth64"])
-@pytest.mark.parametrize("own", [torch.float32, torch.float64], ids=["state32", "state64"])
-def test_saved_state_continues_bit_for_bit(tmp_path, cut, dtype, own):
-    whole = UfMStar(CONFIG.replace(initial_capacity=4), dtype=own)
+@pytest.mark.parametrize("state_dtype", [torch.float32, torch.float64], ids=["state32", "state64"])
+def test_saved_state_continues_bit_for_bit(tmp_path, cut, dtype, state_dtype):
+    whole = UfMStar(CONFIG.replace(initial_capacity=4), dtype=state_dtype)
     expected = [whole(*frame(i, dtype)).variance for i in range(8)]
     assert {e.dtype for e in expected} == {dtype}
-    first = UfMStar(CONFIG.replace(initial_capacity=4), dtype=own)
+    first = UfMStar(CONFIG.replace(initial_capacity=4), dtype=state_dtype)
     for i in range(cut):
         first(*frame(i, dtype))
-    second = UfMStar(CONFIG.replace(initial_capacity=4), dtype=own)
+    second = UfMStar(CONFIG.replace(initial_capacity=4), dtype=state_dtype)
     if cut == 1:
         safetensors.torch.save_file(first.state_dict(), tmp_path / "state.safetensors")
         second.load_state_dict(safetensors.torch.load_file(tmp_path / "state.safetensors"))
@@ -46,7 +46,7 @@ def test_saved_state_continues_bit_for_bit(tmp_path, cut, dtype, own):
 
 
 def put(index, value):
-    """An edit that writes a value (a number, or a function of the old ones) at an index of a tensor."""
+    """Return an edit of a tensor that writes a value (a number, or a function of the old values) at an index."""
 
     def edit(tensor):
         tensor[index] = value(tensor[index]) if callable(value) else value
@@ -121,8 +121,8 @@ def test_a_frame_does_not_mutate_what_it_is_given():
     copies = [x.clone() for x in (depth, pose, intrinsics)]
     ufm = UfMStar(CONFIG)
     ufm(depth, pose, intrinsics)
-    for given_, kept in zip((depth, pose, intrinsics), copies, strict=True):
-        assert same(given_.double(), kept.double())
+    for value, original in zip((depth, pose, intrinsics), copies, strict=True):
+        assert same(value.double(), original.double())
 
 
 @pytest.mark.parametrize("cast", [torch.float64, torch.float32, torch.float16, torch.bfloat16])
@@ -230,7 +230,8 @@ def test_growth_by_doubling_keeps_everything():
 
 @pytest.mark.parametrize("limit", [5, 14])
 def test_max_components_drops_the_farthest_in_both_tiers(limit):
-    """The mixture is the one without a limit, less the components farthest from the camera; each is counted."""
+    """The mixture equals the one without a limit minus the components farthest from the camera; the drops are
+    counted."""
     limited = CONFIG.replace(initial_capacity=2, max_components=limit)
     tiers = [UfMStar(limited.replace(backend=backend), dtype=torch.float64) for backend in ("torch", "numba")]
     free, dropped, before, earlier = UfMStar(CONFIG, dtype=torch.float64), 0, 0, []
@@ -253,23 +254,23 @@ def test_max_components_drops_the_farthest_in_both_tiers(limit):
             where = torch.linalg.inv(free.T_world_first[0]) @ torch.tensor(POSES[i])
             far = (free.mixture.mean[0, : len(earlier)] - where[:3, 3]).square().sum(-1)
             gone = far.sort(descending=True).indices[: k - limit]
-            kept = [n for n in range(k) if n not in gone.tolist()][:limit]
-            torch.testing.assert_close(tiers[0].mixture.mean[0], free.mixture.mean[0, kept], rtol=1e-9, atol=1e-12)
+            retained = [n for n in range(k) if n not in gone.tolist()][:limit]
+            torch.testing.assert_close(tiers[0].mixture.mean[0], free.mixture.mean[0, retained], rtol=1e-9, atol=1e-12)
             free = None
     assert dropped > 0
     assert free is None
     assert tiers[0].mean.shape[1] == tiers[1].mean.shape[1] == limit
 
 
-def test_of_equally_far_components_the_oldest_is_dropped_and_sums_follow():
+def test_the_oldest_of_equally_far_components_is_dropped_and_sums_follow():
     mean = torch.tensor([[[0.0, 0, 1], [0, 0, 2], [0, 2, 0], [0, 0, 0.5], [0, 0, 9]]])
     empty = GaussianMixture.empty(1, 5, dtype=torch.float32, device="cpu")
     mixture = empty.replace(mean=mean, weight=torch.tensor([[1.0, 2, 3, 4, 0]]))
     sums = {"evidence": torch.arange(4.0)[None, :, None]}
-    for old, coming, kept, dropped in ((4, 1, [0, 2, 3], 1), (4, 3, [3], 3), (2, 1, [0, 2, 3], 1), (2, 3, [2], 2)):
+    for old, coming, retained, dropped in ((4, 1, [0, 2, 3], 1), (4, 3, [3], 3), (2, 1, [0, 2, 3], 1), (2, 3, [2], 2)):
         room = make_room(mixture, sums, torch.tensor([old]), torch.tensor([coming]), torch.zeros(1, 3), 4)
-        assert (room.mixture.weight[0] - 1)[: len(kept)].tolist() == kept
-        assert room.sums["evidence"][0, :, 0].tolist() == kept + [0] * (5 - len(kept))
+        assert (room.mixture.weight[0] - 1)[: len(retained)].tolist() == retained
+        assert room.sums["evidence"][0, :, 0].tolist() == retained + [0] * (5 - len(retained))
         assert int(room.dropped) == dropped
 
 
@@ -286,13 +287,13 @@ def test_mean_uncertainty(average):
         exact = all_of_it.mean_uncertainty(depth, pose, intrinsics, a, fraction=1.0, average=average)
         assert exact.mean.item() == pytest.approx(truth, rel=1e-5)
         assert exact.pixels.item() == out.valid.sum().item()
-        assert exact.standard_error.item() < 1e-12, "no pixel is left to draw"
+        assert exact.standard_error.item() < 1e-12, "every pixel is sampled"
         if not average:
             estimate = sampled.mean_uncertainty(depth, pose, intrinsics, a, pixels=200, seed=i)
             assert estimate.pixels.item() == 200
             assert abs(estimate.mean.item() - truth) <= 3 * estimate.standard_error.item() + 1e-12
     if not average:
-        assert unchanged(sampled, all_of_it.state_dict())  # the state does not depend on where it is read
+        assert unchanged(sampled, all_of_it.state_dict())  # the state does not depend on the query's pixels
         state = copy.deepcopy(sampled.state_dict())
         means = []
         for seed in (3, 3, 4):
@@ -317,9 +318,9 @@ def test_query_is_the_dense_map_at_its_own_points():
 
 
 class Transfers(TorchDispatchMode):
-    """Counts what crosses between devices and waits, on fake tensors: no accelerator is needed.
+    """Records synchronising transfers between devices, on fake tensors: no accelerator is needed.
 
-    Fake tensors have no values, so what depends on one raises: with a fixed capacity nothing is read at all."""
+    Reading a fake tensor's value raises: with a fixed capacity, the step reads no value."""
 
     def __init__(self):
         super().__init__()
@@ -335,17 +336,17 @@ class Transfers(TorchDispatchMode):
         return out
 
 
-@pytest.mark.parametrize("given", ["all there", "pose and intrinsics on the host"])
-def test_nothing_waits_for_the_accelerator(given):
+@pytest.mark.parametrize("location", ["all on the device", "pose and intrinsics on the host"])
+def test_nothing_waits_for_the_accelerator(location):
     config = UfMStarConfig(segment=SPGF, backend="torch", initial_capacity=16, max_components=16, on_bad_frame="skip")
     with FakeTensorMode(allow_non_fake_inputs=True):
         ufm = UfMStar(config, device="cuda")
         depth = torch.empty(1, 2, 6, device="cuda")  # each row takes fake tensors seconds
-        device = "cuda" if given == "all there" else "cpu"
+        device = "cuda" if location == "all on the device" else "cpu"
         pose, intrinsics = torch.empty(1, 4, 4, device=device), torch.empty(1, 3, 3, device=device)
         with Transfers() as transfers:
             out = ufm(depth, pose, intrinsics, aleatoric=torch.empty_like(depth))
-            if given == "all there":  # where pose and intrinsics lie matters until they are checked, which is common
+            if location == "all on the device":  # after the check of a frame both cases are the same
                 ufm.mean_uncertainty(depth, pose, intrinsics, pixels=5)
                 ufm.query(torch.empty(1, 3, 3, device="cuda"))
     assert transfers.waits == []

@@ -1,4 +1,4 @@
-"""Bad input of the core: an error that names the argument, or a counted skip; the state stays whole."""
+"""Invalid input of the core: an error that names the argument, or a counted skip; the state stays valid."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ D, K1 = torch.ones(2, 5, 6), torch.tensor([[5.0, 0, 3], [0, 5, 2], [0, 0, 1]]).e
 
 
 def begun() -> UfMStar:
-    """A module with a frame."""
+    """A module after one frame."""
     ufm = UfMStar(CONFIG)
     ufm(*frame(0))
     return ufm
 
 
 settings, segment = UfMStarConfig.from_dict, SPGFConfig.from_dict
-# Of arguments that are no frame's: those are in test_core_arguments.py.
+# Arguments other than a frame's; a frame's arguments: test_core_arguments.py.
 REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: begun().reset([7]), "7"),
     (lambda: begun().reset(torch.tensor([True, False])), "mask"),
@@ -78,7 +78,7 @@ def edited(matrix: Tensor, at: tuple[int, int], value: float) -> Tensor:
     return matrix
 
 
-# The camera of a frame, made wrong, and what is said.
+# An edit that makes a frame's camera invalid, and part of the error message.
 FAULTS: dict[str, tuple[Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], str]] = {
     "NaN": (lambda T, K: (edited(T, (0, 3), NAN), K), "stream 0: pose holds NaN"),
     "infinite": (lambda T, K: (edited(T, (1, 1), -INF), K), "stream 0: pose holds NaN"),
@@ -104,7 +104,8 @@ FAULTS: dict[str, tuple[Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], str]]
 
 @pytest.mark.parametrize(("name", "backend"), [("NaN", "torch"), *((name, "numba") for name in FAULTS)])
 def test_a_camera_at_fault_is_refused_or_skipped_and_the_state_stays(name, backend):
-    """Alone; and counted, beside a stream that goes on. A first frame at fault does not anchor its stream."""
+    """A single stream; and a counted skip, while another stream continues. An invalid first frame does not define its
+    stream's world frame."""
     spoil, message = FAULTS[name]
     depth, pose, _ = frame(1)
     config = CONFIG.replace(backend=backend)

@@ -31,7 +31,7 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 
 def random_like(state: Mapping[str, Tensor], seed: int) -> dict[str, Tensor]:
-    """Other values for every tensor, of a size that keeps activations in range."""
+    """Random values for every tensor, scaled to keep activations in range."""
     generator, result = seeded(seed), {}
     for key, value in state.items():
         if not value.is_floating_point():
@@ -63,7 +63,7 @@ def random_classifier(layers: int, seed: int) -> dict[str, Tensor]:
 
 
 def classifier_weights(layers: int = 18, seed: int = 1) -> dict[str, Tensor]:
-    """The state_dict of a whole classifier, as torchvision publishes it."""
+    """The state_dict of a complete classifier, like torchvision's."""
     return {name: value.clone() for name, value in random_classifier(layers, seed).items()}
 
 
@@ -91,7 +91,7 @@ def test_untrained_depth_is_a_rooms() -> None:
 
 
 def decoder_of_the_paper(state: Mapping[str, Tensor], maps: list[Tensor]) -> Tensor:
-    """Monodepth2's decoder, written out with the keys that its repository publishes, up to the last features."""
+    """Monodepth2's decoder up to the last features, written independently, with the published keys."""
 
     def convolve(x: Tensor, n: int) -> Tensor:
         x = F.pad(x, (1, 1, 1, 1), mode="reflect")
@@ -132,7 +132,7 @@ def write_published(
 
 
 def test_published_weights_are_taken(tmp_path: Path) -> None:
-    """Every tensor is taken but those of classifier and disparities."""
+    """Every tensor is loaded except those of the classifier and the disparities."""
     network = small()
     before = {key: value.clone() for key, value in network.state_dict().items()}
     decoder = published_decoder(network.encoder.channels, SMALL)
@@ -146,7 +146,8 @@ def test_published_weights_are_taken(tmp_path: Path) -> None:
 
 
 def test_published_weights_predict_metric_depth(tmp_path: Path) -> None:
-    """Weights of stereo pairs predict 5.4 m over a disparity from 1 / 100 to 1 / .1, of the finest convolution."""
+    """Weights trained on stereo pairs predict depth = 5.4 m / disparity, with the finest disparity scaled to 1/100 ...
+    1/.1."""
     decoder = published_decoder((64, 64, 128, 256, 512), SMALL)
     write_published(tmp_path, classifier_weights(), decoder, stereo=True)
     network = load_network("monodepth2", tmp_path)
@@ -187,8 +188,8 @@ def test_published_weights_of_single_images_need_a_scale(tmp_path: Path) -> None
 
 
 def test_colours_are_renormalised(tmp_path: Path) -> None:
-    """The stem on an image normalised as ImageNet's equals the published one on (x - .45) / .225, but for
-    the two pixels at the border that see the padding."""
+    """The stem on an image with ImageNet's normalisation equals the published stem on (x - .45) / .225, except within
+    two pixels of the padded border."""
     import torchvision.models
 
     weights = classifier_weights()
@@ -204,7 +205,7 @@ def test_colours_are_renormalised(tmp_path: Path) -> None:
         observed = network.encoder.bn1(network.encoder.conv1((image - mean) / std))
         torch.testing.assert_close(observed[..., 2:-2, 2:-2], expected[..., 2:-2, 2:-2], rtol=1e-4, atol=1e-4)
         difference = (observed - expected).abs()
-        assert float(difference.max()) > 1e-3, "the border is padded with another colour"
+        assert float(difference.max()) > 1e-3, "the padding is another colour"
 
 
 def test_what_does_not_fit_is_refused_and_loads_nothing(tmp_path: Path) -> None:
@@ -233,7 +234,7 @@ def test_what_does_not_fit_is_refused_and_loads_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
 @pytest.mark.parametrize("half", [False, True])
 def test_imagenet_from_a_file(tmp_path: Path, suffix: str, half: bool) -> None:
-    """The encoder computes what torchvision's classifier does up to its pooling."""
+    """The encoder equals torchvision's classifier up to its pooling."""
     import torchvision.models
 
     weights = classifier_weights()
@@ -258,7 +259,7 @@ def test_imagenet_counts_every_tensor(tmp_path: Path) -> None:
         torch.save(dict(changed), tmp_path / "w.pth")
         return MonodepthResNet.imagenet(tmp_path / "w.pth", layers, decoder=SMALL)
 
-    load({k: v for k, v in weights.items() if not k.endswith("num_batches_tracked")})  # as old files are
+    load({k: v for k, v in weights.items() if not k.endswith("num_batches_tracked")})  # like old files
     with pytest.raises(CheckpointError, match=r"w.pth does not fit ResNetEncoder \(120 keys\): 1 unexpected: extra"):
         load(weights | {"extra": torch.zeros(1)})
     with pytest.raises(CheckpointError, match="does not fit ResNetEncoder"):
@@ -266,7 +267,7 @@ def test_imagenet_counts_every_tensor(tmp_path: Path) -> None:
 
 
 def test_a_variance_beyond_half_precision(tmp_path: Path) -> None:
-    """Stored as infinity it would silence its channel: it becomes 65504. Any other infinity is a fault."""
+    """Stored as infinity, the variance would zero its channel, so it becomes 65504. Any other infinity is an error."""
     weights = classifier_weights()
     weights["bn1.running_var"][3] = 1e5
     half = {k: v.half() if v.is_floating_point() else v for k, v in weights.items()}
@@ -278,7 +279,7 @@ def test_a_variance_beyond_half_precision(tmp_path: Path) -> None:
     torch.save(half, tmp_path / "w.pth")
     with pytest.raises(CheckpointError, match=r"NaN or infinity: bn1.running_mean"):
         MonodepthResNet.imagenet(tmp_path / "w.pth", 18, decoder=SMALL)
-    weights["bn1.running_var"][3] = float("inf")  # in single precision it is no overflow
+    weights["bn1.running_var"][3] = float("inf")  # in single precision the value does not overflow
     torch.save(weights, tmp_path / "w.pth")
     with pytest.raises(CheckpointError, match=r"NaN or infinity: bn1.running_var"):
         MonodepthResNet.imagenet(tmp_path / "w.pth", 18, decoder=SMALL)

@@ -1,4 +1,4 @@
-"""docs/networks.md: every piece of code on the page runs, in order, on small files of the names it uses."""
+"""docs/networks.md: the code blocks run in order, on small files with the page's names."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def blocks() -> list[str]:
 
 
 def write_files(folder: Path) -> None:
-    """Small networks under the names that the page uses."""
+    """Write small networks under the page's file names."""
     torch.manual_seed(0)
     write_fastdepth(folder / "fastdepth_nyu.onnx", small_network())
     weights = classifier_weights(50)
@@ -42,7 +42,7 @@ def write_files(folder: Path) -> None:
 
 
 def camera() -> dict[str, Any]:
-    """Images, intrinsics and measured depth, which the page takes for given; the alignment is 0.05 x + 0.1 [1/m]."""
+    """The page's inputs: images, intrinsics and measured depth; the alignment is 0.05 x + 0.1 [1/m]."""
     images = torch.randint(0, 256, (2, 3, 60, 80), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     K = torch.tensor([[70.0, 0, 39.5], [0, 70.0, 29.5], [0, 0, 1]], dtype=torch.float64)
     relative = DepthAnything.from_pretrained("Depth-Anything-V2-Small-hf")

@@ -29,7 +29,7 @@ def test_statistics_are_of_depth_parts_motion_and_landmarks():
     c, s = math.cos(0.3), math.sin(0.3)
     motion = torch.tensor([[c, -s, 0, 0.6], [s, c, 0, 0], [0, 0, 1, 0.8], [0, 0, 0, 1]])
     result, plain = statistics_of(UfMStarConfig(backend="torch"), motion)
-    assert len(plain) == 4 * 4 + 4  # V, M, A and depth; what was measured, motion and landmarks
+    assert len(plain) == 4 * 4 + 4  # V, M, A and depth; measured pixels, motion and landmarks
     depth = float(result.depth.mean)
     expected = [float(result.measured), 1 / depth, 0.3, 0]
     np.testing.assert_allclose(plain[-4:], expected, rtol=1e-5)
@@ -45,7 +45,7 @@ def test_statistics_are_of_depth_parts_motion_and_landmarks():
 
 
 def images(count, seed=0):
-    """Statistics [count, 5] of images, and the gain of an update on each: .1 from the second of them, and noise."""
+    """Statistics [count, 5] of images, and the gain of an update on each: .1 times the second statistic, and noise."""
     rng = np.random.default_rng(seed)
     x = torch.from_numpy(rng.normal(size=(count, 5)))
     return x, 0.1 * x[:, 1] + 0.01 * torch.from_numpy(rng.normal(size=count))
@@ -81,7 +81,7 @@ def test_it_trains_where_that_pays():
     free = TrainDecision(-1.0)
     for one, value in zip(x[:20], gain, strict=False):
         free.learn(one, float(value))
-    assert all(free(one) for one in x), "an update that costs less than nothing is always made"
+    assert all(free(one) for one in x), "with a negative cost every update is made"
 
 
 def test_old_updates_fade():
@@ -114,6 +114,6 @@ def test_what_makes_no_sense_is_refused():
 def test_the_example_counts_its_updates(capsys):
     results = example.main(walks=1, frames=10, cost=9.0)
     assert {name: row[0] for name, [row] in results.items()} == {"decided": 8, "random": 8, "all": 10, "none": 0}
-    assert results["random"] == results["decided"], "the same images, the same error"
+    assert results["random"] == results["decided"], "the same images give the same error"
     assert len({row[1] for [row] in results.values()}) == 3
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(results)

@@ -21,7 +21,7 @@ COEFFICIENTS = (0.5, 0.25, 2.0)  # depth = .5 R + .25 G + 2 B
 
 
 def depth_of(image: Tensor) -> Tensor:
-    """[B, H, W] what the tiny graphs compute from an RGB image [B, 3, H, W]."""
+    """[B, H, W] the depth that the tiny graphs compute from an RGB image [B, 3, H, W]."""
     return (image * image.new_tensor(COEFFICIENTS)[:, None, None]).sum(1)
 
 
@@ -60,7 +60,7 @@ def write(
 
 
 def write_with_camera(path: Path, shape: list[int | str], camera: list[int | str], names: tuple[str, str]) -> Path:
-    """depth = the first channel times fx, of an image in single and intrinsics in double precision."""
+    """depth = the first channel times fx; the image is single, the intrinsics double precision."""
     fx = numpy_helper.from_array(np.array([[1, 0, 0]], np.float64), "fx")
     ones = numpy_helper.from_array(np.array([[1], [0], [0]], np.float64), "ones")
     shape_of = numpy_helper.from_array(np.array([-1, 1, 1, 1], np.int64), "shape")
@@ -80,7 +80,7 @@ def write_with_camera(path: Path, shape: list[int | str], camera: list[int | str
 
 @pytest.mark.parametrize("batch", ["n", 1])
 def test_a_second_input_for_the_intrinsics(tmp_path: Path, image: Tensor, batch: int | str) -> None:
-    """Image by image its own camera, also where the graph takes one at a time; copies too."""
+    """Every image has its camera, also with a graph for one image at a time, and in copies of the network."""
     path = write_with_camera(tmp_path / "n.onnx", [batch, 3, "h", "w"], [batch, 3, 3], ("image", "K"))
     spec = {"outputs": {"kind": "metric", "focal": 300.0}, "takes_intrinsics": True, "input": "image"}
     K = torch.diag_embed(torch.tensor([[300.0, 300, 1], [600, 600, 1], [200, 100, 1]], dtype=torch.float64))
@@ -127,7 +127,7 @@ def test_depth_of_every_image_in_the_batch(tmp_path: Path, image: Tensor, shape:
 
 
 def test_layout_channels_and_scale(tmp_path: Path, image: Tensor) -> None:
-    """NHWC, and a graph that wants blue first, in millimetres."""
+    """NHWC, and a BGR graph with depth in millimetres."""
     path = write(tmp_path / "n.onnx", nhwc=True, coefficients=COEFFICIENTS[::-1])
     spec = OnnxSpec(OutputSpec("metric", scale=0.001), layout="NHWC", channels="bgr")
     torch.testing.assert_close(OnnxNetwork(path, spec)(image).depth, depth_of(image) / 1000)
@@ -139,7 +139,7 @@ def test_layout_channels_and_scale(tmp_path: Path, image: Tensor) -> None:
     ids=["half", "double", "bytes"],
 )
 def test_input_types(tmp_path: Path, image: Tensor, kind: int, value_range: float, tolerance: float) -> None:
-    """The graph's own input type is served; bytes are rounded, by at most half of one each."""
+    """The image is converted to the graph's input type; bytes are rounded, so by at most half a level."""
     spec = OnnxSpec(METRIC, Preprocess(value_range=value_range))
     network = OnnxNetwork(write(tmp_path / "n.onnx", kind=kind), spec)
     x = network.preprocess.apply_image(image)
@@ -147,7 +147,7 @@ def test_input_types(tmp_path: Path, image: Tensor, kind: int, value_range: floa
 
 
 def test_variances_in_square_metres(tmp_path: Path, image: Tensor) -> None:
-    """Outputs by their names; the kinds of spreads: test_any_network.py."""
+    """Outputs are selected by name. The kinds of spreads: test_any_network.py."""
     path = write(tmp_path / "n.onnx", spread="spread")
     outputs = OutputSpec("metric", "depth", 0.5, aleatoric="spread", aleatoric_kind="log_std")
     prediction = OnnxNetwork(path, OnnxSpec(outputs))(image)
@@ -156,7 +156,7 @@ def test_variances_in_square_metres(tmp_path: Path, image: Tensor) -> None:
 
 
 def test_a_fixed_size_becomes_the_preprocessing(tmp_path: Path) -> None:
-    """The size in the graph need not be declared, and a contradicting declaration is refused."""
+    """The graph's fixed size needs no declaration; a contradicting declaration is refused."""
     path = write(tmp_path / "n.onnx", ["n", 3, 6, 8])
     assert OnnxNetwork(path, OnnxSpec(METRIC)).preprocess == Preprocess(size=(6, 8))
     cropped = Preprocess(resize_height=20, crop=(12, 16))
@@ -199,7 +199,7 @@ def test_names_and_images_that_do_not_fit(tmp_path: Path, name: str) -> None:
 
 
 def pooled(tmp_path: Path) -> Path:
-    """Depth at half the resolution, as many networks have it."""
+    """Depth at half the resolution."""
     nodes = [
         helper.make_node("ReduceMax", ["image"], ["max"], axes=[1], keepdims=1),
         helper.make_node("MaxPool", ["max"], ["depth"], kernel_shape=[2, 2], strides=[2, 2]),
@@ -208,7 +208,7 @@ def pooled(tmp_path: Path) -> Path:
 
 
 def test_outputs_of_another_resolution(tmp_path: Path, image: Tensor) -> None:
-    """Refused, because the input's intrinsics would not fit; repeated pixel by pixel when asked."""
+    """By default refused, because the input's intrinsics would not fit; optionally repeated pixel by pixel."""
     path = pooled(tmp_path)
     with pytest.raises(ValueError, match=r"output 'depth' has \(3, 4\) px, expected the input's \(6, 8\)"):
         OnnxNetwork(path, OnnxSpec(METRIC))(image)
@@ -227,7 +227,7 @@ def test_outputs_of_another_resolution(tmp_path: Path, image: Tensor) -> None:
 def test_a_graph_with_a_defect_is_named(
     tmp_path: Path, image: Tensor, operation: str, inputs: list[str], options: dict[str, Any], message: str
 ) -> None:
-    """More of them: test_any_network.py."""
+    """Further defects: test_any_network.py."""
     red = numpy_helper.from_array(np.array([[[[1]], [[0]], [[0]]]], np.float32), "red")
     one = numpy_helper.from_array(np.array(2, np.float32), "one")
     nodes = [
@@ -251,7 +251,7 @@ def test_files_that_are_no_graphs(tmp_path: Path, content: bytes | None) -> None
 
 
 def test_a_node_that_fails_at_run_time_names_the_file(tmp_path: Path) -> None:
-    """A graph whose reshape fits images of 8 x 8 only, although its input is open."""
+    """A graph whose reshape works for 8 x 8 images only, although its input size is dynamic."""
     red = numpy_helper.from_array(np.array([[[[1]], [[0]], [[0]]]], np.float32), "red")
     shape = numpy_helper.from_array(np.array([1, 1, 8, 8], np.int64), "shape")
     nodes = [

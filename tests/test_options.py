@@ -1,4 +1,4 @@
-"""Command lines from dataclasses: every form of an option, configuration files, help, and what is refused."""
+"""Command lines from dataclasses: every kind of option, configuration files, help, and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The example of a head on a network of one's own, with a few frames."""
+"""The example train_own_head.py, with a few frames."""
 
 from __future__ import annotations
 
@@ -26,6 +26,6 @@ def test_its_table_has_every_row(tmp_path, capsys, monkeypatch):
     assert list(figures) == rows
     assert all(math.isfinite(row[name]) for row in figures.values() for name in example.LOGGED)
     assert [line[:18].strip() for line in capsys.readouterr().out.splitlines() if line.startswith(tuple(rows))] == rows
-    # The head leaves the depth as it is.
+    # The head does not change the depth.
     assert figures["constant"]["rmse"] == pytest.approx(figures["head: network"]["rmse"], rel=1e-6)
     assert len(EXAMPLE.read_text().splitlines()) < 60

@@ -1,4 +1,4 @@
-"""Plug-ins, by the example: a method, a metric and a reader of one's own, in eval, report, run and data check."""
+"""The plug-in example own_method.py: a method, a metric and a reader, in eval, report, run and data check."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NETWORK = "depth_only=ground-truth"
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
-    """A sequence in the example's own layout, whose images alone say how far all is."""
+    """A sequence in the example's layout, whose images encode the depth."""
     scene = layouts.truth(layouts.resized(500, 510, 310, 245, (480, 640)))
     path = tmp_path_factory.mktemp("data") / "walk.npz"
     depths, poses = np.float32(scene.depths), np.array(scene.T_world_cam)
@@ -64,7 +64,7 @@ def test_the_reader_is_everywhere(walk, tmp_path, capfd):
     np.testing.assert_allclose(undistorted.intrinsics, lens.K, atol=1e-12)
     assert (undistorted.image != scene.images[3]).any()
     np.testing.assert_allclose(sequence[3].depth, scene.depths[3], rtol=1e-6)
-    assert [one.layout for one in find_sequences(path.parent, plugin=[PLUGIN])] == []  # files are none below a folder
+    assert [one.layout for one in find_sequences(path.parent, plugin=[PLUGIN])] == []  # skips files
     assert [one.layout for one in find_sequences(path, plugin=[PLUGIN])] == ["npz"]
     assert cli.main(["data", "check", str(path), "--plugin", PLUGIN]) == 0
     out = tmp_path / "out"

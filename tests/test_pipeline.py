@@ -22,7 +22,7 @@ POSES = [torch.tensor(T) for T in scenes.tour(30)[:9]]
 
 
 class Scaled(nn.Module):
-    """A network whose image is the depth itself, times a factor of its own."""
+    """A network: depth = the image times a factor."""
 
     def __init__(self, factor: float, aleatoric: float | None = None) -> None:
         super().__init__()
@@ -94,7 +94,7 @@ def test_combine():
 
 
 class ByFocal(nn.Module):
-    """Depth = the image times fx [px] of the network's own input / 16."""
+    """Depth = the image times fx / 16, fx [px] of the network's input."""
 
     takes_intrinsics = True
 
@@ -106,7 +106,7 @@ class ByFocal(nn.Module):
 
 @pytest.mark.parametrize("mode", ["alternate", "full"])
 def test_the_preprocessed_intrinsics_reach_the_networks_that_take_them(mode):
-    """Half the size, half the focal length; a member that takes none is called as ever."""
+    """Half the size, half the focal length. A member without ``takes_intrinsics`` gets the image only."""
     half = Preprocess(size=(H // 2, W // 2))
     x = torch.rand(2, 3, H, W, generator=torch.Generator().manual_seed(0))
     model = UncertainDepth([ByFocal(), Scaled(1.0)], CONFIG, mode=mode, preprocess=half)
@@ -122,7 +122,7 @@ def test_the_preprocessed_intrinsics_reach_the_networks_that_take_them(mode):
 
 
 def test_the_mean_uncertainty_of_images():
-    """As UfM*'s own, with the members in turn; a call that fails does not advance the turn."""
+    """Equal to UfM*'s, with alternating members. A failed call does not advance the member index."""
     model, ufm = UncertainDepth([Scaled(1.0, 0.01), Scaled(1.2, 0.03)], CONFIG), UfMStar(CONFIG)
     for i in range(4):
         factor, a = ((1.0, 0.01), (1.2, 0.03))[i % 2]

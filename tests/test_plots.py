@@ -1,4 +1,4 @@
-"""Pictures: colours that mean what the bar says, sheets and videos that can be read back."""
+"""Pictures: colours that agree with the colour bar; sheets and videos that can be read back."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class TestContactSheet:
         contact_sheet(panels, tmp_path / "s.png", title="t")
         depth = map_columns(panels)[0].scale
         picture = load(tmp_path / "s.png")[..., :3]
-        # Every colour of both depth maps is in the picture, so both rows were drawn on the one scale.
+        # Every colour of both depth maps is in the picture, so both rows have one scale.
         shown = {tuple(c) for c in picture.reshape(-1, 3).tolist()}
         for one in panels:
             expected = {tuple(c) for c in depth.rgb(one.maps["depth"]).reshape(-1, 3).tolist()}

@@ -1,4 +1,4 @@
-"""Mixture files, parsed back by a reader of their own."""
+"""Mixture files, parsed by an independent reader."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def mixture(k: int = 7, *, streams: int = 2, seed: int = 0, dtype: torch.dtype =
 
 
 def matrix_of(q: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """[K, 3, 3] rotations of unit quaternions w x y z, by the textbook's formula."""
+    """[K, 3, 3] rotations of unit quaternions w x y z, from the textbook formula."""
     w, x, y, z = q.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -139,7 +139,7 @@ class TestSplats:
 
 
 def read_mixture_npz(path: Path) -> tuple[GaussianMixture, torch.Tensor | None]:
-    """As a user's program reads it: the fields of a mixture, and the pose."""
+    """Read the fields of a mixture and the pose, as a user's program would."""
     with np.load(path, allow_pickle=False) as stored:
         fields = {name: torch.from_numpy(stored[name]) for name in stored.files}
     T_world_first = fields.pop("T_world_first", None)

@@ -41,7 +41,7 @@ def test_a_walk_without_poses_gets_them(walk, reconstructed):
     assert found["residual"] < 0.03
     sequence = open_sequence(reconstructed, truth=str(folder / "depth"))
     assert sequence.metric
-    np.testing.assert_allclose(sequence.intrinsics, tour.intrinsics, atol=1e-9)  # known, and kept
+    np.testing.assert_allclose(sequence.intrinsics, tour.intrinsics, atol=1e-9)  # known and fixed
     for frame in sequence:
         assert np.linalg.norm(frame.T_world_cam[:3, 3] - truth[frame.name][:3, 3]) < 0.06
     depth = {frame.name: frame.depth for frame in tour}
@@ -49,7 +49,7 @@ def test_a_walk_without_poses_gets_them(walk, reconstructed):
     points, sigma = stored["points"], stored["sigma"]
     assert len(points) == found["landmarks"] > 50
     error = []
-    for frame in sequence:  # landmarks against the rendered depth, where they are in view
+    for frame in sequence:  # visible landmarks against the rendered depth
         T = np.linalg.inv(frame.T_world_cam)
         x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
         with np.errstate(all="ignore"):
@@ -109,14 +109,14 @@ def test_a_length_between_pixels_is_that_of_their_landmarks(walk, reconstructed)
     frame, model = walk[0][0], pycolmap.Reconstruction(reconstructed / "sparse" / "0")
     image = next(image for image in model.images.values() if image.name == f"{frame.name}.jpg")
     seen = sorted((p for p in image.points2D if p.has_point3D()), key=lambda point: point.xy[0])
-    places = [f"{frame.name}:{p.xy[0] - 0.5:.1f},{p.xy[1] - 0.5:.1f}" for p in (seen[0], seen[-1])]
+    positions = [f"{frame.name}:{p.xy[0] - 0.5:.1f},{p.xy[1] - 0.5:.1f}" for p in (seen[0], seen[-1])]
     expected = [model.points3D[p.point3D_id].xyz for p in (seen[0], seen[-1])]
-    ends = [endpoint(model, place) for place in places]
+    ends = [endpoint(model, position) for position in positions]
     np.testing.assert_allclose(ends, expected)
     apart = np.linalg.norm(ends[1] - ends[0])
-    assert scale_model(model, [], length=(*places, 3 * apart))["metres_per_unit"] == pytest.approx(3)
+    assert scale_model(model, [], length=(*positions, 3 * apart))["metres_per_unit"] == pytest.approx(3)
     np.testing.assert_allclose(
-        endpoint(model, places[0]) - endpoint(model, places[1]), 3 * (ends[0] - ends[1]), rtol=1e-6
+        endpoint(model, positions[0]) - endpoint(model, positions[1]), 3 * (ends[0] - ends[1]), rtol=1e-6
     )
     for bad, message in (
         ("nowhere", "has no pose"),

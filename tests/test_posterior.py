@@ -1,4 +1,4 @@
-"""The posterior: three tiers against each other, closed forms, and what UfM* makes of it."""
+"""The posterior: three tiers against each other, closed forms, and its use in UfM*."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def scene(seed, size=(36, 48), n=60):
 def checked(depth, pixel, g, variance):
     frame = check_frame(torch.from_numpy(depth)[None], torch.eye(4)[None], K[None], None, None, None, None,
                         feature_count=0, rotation_tolerance=0.01)  # fmt: skip
-    given = Anchors(*(torch.from_numpy(x)[None] for x in (pixel, g, variance)))
-    return frame, check_anchors(given, frame)
+    anchors = Anchors(*(torch.from_numpy(x)[None] for x in (pixel, g, variance)))
+    return frame, check_anchors(anchors, frame)
 
 
 @pytest.mark.parametrize("tier", [update, posterior_cpu.update], ids=["torch", "numba"])
@@ -84,22 +84,23 @@ def test_compiled_field_and_distance_equal_the_reference(rows, cols):
 
 
 def streams_of(seeds, dtype, size=(36, 48)):
-    """Frame, anchors and V of several streams; the last anchors of the first are not valid, the last has none."""
+    """Frame, anchors and V of several streams. The last anchors of the first stream are invalid; the last stream has
+    none."""
     scenes = [scene(seed, size) for seed in seeds]
     depth, claimed = (torch.from_numpy(np.stack([s[i] for s in scenes])).to(dtype) for i in (0, 2))
     b = len(seeds)
-    given = check_frame(depth, torch.eye(4).repeat(b, 1, 1), K.repeat(b, 1, 1), None, None, None, None,
+    frame = check_frame(depth, torch.eye(4).repeat(b, 1, 1), K.repeat(b, 1, 1), None, None, None, None,
                         feature_count=0, rotation_tolerance=0.01)  # fmt: skip
     valid = torch.ones(b, 60, dtype=torch.bool)
     valid[0, 50:] = valid[-1] = False
     stacked = (torch.from_numpy(np.stack([s[i] for s in scenes])).to(dtype) for i in (3, 4, 5))
     claimed[:, 20, 30] = torch.nan
-    return given, check_anchors(Anchors(*stacked, valid), given, None), claimed
+    return frame, check_anchors(Anchors(*stacked, valid), frame, None), claimed
 
 
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-9), (torch.float32, 1e-5)])
 def test_compiled_update_equals_the_reference(dtype, rtol):
-    """Over frames, some streams without anchors in some frames, and V that is NaN at a valid pixel."""
+    """Over several frames, some without anchors in some streams, and with a V that is NaN at a valid pixel."""
     slow = fast = torch.zeros(3, SIZE, dtype=torch.float64)
     for seeds in ((0, 1, 2), (3, 0, 1), (4, 5, 4)):
         frame, anchors, claimed = streams_of(seeds, dtype)
@@ -136,11 +137,11 @@ def test_anchors_correct_a_wrong_scale_and_the_variance_covers_what_is_left():
     seen, truth = depth > 0, depth * factor
     error = (out.depth[0].numpy() - truth)[seen]
     assert np.sqrt((error**2).mean()) < 0.25 * np.sqrt(((depth - truth)[seen] ** 2).mean())
-    assert 0.02 < (error**2 / out.variance[0].numpy()[seen]).mean() < 1.5  # of few anchors it is cautious
+    assert 0.02 < (error**2 / out.variance[0].numpy()[seen]).mean() < 1.5  # conservative with few anchors
 
 
 def test_the_variance_grows_in_proportion_to_the_distance_from_evidence():
-    """A flat wall with anchors at its left edge: by what was learnt, a width of the image."""
+    """A flat wall with anchors at its left edge: the variance grows at the learnt rate over the image's width."""
     depth = np.full((28, 56), 2.0)
     pixel = np.stack([np.tile([1.0, 3.0], 14), np.repeat(np.arange(0.0, 28, 2), 2)], -1)
     _, out = updated(depth, (pixel, np.full(28, 2.2), np.full(28, 1e-4)), tier=update)
@@ -149,7 +150,8 @@ def test_the_variance_grows_in_proportion_to_the_distance_from_evidence():
 
 
 def test_an_error_that_held_out_anchors_show_makes_what_is_unseen_less_certain():
-    """Two surfaces of one predicted depth, off by different factors: the growth becomes a multiple of its start."""
+    """Two surfaces with one predicted depth and different error factors: the growth rate becomes a multiple of its
+    prior."""
     depth, packed = np.full((56, 56), 2.0), None
     rows, cols = (x.ravel() for x in np.mgrid[2:56:4, 2:56:4])
     pixel = np.stack([cols, rows], -1).astype(float)
@@ -173,33 +175,34 @@ def test_outliers_do_not_widen_what_is_stated_of_the_other_pixels():
 
 
 def test_where_the_field_jumps_the_depth_is_less_certain_than_on_either_side():
-    """A wall as predicted, and one whose right half is three times as far: its edge may lie a cell from where f has
-    it."""
+    """A wall as predicted, and one whose right half is three times as far: the true edge may be one cell off the edge
+    of f."""
     depth = np.full((56, 56), 2.0)
     rows, cols = (x.ravel() for x in np.mgrid[2:56:4, 2:56:4])
     for factor, least, most in ((1.0, 0.95, 1.05), (3.0, 1.5, 50.0)):
         packed, g = None, 2 * np.where(cols < 28, 1, factor)
         for _ in range(10):
             packed, out = updated(depth, (np.stack([cols, rows], -1) + 0.0, g, np.full(len(g), 1e-4)), packed=packed)
-        own = (out.inlier / out.depth.square())[0, 8:-8]
-        assert least < float(own[:, 24:32].mean() / own[:, 8:16].mean()) < most
+        relative_variance = (out.inlier / out.depth.square())[0, 8:-8]
+        assert least < float(relative_variance[:, 24:32].mean() / relative_variance[:, 8:16].mean()) < most
 
 
 @pytest.mark.parametrize("tier", [update, posterior_cpu.update], ids=["torch", "numba"])
 def test_a_region_whose_anchors_disagree_is_less_certain_than_one_whose_anchors_agree(tier):
-    """The anchors of the right half are off by 20 %, each its own, and those of the left half as stated."""
+    """The anchors of the right half have independent errors of 20 %, those of the left half the stated errors."""
     depth, rng, packed = np.full((56, 56), 2.0), np.random.default_rng(0), None
     rows, cols = (x.ravel() for x in np.mgrid[1:56:3, 1:56:3])
     for _ in range(8):
         g = 2 * np.exp(np.where(cols < 28, 0.02, 0.2) * rng.normal(size=len(cols)))
         packed, out = updated(depth, (np.stack([cols, rows], -1) + 0.0, g, (0.02 * g) ** 2), packed=packed, tier=tier)
-    own = (out.inlier / out.depth.square())[0]
-    assert float(own[:, 34:].mean()) > 4 * float(own[:, :22].mean())
+    relative_variance = (out.inlier / out.depth.square())[0]
+    assert float(relative_variance[:, 34:].mean()) > 4 * float(relative_variance[:, :22].mean())
     assert float(out.outlier[0, :, 34:].mean()) > 4 * float(out.outlier[0, :, :22].mean())
 
 
 def wall(error):
-    """Learnt of a flat wall in twelve frames; the anchor of a cell is off by a factor e^error [28, 28]."""
+    """The statistics after twelve frames of a flat wall; the anchor in each cell is off by a factor e^error [28,
+    28]."""
     depth, packed = np.full((56, 56), 2.0), None
     rows, cols = (x.ravel() for x in np.mgrid[0:56:2, 0:56:2])
     for frame in range(12):
@@ -209,12 +212,12 @@ def wall(error):
 
 
 def test_errors_that_neighbouring_anchors_do_not_share_are_not_taken_for_the_networks():
-    """The same factors, once in patches of a quarter of the image and once shuffled, each anchor its own."""
+    """The same factors: constant in patches of a quarter of the image, or shuffled over the anchors."""
     patches = np.kron(np.random.default_rng(4).normal(0, 0.3, (4, 4)), np.ones((7, 7)))
     shared, _ = wall(lambda rng: patches)
-    own, _ = wall(lambda rng: rng.permutation(patches.ravel()).reshape(28, 28))
-    assert shared.ratio("amplitude") > 5 * own.ratio("amplitude")
-    assert shared.ratio("unseen") > 2 * own.ratio("unseen")
+    independent, _ = wall(lambda rng: rng.permutation(patches.ravel()).reshape(28, 28))
+    assert shared.ratio("amplitude") > 5 * independent.ratio("amplitude")
+    assert shared.ratio("unseen") > 2 * independent.ratio("unseen")
 
 
 @pytest.mark.parametrize("tier", [update, posterior_cpu.update], ids=["torch", "numba"])
@@ -246,19 +249,20 @@ def test_more_regions_on_another_surface_make_it_more_probable():
 
 
 def test_the_variance_is_the_second_moment_about_the_posterior_depth():
-    """Drawn: true depths d e^n, and with the probability p of another surface d e^(n - o)."""
+    """Against samples of the true depth: d e^n, or with probability p another surface, d e^(n - o)."""
     rng, size = np.random.default_rng(0), 2_000_000
     for offset, p in ((-0.4, 0.03), (0.3, 0.3)):
         other = rng.random(size) < p
         n = rng.normal(np.where(other, -offset, 0), np.where(other, 0.2, 0.3) ** 0.5)
-        given = (np.array([x]) for x in (0.3, p, offset, 0.2))
-        variance, _ = posterior_scene_cpu.second_moments(MODEL, *given)
+        arguments = (np.array([x]) for x in (0.3, p, offset, 0.2))
+        variance, _ = posterior_scene_cpu.second_moments(MODEL, *arguments)
         assert variance == pytest.approx(((np.exp(n) - 1) ** 2).mean(), rel=0.03)
 
 
 @pytest.mark.parametrize("tier", [update, posterior_cpu.update], ids=["torch", "numba"])
 def test_one_anchor_that_is_off_by_a_factor_of_twenty_does_not_decide(tier):
-    """Alone it moves the depth by a factor of 3 at most; among sixty its surface stays where the others see it."""
+    """A single anchor changes the depth by a factor of 3 at most; among sixty anchors it does not change its
+    surface."""
     depth, pixel = np.full((36, 48), 2.0), np.stack([x.ravel() for x in np.mgrid[4:48:6, 4:36:6]], -1).astype(float)
     alone = updated(depth, (pixel[:1], np.array([0.1]), np.array([1e-6])), tier=tier)[1]
     assert float(alone.depth.median()) > 2 / 3
@@ -271,7 +275,7 @@ def test_one_anchor_that_is_off_by_a_factor_of_twenty_does_not_decide(tier):
 
 
 def test_another_surface_is_more_probable_and_less_certain_away_from_evidence():
-    """Anchors that agree make it improbable near them; away from them its probability is the stream's own."""
+    """Agreeing anchors make another surface improbable near them. Away from them its probability is the stream's."""
     depth = np.full((28, 56), 2.0)
     pixel = np.stack([np.tile([1.0, 3.0], 14), np.repeat(np.arange(0.0, 28, 2), 2)], -1)
     _, out = updated(depth, (pixel, np.full(28, 2.2), np.full(28, 1e-4)))
@@ -281,13 +285,13 @@ def test_another_surface_is_more_probable_and_less_certain_away_from_evidence():
     assert float(p[20]) == pytest.approx(float(p.max())) == pytest.approx(MODEL.wrong, rel=0.3)
     beyond = ((out.variance - out.inlier) / out.depth.square())[0].mean(0)
     assert float(beyond[50]) > 2 * float(beyond[20]) > 4 * float(beyond[1])
-    assert bool((out.inlier < out.variance).all())  # what another surface would add is in the latter alone
+    assert bool((out.inlier < out.variance).all())  # another surface adds to the total variance only
     assert float(p.max()) <= MODEL.wrong * (1 + 1e-9)
 
 
 def test_contradictory_anchors_and_depth_that_they_pull_near_are_less_certain():
-    """One wall: all anchors agree, every fourth is off by a factor of 3, and a cluster that pulls it three times nearer
-    or farther."""
+    """A wall where all anchors agree, where every fourth is off by a factor of 3, and with a cluster of anchors three
+    times nearer or farther."""
     depth, pixel = np.full((36, 48), 2.0), np.stack([x.ravel() for x in np.mgrid[2:48:4, 2:36:4]], -1).astype(float)
     corner = (pixel[:, 0] > 30) & (pixel[:, 1] > 20)
     factors = {"alike": 1.0, "mixed": np.where(np.arange(len(pixel)) % 4, 1, 3.0),
@@ -306,26 +310,26 @@ def test_far_from_evidence_the_variance_is_larger_and_never_below_what_ufm_star_
     anchors = pixel[near], g[near], variance[near]
     none, small, large = (updated(depth, anchors, np.full((36, 48), v))[1].variance[0] for v in (0.0, 0.01, 5.0))
     assert float(none[:, 44:].mean() / none[8:, :10].mean()) > 4
-    torch.testing.assert_close(small, none, equal_nan=True)  # it is less than what the anchors leave open
+    torch.testing.assert_close(small, none, equal_nan=True)  # less than the uncertainty that the anchors leave
     assert float((large - none)[:, 44:].mean()) > 0.1
     assert bool((large >= none)[np.nonzero(depth)].all())
 
 
 def test_another_surface_is_less_certain_than_the_anchors_around_agree():
-    given = np.array([0.0, 0.1, 3.0]), np.array([0.01, 0.02, 0.01])
+    arguments = np.array([0.0, 0.1, 3.0]), np.array([0.01, 0.02, 0.01])
     expected = [0.01 * MODEL.elsewhere, 0.1 + 0.02 * MODEL.elsewhere, MODEL.widest]
-    np.testing.assert_allclose(posterior_scene_cpu.elsewhere_variance(MODEL, *given), expected)
-    same = elsewhere_variance(MODEL, *map(torch.from_numpy, given))
+    np.testing.assert_allclose(posterior_scene_cpu.elsewhere_variance(MODEL, *arguments), expected)
+    same = elsewhere_variance(MODEL, *map(torch.from_numpy, arguments))
     np.testing.assert_allclose(same, expected)
 
 
 def test_errors_that_all_anchors_have_in_common_widen_every_pixel():
     """A factor common to all depths, and an error common to their inverses [1/m]."""
     depth, _, _, pixel, g, variance = scene(0)
-    given = [torch.from_numpy(x)[None] for x in (pixel, g, variance)]
+    arguments = [torch.from_numpy(x)[None] for x in (pixel, g, variance)]
     outs = []
     for common in ({}, {"scale": torch.tensor([0.01])}, {"shared": torch.tensor([0.002])}):
-        anchors = Anchors(*given, **common)
+        anchors = Anchors(*arguments, **common)
         outs.append(UfMStar(CONFIG)(torch.from_numpy(depth)[None], torch.eye(4)[None], K[None], anchors=anchors))
     plain, by_scale, by_pose = outs
     d = plain.posterior_depth
@@ -357,11 +361,11 @@ def test_before_the_first_anchor_it_is_plain_ufm_star_to_the_bit():
 
 
 def test_before_the_first_anchor_of_a_source_nothing_reads_as_certain():
-    """Given anchors of which none is valid: the depth is the network's, but its variance is the error's before any."""
+    """With only invalid anchors, the depth is the network's, and its variance is the prior's."""
     depth, _, _, *anchors = scene(0)
-    frame, given = checked(depth, *anchors)
-    given = dataclasses.replace(given, valid=torch.zeros_like(given.valid))
-    packed, out = update(torch.zeros(1, SIZE), frame, given, torch.zeros(1, 36, 48), MODEL)
+    frame, invalid = checked(depth, *anchors)
+    invalid = dataclasses.replace(invalid, valid=torch.zeros_like(invalid.valid))
+    packed, out = update(torch.zeros(1, SIZE), frame, invalid, torch.zeros(1, 36, 48), MODEL)
     assert not bool(packed.any())
     torch.testing.assert_close(out.depth[0][frame.valid[0]], frame.depth[frame.valid])
     share = relative(out)[frame.valid[0]]
@@ -387,16 +391,16 @@ def test_a_frame_without_anchors_keeps_the_correction_learns_nothing_and_grows_l
 
 
 def test_poses_that_contradict_the_images_make_a_stream_forget():
-    """Of two streams, the poses of the second contradict its images: its depth is the network's again, as uncertain as
-    at the start, and how far the network errs remains known."""
+    """The poses of the second of two streams contradict its images: its depth is the network's again, with the
+    uncertainty of the start, and the estimate of the network's error remains."""
     ufm = UfMStar(CONFIG)
     for depth, T, anchors in ufm_frames(streams=2):
         ufm(depth, T, K, anchors=anchors)
     before = Running.of(ufm.posterior, MODEL)
     shared, none = torch.tensor([0.0, torch.inf]), torch.zeros(anchors.depth.shape, dtype=torch.bool)
     out = ufm(depth, T, K, anchors=dataclasses.replace(anchors, valid=none, shared=shared))
-    kept, forgotten = ((out.posterior()[0][i] / depth[i])[out.valid[i]] for i in range(2))
-    assert 1.1 < float(kept.median()) < 2
+    remembered, forgotten = ((out.posterior()[0][i] / depth[i])[out.valid[i]] for i in range(2))
+    assert 1.1 < float(remembered.median()) < 2
     torch.testing.assert_close(forgotten, torch.ones_like(forgotten))
     after = Running.of(ufm.posterior, MODEL)
     assert after.coefficients.any(1).tolist() == [True, False]

@@ -19,7 +19,7 @@ SIGMA = 4.0  # [px] radius of a blob in the network's image
 
 
 def camera(height: int, width: int) -> Tensor:
-    """Some intrinsics [1, 3, 3] of such an image, the centre a little off."""
+    """Intrinsics [1, 3, 3] for the image size, with the principal point off the centre."""
     f = 0.9 * max(height, width)
     return torch.tensor([[[f, 0, width / 2 - 3.7], [0, 1.05 * f, height / 2 + 2.2], [0, 0, 1]]], dtype=torch.float64)
 
@@ -80,7 +80,7 @@ def test_the_crop_fits_into_every_image(height: int, width: int) -> None:
     assert g.final == (224, 224)
     assert g.cropped == (228, 304)
     assert g.resized[0] >= 250 or abs(g.resized[1] - 304) <= 1
-    assert min(g.resized[0] - 250, g.resized[1] - 304) <= 0  # no larger than it has to be
+    assert min(g.resized[0] - 250, g.resized[1] - 304) <= 0  # no larger than necessary
     assert 0 <= g.top <= g.resized[0] - 228
     assert 0 <= g.left <= g.resized[1] - 304
     exact = max(250 / height, 304 / width)
@@ -89,7 +89,8 @@ def test_the_crop_fits_into_every_image(height: int, width: int) -> None:
 
 
 def test_nyu_geometry_and_the_fields_formula() -> None:
-    """480 x 640 -> 250 x 333, crop at (11, 14); f' exactly, c' up to the half pixel that the formula drops."""
+    """480 x 640 -> 250 x 333, crop at (11, 14); f' exactly, c' up to the half pixel that the original formula
+    ignores."""
     g = NYU.geometry(480, 640)
     assert (g.resized, g.top, g.left) == ((250, 333), 11, 14)
     fx, fy, cx, cy = 518.9, 519.5, 325.6, 253.7
@@ -100,7 +101,7 @@ def test_nyu_geometry_and_the_fields_formula() -> None:
     torch.testing.assert_close(got.diagonal()[:2], expected_f)
     simple = torch.tensor([(cx * 333 / 640 - 14) * 224 / 304, (cy * 250 / 480 - 11) * 224 / 228])
     assert (got[:2, 2] - simple).abs().max() < 0.5
-    # The half-pixel rule, written out: borders at -1/2 stay borders.
+    # The half-pixel rule, written out: borders at -1/2 map to borders.
     u = (((cx + 0.5) * 333 / 640 - 14) * 224 / 304) - 0.5
     v = (((cy + 0.5) * 250 / 480 - 11) * 224 / 228) - 0.5
     torch.testing.assert_close(got[:2, 2], torch.tensor([u, v], dtype=torch.float64))
@@ -108,8 +109,8 @@ def test_nyu_geometry_and_the_fields_formula() -> None:
 
 @pytest.mark.parametrize("size", [(480, 640), (360, 540), (968, 1296)], ids=str)
 def test_colour_is_resampled_as_pillow_does(size: tuple[int, int]) -> None:
-    """The field's loaders went through Pillow in bytes, which rounds four times: observed .35 of 255 apart in
-    the mean and 1.6 at most; without antialiasing it would be 13 to 24 in the mean on this noise."""
+    """Published data loaders resize bytes with Pillow, which rounds four times. Observed differences of 255 levels: .35
+    in the mean and 1.6 at most. Without antialiasing the mean would be 13 to 24 on this noise."""
     generator = np.random.default_rng(0)
     array = generator.integers(0, 256, (*size, 3), dtype=np.uint8)
     g = NYU.geometry(*size)
@@ -123,7 +124,7 @@ def test_colour_is_resampled_as_pillow_does(size: tuple[int, int]) -> None:
 
 
 def test_depth_pixels_are_the_ones_seen() -> None:
-    """A plane's depth, carried along, unprojects onto the same plane with the new intrinsics."""
+    """A plane's preprocessed depth unprojects to the same plane with the new intrinsics."""
     size = (360, 540)
     K = camera(*size)
     n, offset = torch.tensor([0.2, -0.3, 1.0], dtype=torch.float64), 2.0
@@ -131,7 +132,7 @@ def test_depth_pixels_are_the_ones_seen() -> None:
     depth = offset / (ray @ n)
     carried = NYU.apply_depth(depth)
     points = unproject(carried, NYU.apply_intrinsics(K, *size))
-    # One source pixel to each side at most half of one off: .5 px / f at the plane's slope.
+    # The nearest source pixel is at most half a pixel away: .5 px / f at the plane's slope.
     bound = 0.5 / float(K[0, 0, 0]) * float(depth.max()) * (0.2 + 0.3)
     error = (points @ n - offset).abs().max()
     assert 0 < error < bound

@@ -1,5 +1,5 @@
 """The table "Published networks" of docs/networks.md: every line runs on a tiny checkpoint with random weights, or on a
-stand-in that takes and returns what the published code does."""
+stand-in with the published code's interface."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ K = torch.tensor([[80.0, 0, 48.5], [0, 84.0, 34.5], [0, 0, 1]])
 
 
 def ramp(x: torch.Tensor) -> torch.Tensor:
-    """[B, H, W] a depth that depends on the image, 1 m to 3 m for images in [0, 1]."""
+    """[B, H, W] depth from the image: 1 m to 3 m for images in [0, 1]."""
     return 1 + 2 * (x - x.amin()).mean(1) / (x.amax() - x.amin())
 
 
 class UniDepth(torch.nn.Module):
-    """``infer`` takes RGB in 0..255 and K; points of a camera, and a "confidence" that grows with the error."""
+    """``infer`` takes RGB in 0..255 and K; returns points in the camera frame, and a "confidence" that grows with the
+    error."""
 
     def infer(self, rgb: torch.Tensor, camera: torch.Tensor | None = None, normalize: bool = True) -> dict[str, Any]:
         assert rgb.amax() > 2
@@ -54,7 +55,8 @@ class MoGe(torch.nn.Module):
 
 
 class Metric3D(torch.nn.Module):
-    """``inference`` takes a normalised image in a dict; depth for a focal length of 1000 px, confidence, and others."""
+    """``inference`` takes a normalised image in a dict; returns depth for a focal length of 1000 px, confidence, and
+    others."""
 
     def inference(self, data: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
         x = data["input"]
@@ -65,7 +67,7 @@ class Metric3D(torch.nn.Module):
 
 @dataclass
 class Prediction:
-    """As ``depth_anything_3.specs.Prediction``; the metric network leaves confidence and cameras away."""
+    """As ``depth_anything_3.specs.Prediction``; the metric network returns no confidence and no cameras."""
 
     depth: np.ndarray
     is_metric: int = 1
@@ -76,7 +78,7 @@ class Prediction:
 
 
 class DepthAnything3(torch.nn.Module):
-    """``inference`` takes a list of NumPy pictures, whose longer side becomes 504 px."""
+    """``inference`` takes a list of NumPy images and resizes their longer side to 504 px."""
 
     def inference(self, image: list[np.ndarray], **options: Any) -> Prediction:
         assert all(picture.dtype == np.uint8 and picture.shape[2] == 3 for picture in image)
@@ -94,7 +96,7 @@ def run(line: str, **names: Any) -> package.DepthNetwork:
 
 
 def write(folder: Path, name: str) -> dict[str, Any]:
-    """Write a line's files, and return the values of its names."""
+    """Write the files for a line of the table, and return the values of the line's names."""
     if name == "Depth Anything V2":
         write_depth_anything(folder, "metric")
     elif name in ("ZoeDepth", "Depth Pro"):

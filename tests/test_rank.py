@@ -1,4 +1,4 @@
-"""Choosing images: ``ufmstar rank``, the order of choice, and the sampler of a training loop."""
+"""Image selection: ``ufmstar rank``, the selection order, and the sampler of a training loop."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def test_parts_have_their_own_statistics():
         out, mean = dense(*frame), ufm.mean_uncertainty(*frame, fraction=1.0)
     maps = {"total": out.variance, "disagreement": out.disagreement, "aleatoric": frame[3], "epistemic": frame[4]}
     for name, values in (maps | {"depth": d}).items():
-        part, known = getattr(mean, name), values[out.valid & ~values.isnan()].double()
-        assert int(part.pixels) == len(known)
-        expected = known.mean(), known.var(), known.median(), known.max()
+        part, pixels = getattr(mean, name), values[out.valid & ~values.isnan()].double()
+        assert int(part.pixels) == len(pixels)
+        expected = pixels.mean(), pixels.var(), pixels.median(), pixels.max()
         actual = part.mean, part.variance, part.median, part.maximum
         torch.testing.assert_close(torch.cat(actual).double(), torch.stack(expected), rtol=1e-4, atol=0)
     assert mean.anchored is None
@@ -56,14 +56,14 @@ def test_the_best_come_first():
     assert choose([1.0, 3.0, math.nan, 3.0, 2.0]) == [1, 3, 4, 0]
     assert choose([1.0, 3.0, math.nan, 3.0, 2.0], 2) == [1, 3]
     assert choose([]) == []
-    assert choose([math.nan, -math.inf, 1.0], 3) == [2], "a score of -inf is none"
+    assert choose([math.nan, -math.inf, 1.0], 3) == [2], "a score of -inf counts as missing"
 
 
 def test_a_diverse_choice_leaves_out_neighbours():
     scores = [1.0, 0.9, 0.8, 0.5]
     poses = along([0.0, 0.1, 0.2, 3.0])
-    assert choose(scores, poses=poses) == [0, 3, 2, 1], "a fifth of .8 is less than .5, and more than a tenth of .9"
-    assert choose(scores, 2, poses=poses, distance=0.1) == [0, 1], "what is near cannot be seen from 10 cm beside"
+    assert choose(scores, poses=poses) == [0, 3, 2, 1], ".8 / 5 is less than .5, and more than .9 / 10"
+    assert choose(scores, 2, poses=poses, distance=0.1) == [0, 1], "near surfaces are out of view 10 cm to the side"
     assert choose(scores, 2, poses=poses, sequences=["a", "b", "b", "b"]) == [0, 1], "another sequence is elsewhere"
     turned = along([0.0, 0.0, 0.0, 0.0], angle=1.0)
     assert choose(scores, poses=turned)[:2] == [0, 3], "the same place, another direction"
@@ -92,7 +92,7 @@ def test_a_pool_of_two_sequences(ufmstar, tmp_path, weights):
         rows = list(csv.DictReader(file))
     assert {row["sequence"] for row in rows} == set(TOURS)
     first = [row for row in rows if row["frame"] == "000000"]
-    assert all(row["rank"] == "" and float(row["measured"]) == 0 for row in first), "a fresh state each"
+    assert all(row["rank"] == "" and float(row["measured"]) == 0 for row in first), "a new state per sequence"
     ranked = [float(row["total_mean_m2"]) for row in rows if row["rank"]]
     assert ranked == sorted(ranked, reverse=True)
     assert len(ranked) >= 2
@@ -115,7 +115,7 @@ def test_a_sequence_twice_is_refused_and_wrong_poses_are_named(ufmstar, tmp_path
 
 
 def test_a_ranking_that_fails_is_no_earlier_one(ufmstar, tmp_path, weights, monkeypatch):
-    """A disk that is full at the last file leaves no rank.json that states a ranking."""
+    """A disk that is full at the last file leaves no rank.json with a ranking."""
     words = ("rank", TOURS[0], "--depth", "self", "--measured", "0", "--out", tmp_path / "out")
 
     def full(*_, **__):

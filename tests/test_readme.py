@@ -1,4 +1,4 @@
-"""The README: its code runs, its commands are the ones CI uses, its links lead somewhere."""
+"""The README: its code runs, CI uses its commands, its links exist."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_the_example_runs(tmp_path, monkeypatch, capsys):
     depths, poses, K = scenes.sequence(3, 48, 64, 0.05)
     pictures = [np.repeat(np.nan_to_num(d * 40).clip(0, 255).astype(np.uint8)[..., None], 3, 2) for d in depths]
     monkeypatch.chdir(tmp_path)
-    # A pose every 50 ms, a picture at each and one 2 s later.
+    # A pose every 50 ms, an image at each of them and one 2 s later.
     lines = [[0.05 * i, *T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()] for i, T in enumerate(poses)]
     np.savetxt("poses.txt", lines, fmt="%.9f")
     video = [(0.05 * i, picture) for i, picture in enumerate(pictures)] + [(2.1, pictures[-1])]
@@ -40,13 +40,13 @@ def test_the_example_runs(tmp_path, monkeypatch, capsys):
 
 
 def test_both_commands_are_one_line_each():
-    main, tests, own = blocks("bash")
-    assert all(len(block.strip().splitlines()) == 1 for block in (main, tests, own))
-    assert main.strip().endswith("ufmstar demo"), "the main job needs no file of the reader's"
-    assert "ufmstar run" in own
+    main, tests, recording = blocks("bash")
+    assert all(len(block.strip().splitlines()) == 1 for block in (main, tests, recording))
+    assert main.strip().endswith("ufmstar demo"), "the main job needs no file of the user"
+    assert "ufmstar run" in recording
     assert tests.strip().endswith("pytest")
     between = README.split("<!-- test-command -->")[1].split("<!-- end -->")[0]
-    assert tests in between, "CI runs what stands between the markers"
+    assert tests in between, "CI runs the lines between the markers"
 
 
 def test_links_and_pictures_exist():

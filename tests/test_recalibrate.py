@@ -1,4 +1,5 @@
-"""The map of the variance: its form, its fit to counts, and its way through eval, recalibrate, run and the module."""
+"""Recalibration of the variance: the map's form, its fit to counts, and its use in eval, recalibrate, run and the
+module."""
 
 from __future__ import annotations
 
@@ -15,13 +16,13 @@ from tiny_suite import write_network, write_rooms
 from ufmstar_torch import Recalibration, UfMStar, UfMStarConfig, cli
 from ufmstar_torch.eval.metrics.ranking import SpearmanCorrelation
 from ufmstar_torch.eval.metrics.recalibration import figures, fit
-from ufmstar_torch.recalibrate import beside
+from ufmstar_torch.recalibrate import stored_next_to
 
 MAP = Recalibration((0.01, 0.1, 1.0), (0.2, 0.2, 4.0))
 
 
 def counts(variance, z):
-    """[V, e] of pixels with squared errors V z^2 as the metric counts them."""
+    """Counts [V, e] of pixels with squared errors V z^2, as in the metric."""
     metric, depth = SpearmanCorrelation(), torch.full_like(variance, 50.0)
     metric.update(depth, variance, depth + z)
     return metric.joint.double().numpy()
@@ -150,7 +151,7 @@ def test_from_an_evaluation_to_other_sequences(evaluated, tmp_path, capsys):
     assert fitted.row == "UfM*-DepthOnly"
     assert fitted.sequences == ("rooms/ash", "rooms/birch")
     again = eval_words(weights, tmp_path / "out", rooms / "ash", rooms / "cedar", more=["--recalibration", file])
-    assert cli.main(again) == 1  # one of the sequences was fitted to
+    assert cli.main(again) == 1  # the map was fitted to one of the sequences
     assert "were fitted to this sequence" in capsys.readouterr().err
     records = sorted(path.relative_to(tmp_path / "out" / "records") for path in (tmp_path / "out").rglob("*@*.json"))
     result = [json.loads((tmp_path / "out" / "records" / path).read_text()) for path in records]
@@ -167,7 +168,7 @@ def test_run_uses_the_map_beside_the_weights(evaluated, tmp_path, capsys):
     rooms, weights, out = evaluated
     words = ["run", str(rooms / "cedar"), "--model", "trained", "--weights", str(weights), "--no-video", "--no-sheet"]
     assert cli.main([*words, "--out", str(tmp_path / "plain")]) == 0
-    file = beside(weights)
+    file = stored_next_to(weights)
     assert cli.main(["recalibrate", str(out), "--row", "UfM*-DepthOnly", "--to", str(file)]) == 0
     try:
         assert cli.main([*words, "--out", str(tmp_path / "mapped")]) == 0

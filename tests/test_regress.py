@@ -1,4 +1,4 @@
-"""Gaussian mixture regression: every backend against oracle and reference, the bound of the culling, sampling."""
+"""Gaussian mixture regression: every backend against oracle and reference, the error bound of the culling, sampling."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ def test_agrees_with_the_oracle(backend, config, seed):
     depth = 1 + 4 * torch.rand(2, 3, 5, generator=generator, dtype=torch.float64)
     points = unproject(depth, camera.expand(2, 3, 3)).flatten(1, 2)
     m = m.replace(mean=torch.cat([points[:, :7] + 0.02, m.mean[:, 7:]], 1))
-    given_ = (m, depth, camera.expand(2, 3, 3), depth > 0, config)
-    result = backend.kernels.regress_image(*given_)
-    some = backend.kernels.regress_image(*given_, torch.tensor([[14, 3], [0, 9]]))
+    arguments = (m, depth, camera.expand(2, 3, 3), depth > 0, config)
+    result = backend.kernels.regress_image(*arguments)
+    sparse = backend.kernels.regress_image(*arguments, torch.tensor([[14, 3], [0, 9]]))
     neighbourhood = (2.0, 0.1, 0.5) if config is NEAR else None
     for b in range(2):
         components = oracle.prepared(as_lists(m, b))
@@ -59,8 +59,8 @@ def test_agrees_with_the_oracle(backend, config, seed):
         np.testing.assert_allclose(result.disagreement[b].flatten(), values, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(result.features[b].flatten(0, 1), features, rtol=1e-9, atol=1e-12)
         chosen = [[14, 3], [0, 9]][b]
-        np.testing.assert_allclose(some.disagreement[b], values[chosen], rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(some.features[b], features[chosen], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(sparse.disagreement[b], values[chosen], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(sparse.features[b], features[chosen], rtol=1e-9, atol=1e-12)
 
 
 @BOTH
@@ -84,7 +84,7 @@ def test_shares_make_up_the_regression(config):
 
 
 def crowded(seed: int, count: int = 300, features: int = 0):
-    """Gaussians about the surface of ``rendered(2)`` and behind the camera, many of them thin, and its depth."""
+    """Gaussians near the surface of ``rendered(2)`` and behind the camera, many of them thin; and the depth."""
     depth = rendered(2)
     m = mixture(1, count, seed, empty=3, features=features)
     generator = torch.Generator().manual_seed(seed)
@@ -99,13 +99,14 @@ def crowded(seed: int, count: int = 300, features: int = 0):
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-4)])
 @pytest.mark.parametrize(("size", "features"), [((40, 56), 2), ((33, 41), 0), ((7, 3), 4)])
 def test_agrees_with_the_reference(compiled_backend, config, dtype, tolerance, size, features):
-    """Images of any size, with holes and an outlier, and pixels of them: one, less than a tile, several in a block."""
+    """Images of different sizes, with holes and an outlier, and subsets of pixels: one, less than a tile, several in a
+    block."""
     m, depth = crowded(6, 60 if compiled_backend.slow else 300, features)
     depth = depth[:, : size[0], : size[1]].contiguous()
     valid = torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) > 0.4
     valid[:, :9, 16:32] = False  # whole tiles
     valid &= depth > 0
-    depth[0, 2, 2] = 1e30  # spoils no neighbour
+    depth[0, 2, 2] = 1e30  # does not affect its neighbours
     exact = regress_image(m, depth, K, valid, config)
     for count in (None, 1, 63, 700):
         pixels, expected = None, (exact.disagreement, exact.features)
@@ -156,7 +157,7 @@ def test_culling_keeps_its_bound(monkeypatch, epsilon, weight):
     unexplained = (share.amax(-1) <= 1e-3 * (1 - share.sum(-1))).view(depth.shape)
     assert error[unexplained].max() <= 1e-3 * epsilon * greatest
     if epsilon == 0.5 and weight == 1e3:
-        assert error.max() > 1e-9, "or nothing was left out, and the test tests nothing"
+        assert error.max() > 1e-9, "some components must be culled"
 
 
 @BOTH
@@ -180,8 +181,8 @@ def test_chunks_change_nothing(monkeypatch):
 
 def test_smooth_averages_where_both_are_known():
     nan = float("nan")
-    before, now = torch.tensor([[[1.0, nan, 2.0, nan]]]), torch.tensor([[[3.0, 4.0, nan, nan]]]).double()
-    memory, shown = smooth(before, now, 0.25)
+    before, current = torch.tensor([[[1.0, nan, 2.0, nan]]]), torch.tensor([[[3.0, 4.0, nan, nan]]]).double()
+    memory, shown = smooth(before, current, 0.25)
     torch.testing.assert_close(memory, torch.tensor([[[1.5, 4.0, 2.0, nan]]]), equal_nan=True)
     torch.testing.assert_close(shown, torch.tensor([[[1.5, 4.0, nan, nan]]]).double(), equal_nan=True)
 
@@ -191,7 +192,7 @@ def test_smooth_averages_where_both_are_known():
 def test_filling_and_smoothing_at_once_equal_both(stated, dtype):
     config, generator = UfMStarConfig(unmeasured=stated), torch.Generator().manual_seed(6)
     maps = torch.rand(4, 2, 9, 11, generator=generator).to(dtype)
-    maps[3, :, :2, ::2], maps[:3, :, 1:4, :3] = torch.nan, torch.nan  # of the memory, and of the frame
+    maps[3, :, :2, ::2], maps[:3, :, 1:4, :3] = torch.nan, torch.nan  # of the mixture, and of the frame
     disagreement, measured, depth, memory = (*maps[:3], maps[3].float())
     filled, _ = after_regression(Regression(disagreement, measured[..., None]), depth, config)
     for alpha in (0.3, 1.0):
@@ -221,7 +222,7 @@ def test_sample_is_seeded_uniform_and_valid():
         counts[index[0]] += 1
     equal, _ = sample_pixels(valid[:1].expand(3, 10, 10), 10, 7)
     assert torch.equal(equal[0], equal[1])
-    assert torch.equal(equal[0], sample_pixels(valid, 10, 7)[0][0]), "whatever is in the other streams"
+    assert torch.equal(equal[0], sample_pixels(valid, 10, 7)[0][0]), "for any content of the other streams"
     # Binomial(400, 0.2) per valid pixel: mean 80, sigma 8.
     assert (counts[:50] - 80).abs().max() < 5 * 8
     assert counts[50:].sum() == 0

@@ -1,4 +1,4 @@
-"""Figures of a report: what their lines, bars and points say, read back from the artists."""
+"""Figures of a report: the values of lines, bars and points, read from the artists."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ufmstar_torch.eval.report.figures_sweep import default_value, draw_sweep, s
 from ufmstar_torch.eval.report.means import difference, mean_of
 from ufmstar_torch.eval.report.names import NLL
 from ufmstar_torch.eval.report.style import (
-    look_of,
+    line_style,
     new_figure,
     save_figure,
 )
@@ -41,7 +41,7 @@ SEQUENCES = ("a", "b")
 
 @pytest.fixture(scope="module")
 def results() -> Results:
-    """Judged maps of two sequences of one data set; the merged ones are those of the first."""
+    """Results of two sequences of one data set; the merged results are the first sequence's."""
     records, merged = [], {}
     for sequence in SEQUENCES:
         variances = {row: draw_maps(row, sequence)[1] for row in (ALONE, UFM)}
@@ -55,7 +55,7 @@ def results() -> Results:
 
 
 def drawn(axes: Any) -> dict[str, Any]:
-    """Lines by the name that their row has."""
+    """The drawn lines by the name of their row."""
     return {line.get_label(): line for line in axes.lines if not line.get_label().startswith("_")}
 
 
@@ -76,13 +76,13 @@ class TestCalibration:
         assert list(delta) == list(quantile) == ["exactly right", "alone", "UfM-100K", "UfM*"]
         for row in (ALONE, UFM, UFM_STAR):
             curves = results.merged["rooms", row]
-            np.testing.assert_array_equal(quantile[look_of(row.method).name].get_ydata(), curves["ece_q_observed"])
+            np.testing.assert_array_equal(quantile[line_style(row.method).name].get_ydata(), curves["ece_q_observed"])
             pixels = np.array(curves["ece_delta_pixels"])
-            kept = pixels > 0.001 * pixels.sum()
-            line = delta[look_of(row.method).name]
-            np.testing.assert_array_equal(line.get_ydata(), np.array(curves["ece_delta_accuracy"], float)[kept])
-            assert line.get_color() == look_of(row.method).colour
-        assert list(drawn(shown[1])) == ["exactly right", "UfM*"]  # a network of depth alone has no variance of its own
+            plotted = pixels > 0.001 * pixels.sum()
+            line = delta[line_style(row.method).name]
+            np.testing.assert_array_equal(line.get_ydata(), np.array(curves["ece_delta_accuracy"], float)[plotted])
+            assert line.get_color() == line_style(row.method).colour
+        assert list(drawn(shown[1])) == ["exactly right", "UfM*"]  # a depth-only network has no variance
         (legend,) = figure.legends
         assert {text.get_text() for text in legend.get_texts()} == {"alone", "UfM-100K", "UfM*", "exactly right"}
 
@@ -97,7 +97,7 @@ class TestError:
         ]
         for axes, reference in zip(shown, ("Ensemble", "UfM-Ensemble-100K"), strict=True):
             for row in (ALONE, UFM, UFM_STAR):
-                line = drawn(axes)[look_of(row.method).name]
+                line = drawn(axes)[line_style(row.method).name]
                 expected = results.merged["rooms", row][f"nll_by_error:{reference}"]
                 np.testing.assert_array_equal(line.get_ydata(), expected)
                 np.testing.assert_array_equal(line.get_xdata(), np.arange(5, 100, 10))
@@ -112,7 +112,7 @@ class TestEntropy:
         for row, mean in zip((ALONE, UFM, UFM_STAR), means, strict=True):  # every sequence has as many pixels
             assert mean == pytest.approx(np.mean([r.figures["entropy"] for r in results.of(row)]), rel=1e-9)
         assert {line.get_linestyle() for line in axes.lines} == {"--"}
-        assert means[0] < means[1] < means[2]  # the drawn sigma is the shorter the more overconfident the method
+        assert means[0] < means[1] < means[2]  # the more overconfident the method, the smaller its sigma
         (histograms,) = entropies(results, "ensemble").values()
         for histogram in histograms.values():
             assert (histogram.density * np.diff(histogram.edges)).sum() == pytest.approx(1.0)  # no pixel lies outside
@@ -124,7 +124,7 @@ class TestEntropy:
         curves = {"entropy_counts": [25, 0, 75, 0], "entropy_edges": [-1.0, 0.0, 1.0]}
         result = in_memory({(UFM_STAR, ("d", "s")): {"entropy": 0.5}})
         result = replace(result, records=(replace(result.records[0], curves=curves),))
-        # The share of all pixels, those without a variance among them.
+        # The share of all pixels, including pixels without a variance.
         assert entropies(result, "ensemble")["d"][UFM_STAR].density.tolist() == [0.0, 0.75]
         assert words(draw_entropy(result, "ensemble").axes[0]) == ["UfM*: mean 0.50\n(25 % with hardly any V)"]
 
@@ -143,7 +143,7 @@ def swept() -> Results:
 
 
 def points_of(results: Results) -> dict[float, Any]:
-    """The records of plain UfM* by rotation noise."""
+    """The results of plain UfM* by rotation noise."""
     lines = sweep_lines(results, "ensemble", "rotation_noise")
     return next(line.points for line in lines if line.method == UFM_STAR.method and not line.rest)
 
@@ -232,7 +232,7 @@ def test_anchored_rows_are_a_line_that_goes_through_the_row_without_noise(anchor
     assert list(tracked[0].points) == pytest.approx(values)
     assert [r.row for r in tracked[0].points[default_value(name)]] == [row(anchors="corners")]
     assert tracked[0].words == "anchored"
-    # And no row of another line is among those of plain UfM*.
+    # The line of plain UfM* has no other row's points.
     (alone,) = (line for line in lines if line.method == STAR and not line.rest)
     assert not any(r.row.setting.anchors for records in alone.points.values() for r in records)
 
@@ -242,7 +242,7 @@ def test_numbers_of_anchors_begin_with_none(anchored):
     assert set(lines) == {"anchored", "truth anchors"}
     assert list(lines["truth anchors"].points) == [0, 5, 20, 100, 300]
     assert list(lines["anchored"].points) == [0, 5, 20, MOST]
-    # Plain UfM* where no row says 0; and a row that says nothing has as many as the tracker follows.
+    # Without a row for 0, plain UfM* is that point. A row without a number has the tracker's default number.
     assert lines["anchored"].points[0][0].row == Row(STAR)
     assert lines["anchored"].points[MOST][0].row == row(anchors="corners")
     assert lines["truth anchors"].points[0][0].row == row(anchors="truth", anchor_count=0)

@@ -1,4 +1,4 @@
-"""The page: well-formed, alone in the world, with the results' numbers, and with what is missing."""
+"""The page: well-formed, self-contained, with the results' numbers and the missing parts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ VOID = {"br", "hr", "img", "meta", "input"}
 
 
 class Page(HTMLParser):
-    """Reads a page, and complains where elements do not close in order."""
+    """Parses a page, and records elements that do not close in order."""
 
     def __init__(self, text: str) -> None:
         super().__init__(convert_charrefs=True)

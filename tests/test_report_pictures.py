@@ -1,4 +1,4 @@
-"""Pictures of a report: strips, breakdowns, comparisons and rooms show the numbers that they say they show."""
+"""Pictures of a report: strips, breakdowns, comparisons and rooms show the right numbers."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class TestFindExamples:
 
     def test_frames_rows_and_cameras(self, tmp_path: Path) -> None:
         folder = tmp_path / "tum" / "desk"
-        for name in ("f@1", "f@2"):  # names with the letter that also parts frames from rows
+        for name in ("f@1", "f@2"):  # names with the character that separates frames from rows
             self.frame(folder, name)
         self.write(folder, "f@1@Ensemble", depth=full(2.0), variance=full(0.1), aleatoric=full(0.1))
         self.write(folder, "f@1@UfMstar-Ensemble@0a1b", depth=full(2.0), variance=full(0.2))
@@ -128,24 +128,25 @@ class TestStrips:
         one = example(rows, halves(3.0, 0.0))
         path = tmp_path / draw_strip(tmp_path, one, list(rows), "ensemble").file
         _, length = fit_strip_scales(one, list(rows))
-        # Errors 1 and .5 where there is truth; sigmas .2 | .8 and .5: the two .5 share a colour, as they share a scale.
+        # Errors 1 and .5 where there is truth; sigmas .2 | .8 and .5. Error and sigma share a scale, so both .5 have
+        # one colour.
         for value, area in ((0.2, 0.5), (0.8, 0.5), (1.0, 0.5), (0.5, 1.5)):
             result = pixels(path, length.rgb(np.array(value)))
             assert result == pytest.approx(area * CELL, rel=0.12), value
         nll = one.rows["star"].nll[0, 0]
         assert pixels(path, NLL_SCALE.rgb(np.array(nll))) == pytest.approx(0.5 * CELL, rel=0.12)
-        # No truth on the right half: of the truth itself, two errors and two NLLs.
+        # No truth on the right half: grey in the truth, two errors and two NLLs.
         assert pixels(path, np.full(3, INVALID_GREY)) == pytest.approx(2.5 * CELL, rel=0.12)
 
 
 class TestCompare:
-    def test_the_place_is_found_and_signed(self, tmp_path: Path) -> None:
+    def test_red_marks_the_pixels_where_ufm_star_is_larger(self, tmp_path: Path) -> None:
         new = full(0.01)
         new[8:, 11:] = 1.0
         one = example({"ufm": (full(2.0), full(0.01)), "star": (full(2.0), new)})
         with Image.open(tmp_path / draw_comparison(tmp_path, one, ["ufm", "star"], "ensemble").file) as picture:
             colours = np.asarray(picture.convert("RGB")).astype(int)
-        # RdBu_r: red where UfM* says more; nowhere does it say less.
+        # RdBu_r: red where UfM*'s value is larger; it is nowhere smaller.
         assert ((colours[..., 0] > 80) & (colours[..., 1] < 20) & (colours[..., 2] < 50)).sum() > 500
 
 
@@ -153,7 +154,8 @@ class TestProjection:
     @settings(max_examples=25)
     @given(st.integers(0, 2**32 - 1))
     def test_the_ellipse_reaches_as_far_as_the_gaussian(self, seed: int) -> None:
-        """In every direction n of the picture its extent is that of the marginal: sigmas sqrt(n^T P S P^T n)."""
+        """In every direction n of the picture the ellipse extends to ``sigmas`` sqrt(n^T P S P^T n), as the marginal
+        does."""
         rng = np.random.default_rng(seed)
         R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         A = rng.normal(size=(4, 3, 3))
@@ -176,7 +178,7 @@ def snapshot(frame: str, mean: list[list[float]], m: list[float], sigma: float =
 
 class TestRooms:
     def pixels(self, path: Path, snapshots: list[Snapshot], *roots: float) -> int:
-        """Pixels where Gaussians of these sqrt(m) [m] lie on each other, the last one on top."""
+        """Pixels where Gaussians with these sqrt(m) [m] overlap, the last one on top."""
         scale = draw_room(path, snapshots, "room")
         colour = np.full(3, 255.0)
         for root in roots:
@@ -221,7 +223,7 @@ class TestRooms:
 
 class TestWritePictures:
     def test_all_kinds_with_their_words(self, evaluation: Path, tmp_path: Path) -> None:
-        sequence = KITCHEN[1]  # no name for a folder
+        sequence = KITCHEN[1]  # not a valid folder name
         pictures = [draw() for _, draw in pictures_of(load_results(evaluation, with_sums=False), tmp_path)]
         assert [p.file.partition("-")[0] for p in pictures] == [STRIP, BREAKDOWN, COMPARE, ROOM]
         assert all((evaluation / "figures" / p.file).is_file() for p in pictures)

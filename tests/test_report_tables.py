@@ -1,4 +1,4 @@
-"""Tables, paired differences and tidy results of a report, against numbers worked out by hand or from the paper."""
+"""Tables, paired differences and tidy results of a report, against numbers computed by hand or from the paper."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class TestMainTable:
         assert [cell.value for cell in table.cells["", "sequences"]] == ["2", "1"]
         assert not any(cell.bold for cell in table.cells.to_numpy().flat)
         assert any("different sequences" in note for note in table.notes)
-        assert not any("Paper" in heading for heading in table.headings), "a suite of one's own"
+        assert not any("Paper" in heading for heading in table.headings), "a user's suite"
 
     def test_a_network_of_depth_alone_has_dashes(self, tmp_path):
         rows = rows_of("DepthOnly", "UfM*-DepthOnly")
@@ -137,7 +137,7 @@ class TestLatex:
 
 
 class TestTextOfUsers:
-    """Names of folders and titles of suites never become markup, links or formulas."""
+    """Folder names and suite titles never become markup, links or formulas."""
 
     def test_markdown(self):
         assert markdown_text("a [b](http://c) *d* `e` <f> | g~~\nh $x$") == (
@@ -182,7 +182,7 @@ class TestDifferences:
         figures = {(ALONE, ("d", s)): {"nll": 1.0} for s in "ab"} | {(UFM, ("d", s)): {"nll": 3.0} for s in "bc"}
         mean = less(in_memory(figures), UFM, ALONE)
         assert (mean.value, mean.sequences) == (2.0, 1)
-        assert math.isnan(mean.half)  # one sequence says nothing about others
+        assert math.isnan(mean.half)  # one sequence has no interval
 
     def test_all_rows_are_compared_with_ufm_star_of_their_base(self):
         rows = [*ENSEMBLE, *rows_of("UfM*-FullEnsemble", "Aleatoric"), Row(UFM_STAR.method, Setting(skip=4))]
@@ -220,7 +220,7 @@ class TestSums:
         assert again.records == results.records
         assert again.merged.keys() == results.merged.keys()
         for key, merged in again.merged.items():
-            # As text, since the NaN of an empty bin equals nothing.
+            # As text, since the NaN of an empty bin is unequal to itself.
             assert repr(sorted(merged.items())) == repr(sorted(results.merged[key].items()))
         write_report(other, figures=False)
         assert (other / "results.csv").read_bytes() == (evaluation / "results.csv").read_bytes()
@@ -234,7 +234,7 @@ class TestTidy:
         for record in results.records:
             mine = [line for line in lines if (line["method"], line["sequence"]) == (record.method, record.sequence)]
             result = {line["figure"]: float(line["value"]) for line in mine}
-            assert {name: result[name] for name in record.figures} == record.figures  # to the last bit
+            assert {name: result[name] for name in record.figures} == record.figures  # bit for bit
             assert result["frames.skipped"] == 2
             assert result["ms.network"] == record.ms["network"]
             assert {line["network"] for line in mine} == {NETWORK}
@@ -283,13 +283,13 @@ class TestLoading:
     def test_sums_that_are_gone_or_broken(self, tmp_path):
         write_evaluation(tmp_path, ENSEMBLE[:2], SCENES[:2])
         sums = tmp_path / "records" / "scannet" / SCENES[1][1] / "Ensemble.pt"
-        kept = sums.read_bytes()
+        content = sums.read_bytes()
         sums.unlink()
         result = load_results(tmp_path)
         assert set(result.merged) == {("scannet", UFM)}
         assert len(result.notes) == 1
         assert "Ensemble.pt is not there" in result.notes[0]
-        sums.write_bytes(kept[:100])
+        sums.write_bytes(content[:100])
         with pytest.raises(ResultsError, match=r"Ensemble\.pt does not hold the sums"):
             load_results(tmp_path)
         torch.save({"metrics": {"metrics.NLL.total": torch.zeros(7)}}, sums)
@@ -306,11 +306,11 @@ class TestCommand:
 
     def test_what_a_killed_report_left_is_removed(self, tmp_path):
         out = write_evaluation(tmp_path, ENSEMBLE[:1], SCENES[:1])
-        left, of_eval = out / ".results.csv.0123456789ab.tmp", out / ".eval.json.0123456789ab.tmp"
-        for path in (left, of_eval):
+        temporary, of_eval = out / ".results.csv.0123456789ab.tmp", out / ".eval.json.0123456789ab.tmp"
+        for path in (temporary, of_eval):
             path.write_text("half")
         write_report(out, figures=False)
-        assert (left.exists(), of_eval.exists()) == (False, True)
+        assert (temporary.exists(), of_eval.exists()) == (False, True)
 
     def test_wrong_usage(self, tmp_path, capsys):
         assert cli.main(["report", str(tmp_path)]) == 2
@@ -322,7 +322,7 @@ PAPER_2 = [table for table in paper_tables() if table.number == 2]
 
 
 class TestThePapersNumbers:
-    """Every number of the four tables, against the LaTeX source of the paper, read by other code."""
+    """Every number of the four tables, against an independent parser of the paper's LaTeX source."""
 
     @staticmethod
     def cells(label: str) -> list[tuple[str, list[Cell | None]]]:

@@ -1,4 +1,4 @@
-"""The runner: what it writes equals a loop by hand, and no interruption changes it."""
+"""The runner: its outputs equal a loop written by hand, and no interruption changes them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ufmstar_torch.models import Preprocess
 
 
 class Crash(BaseException):
-    """An end that nothing in the program knows of."""
+    """An exception that the program does not handle."""
 
 
 def crash():
@@ -37,7 +37,7 @@ def crash():
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """A generic sequence of 6 frames, 48x64, and what it was rendered from. Nobody may change it."""
+    """A generic sequence of 6 frames, 48x64, and its rendered scene. Tests must not change it."""
     return write_generic(tmp_path_factory.mktemp("scene"))
 
 
@@ -48,14 +48,14 @@ def path(scene):
 
 @pytest.fixture(scope="module")
 def uninterrupted(scene, tmp_path_factory):
-    """The outputs of an undisturbed run of two networks in turn."""
+    """The outputs of an undisturbed run of two alternating networks."""
     out = tmp_path_factory.mktemp("uninterrupted") / "out"
     assert run(network_job(scene[0], *pair()), out)["state"] == "finished"
     return outputs(out)
 
 
 def pair(**trouble):
-    """Two members that disagree; trouble happens in the second one."""
+    """Two members that disagree; interruptions happen in the second one."""
     return Brightness(1.0, spread=0.02), Brightness(1.1, spread=0.02, **trouble)
 
 
@@ -113,7 +113,7 @@ def test_the_summary_says_what_it_came_from(path, tmp_path):
     assert text["mixture"]["bytes_allocated"] >= text["mixture"]["bytes_in_use"] > 0
     lines = records(tmp_path / "out")
     assert [line["name"] for line in lines] == ["7", "9"]
-    # The intrinsics of the written maps: those of 24x32 images, from 48x64 ones.
+    # The intrinsics of the written maps, for 24x32 images resized from 48x64.
     K = np.array([500 / 20, 510 / 20, (310 + 0.5) / 20 - 0.5, (245 + 0.5) / 20 - 0.5])
     np.testing.assert_allclose(lines[0]["intrinsics"], K, rtol=1e-9)
 
@@ -130,8 +130,8 @@ def test_pictures_and_mixture(path, tmp_path):
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 4
     sheet = cv2.imread(str(out / "contact_sheet.png"))
     run(own_depth_job(path, sheet=True, frames=slice(0, 4)), tmp_path / "own")
-    own = cv2.imread(str(tmp_path / "own" / "contact_sheet.png"))
-    assert own.shape[1] < 0.8 * sheet.shape[1]  # no column for an error that is zero by construction
+    without_error = cv2.imread(str(tmp_path / "own" / "contact_sheet.png"))
+    assert without_error.shape[1] < 0.8 * sheet.shape[1]  # no column for an error that is zero by construction
 
 
 def test_ufm_star_stays_on_the_cpu_where_the_networks_run_elsewhere(path):
@@ -154,7 +154,7 @@ def test_frames_that_cannot_be_used_are_skipped_and_counted(tmp_path):
     path, _ = write_generic(tmp_path)
     truncate(path / "images" / "8.png")
     poses = np.loadtxt(path / "poses.txt")
-    poses[3, :3] *= 1.3  # no rotation any more
+    poses[3, :3] *= 1.3  # not a rotation any more
     np.savetxt(path / "poses.txt", poses)
     summary = run(network_job(path), tmp_path / "out")
     assert (summary["state"], summary["frames"]["done"]) == ("finished", 4)
@@ -200,7 +200,7 @@ def test_maps_of_another_size_get_their_intrinsics(scene, tmp_path):
     np.testing.assert_allclose(summary["prediction"]["intrinsics"], K)
     assert summary["prediction"]["size"] == [24, 32]
     assert summary["metrics"]["delta1"] > 0.999
-    assert summary["metrics"]["rmse"] < 1e-6, "the truth is looked up at the maps' own pixels"
+    assert summary["metrics"]["rmse"] < 1e-6, "the truth is sampled at the maps' pixels"
     assert summary["uncertainty"]["mean_network_sigma"] == pytest.approx(0.2)
     assert summary["uncertainty"]["mean_sigma"] > 0.2
     alone = summary["network_alone"]
@@ -213,7 +213,7 @@ def test_maps_that_were_cropped_need_their_intrinsics(path, tmp_path):
     sequence = open_sequence(path)
     with pytest.raises(ValueError, match=r"7\.png: the map is 48x48, the images are 64x48: .*give .* --map-intrinsics"):
         folder_source(sequence, tmp_path / "maps")
-    # Only a later one: that frame is left out.
+    # Only a later trajectory row is present: that frame is left out.
     for name in (7, 8, 9):
         write_depth_png(tmp_path / "maps" / f"{name}.png", np.ones((48, 64)), 1000, scale_text="0.001")
     summary = run(job_of(sequence, folder_source(sequence, tmp_path / "maps")), tmp_path / "out")
@@ -222,7 +222,7 @@ def test_maps_that_were_cropped_need_their_intrinsics(path, tmp_path):
 
 
 def test_the_depth_of_a_run_as_maps_of_another_gives_the_same(path, tmp_path):
-    """A network's cropped view, once from the network and once from its stored maps and their intrinsics."""
+    """A network's cropped input: once predicted, and once from its stored maps and intrinsics."""
     preprocess = Preprocess(resize_height=40, crop=(30, 40), size=(24, 36))
     sequence = open_sequence(path)
     first = run(job_of(sequence, networks(Brightness(), preprocess=preprocess)), tmp_path / "first")
@@ -255,7 +255,7 @@ def test_a_run_reads_back_what_another_left_and_skips_what_it_skipped(path, tmp_
 
 def test_maps_of_some_frames_are_enough_where_only_those_are_run(path, tmp_path):
     words = ["run", str(path), "--depth", str(tmp_path / "maps"), "--no-video", "--no-sheet", "--out"]
-    for name, value in (("first", 1.0), ("second", 2.0)):  # in order: nothing in common with the frames' names
+    for name, value in (("first", 1.0), ("second", 2.0)):  # paired in order: file and frame names differ
         write_depth_png(tmp_path / "maps" / f"{name}.png", np.full((48, 64), value), 1000, scale_text="0.001")
     assert cli.main([*words, str(tmp_path / "out"), "--frames", "2:4"]) == 0
     assert [read_frame(tmp_path / "out" / "frames" / f"{n}.npz")["depth"].max() for n in (9, 10)] == [1, 2]
@@ -274,7 +274,7 @@ def test_an_ensemble_alternates(path, tmp_path):
 
 
 def at_state(count):
-    """Crash when the checkpoint is to be replaced for the ``count``-th time, after every frame."""
+    """Crash at the ``count``-th replacement of the checkpoint, which is written after every frame."""
 
     def break_(monkeypatch):
         calls = []
@@ -293,7 +293,7 @@ def at_state(count):
 
 
 def between_files(count):
-    """Crash when the ``count``-th of the frames' files has been written, three a frame, but nothing notes it yet."""
+    """Crash after the ``count``-th of the frames' files (three per frame), before it is recorded."""
 
     def break_(monkeypatch):
         calls = []
@@ -333,7 +333,7 @@ def test_ctrl_c_leaves_what_is_finished_and_resume_goes_on(path, tmp_path, unint
     assert (summary["state"], summary["frames"]["done"]) == ("interrupted", done)
     assert f"{done} of 6 frames" in summary["reason"]
     assert len(list((out / "frames").iterdir())) == done
-    # The summary speaks of finished frames only, though the next one was in hand.
+    # The summary covers finished frames only, although the next frame was in progress.
     assert len(summary["mixture"]["components_over_time"]) == done
     assert summary["metrics"]["pixels"] == done * 24 * 32
     assert run(network_job(path, *pair()), out, resume=True)["state"] == "finished"
@@ -382,7 +382,7 @@ def test_a_full_disk_leaves_finished_frames_and_resume_continues(path, tmp_path,
 
 
 def _killed(path, out):
-    """Run; killed in the second call of the second network."""
+    """A run that is killed in the second call of the second network."""
     kill = partial(os.kill, os.getpid(), signal.SIGKILL)
     run(network_job(path, *pair(at=1, then=kill)), out)
 
@@ -402,7 +402,7 @@ def test_sigkill_loses_the_last_seconds_only(path, tmp_path, uninterrupted):
     sessions = [(s["first"], s["frames"]) for s in resumed["time"]["sessions"]]
     first = sessions[-1][0]
     assert sessions == ([(0, first), (first, 6 - first)] if first else [(0, 6)])
-    assert first <= written  # those behind the loop are lost, and those since the last state
+    assert first <= written  # queued frames are lost, and frames since the last saved state
     assert outputs(out) == uninterrupted
 
 

@@ -1,4 +1,5 @@
-"""``ufmstar run --anchors``: it equals a loop by hand, whatever interrupts it, and says which frames had none."""
+"""``ufmstar run --anchors``: equal to a loop written by hand, after any interruption; reports frames without
+anchors."""
 
 from __future__ import annotations
 
@@ -30,18 +31,18 @@ OFF = ON.replace(anchors=None)
 
 @pytest.fixture(scope="module")
 def tour():
-    """Eight rendered frames, 120x160, in memory. Nobody may change them."""
+    """Eight rendered frames, 120x160, in memory. Tests must not change them."""
     return in_memory(open_sequence(TOUR))
 
 
 def with_entries(sequence, change):
-    """Every frame's entry changed by a function of its number; None leaves it out."""
+    """The sequence with entries changed by a function of the frame number; None removes an entry."""
     changed = [change(i, entry) for i, entry in enumerate(sequence.entries)]
     return dataclasses.replace(sequence, entries=tuple(entry for entry in changed if entry is not None))
 
 
 def too_far(frame, stop_at=None):
-    """Depth that is 30 % too far, of every second pixel, with a variance of 1 cm^2."""
+    """Depth that is 30 % too far, subsampled by 2, with a variance of 1 cm^2."""
     if frame.index == stop_at:
         raise KeyboardInterrupt
     depth = 1.3 * frame.depth[::2, ::2]
@@ -91,7 +92,7 @@ def test_a_run_with_maps_equals_a_loop_by_hand(tour, finished):
     used = [record["anchors"]["used"] for record in records(out)]
     assert sum(message["frames_without"].values()) == used.count(0)
     assert used[message["frames_before_the_first"]] > 0 == sum(used[: message["frames_before_the_first"]])
-    # The last frame knows of the 30 %, if roughly, in images as small as these: 1/1.3 - 1 = -.23.
+    # The last frame's bias is roughly 1/1.3 - 1 = -.23; in such small images it is not exact.
     assert -0.35 < records(out)[-1]["mean_bias"] < -0.12
     assert summary["time"]["median_ms"]["anchors"] > 0
 
@@ -189,7 +190,7 @@ def test_the_flag(tmp_path, capfd):
     assert "UfM*, anchored  " in printed
     used, result = (summary["anchors"][key] for key in ("used_per_frame", "found_per_frame"))
     assert f"anchors: {used:.1f} used a frame, of {result:.1f} triangulated" in printed
-    # Perfect depth has no bias to find; tracks in images as small as these err by some per cent.
+    # Exact depth has no bias; tracks in such small images have errors of some per cent.
     assert abs(summary["anchors"]["mean_bias"]) < 0.1
     assert summary["anchors"]["mean_anchored"] < 0.1
 

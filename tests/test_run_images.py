@@ -1,4 +1,4 @@
-"""Inputs of a run's figures and pictures: truth at the prediction's pixels, and the network's view of an image."""
+"""Inputs of a run's metrics and pictures: truth at the prediction's pixels, and the network's input image."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ def test_scannet_depth_is_brought_to_the_colour_camera(tmp_path):
     actual = truth_at(frame, K.numpy(), size)
     expected = render(of_color.T_world_cam[1], K.numpy(), *size)
     both = actual > 0
-    assert both.mean() > 0.85  # the depth camera sees a little less than the colour camera
-    # Nearest pixels: exact but for the slant of the surfaces within a pixel, and a few pixels at edges.
+    assert both.mean() > 0.85  # the depth camera has a slightly smaller field of view than the colour camera
+    # Nearest pixels: exact except for the slope within a pixel and a few pixels at edges.
     off = np.abs(actual - expected)[both] / expected[both]
     assert np.quantile(off, 0.9) < 0.02
     assert np.median(off) < 0.006
 
 
 def test_sigma_is_striped_where_nothing_was_compared():
-    """A third of those pixels is grey; depth and the others keep their colours."""
+    """A third of the uncompared pixels is grey; depth and other pixels keep their colours."""
     maps = {"depth": np.full((60, 80), 2.0), "sigma": np.full((60, 80), 0.3), "measured": np.ones((60, 80))}
     maps["measured"][:, :40] = 0.2
     panel = FramePanel("f", np.zeros((60, 80, 3), np.uint8), maps)
@@ -72,7 +72,7 @@ def test_the_shown_image_is_what_the_network_saw():
     K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
     nyu = Preprocess.nyu()
     part = field_of_view(image.astype(np.uint8), K.numpy(), nyu.apply_intrinsics(K, 480, 640).numpy(), (224, 224))
-    # 228 x 304 of 250 x 333 pixels, in those of the image.
+    # 228 x 304 of 250 x 333 pixels, in image pixels.
     assert abs(part.shape[0] - 480 * 228 / 250) <= 1
     assert abs(part.shape[1] - 640 * 304 / 333) <= 1
     assert abs(int(part[0, 0, 0]) - 240 * 11 / 250) <= 1

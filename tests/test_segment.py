@@ -1,4 +1,4 @@
-"""SPGF: the oracle against the authors' partitions, every backend against both, its properties and its input."""
+"""SPGF: the oracle against the authors' partitions, every backend against both, properties, and input."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.numerics
 
 # Where Cholesky failed, upstream added 1e-5 (a float32) to the diagonal.
 JITTER = float(np.float32(1e-5)) * np.eye(3)
-# How many of each file's Gaussians that concerns: the Gaussians without thickness (see below).
+# The number of these Gaussians in each file: Gaussians without thickness (see below).
 SLOWEST = ("spgf_vga_tum", "torch")
 JITTERED = {"spgf_224_tum": 45, "spgf_224_tartanair_indoor": 64, "spgf_vga_tum": 49}
 SMALL = SPGFConfig(sparse=2, min_pixels=10, min_rows=3, scale_with_image=False)
@@ -89,8 +89,8 @@ def test_oracle_is_what_the_authors_program_computed(name):
 
 @pytest.mark.parametrize("name", REFERENCES)
 def test_reference_partitions(name, backend):
-    """All 17 frames: labels and order identical, moments to 1e-9, also those with upstream's 1e-5 I. Where that takes a
-    minute, crops of three frames, against the compiled kernel's."""
+    """All 17 frames: identical labels and order, moments to 1e-9, also with upstream's 1e-5 I. A slow backend runs
+    crops of three frames, compared with the compiled kernel."""
     r = reference(name)
     if backend.slow or (name, backend.name) == SLOWEST:
         depth = r.depth[:3, 100:120, 80:144].contiguous()
@@ -109,7 +109,7 @@ def test_reference_partitions(name, backend):
         added = np.abs(covariance + JITTER - expected["cov"]).max((1, 2)) < 1e-9
         jittered += added.sum()
         np.testing.assert_allclose(covariance[~added], expected["cov"][~added], atol=1e-9)
-        # The cause: covariances that are singular to rounding, so that Cholesky's last pivot may vanish.
+        # The cause: covariances that are singular up to rounding, so Cholesky's last pivot may vanish.
         eigenvalues = np.linalg.eigvalsh(covariance[added])
         assert (eigenvalues[:, 0] < 1e-12 * eigenvalues[:, 2]).all()
     assert jittered == JITTERED[name]
@@ -133,7 +133,7 @@ def test_agrees_with_the_oracle(backend, seed, config, height, width):
 
 
 def test_streams_are_independent(backend):
-    """Scenes with cameras of their own at once equal single runs: depth bins and thresholds per stream."""
+    """Several scenes with different cameras at once equal single runs: depth bins and thresholds are per stream."""
     seeds, size = ((3, 5), (10, 14)) if backend.slow else ((3, 4, 5), (20, 26))
     scenes = [clutter(seed, *size) for seed in seeds]
     depth, K = (torch.cat(parts) for parts in zip(*scenes, strict=True))
@@ -142,11 +142,13 @@ def test_streams_are_independent(backend):
     together, labels = backend.spgf(depth, K, config, features=features)
     assert (labels.amax((1, 2)) >= 0).all()
     for b in range(len(seeds)):
-        own = slice(b, b + 1)
-        single, own_labels = backend.spgf(depth[own], K[own], config, features=features[own])
-        assert torch.equal(labels[own], own_labels)
+        stream = slice(b, b + 1)
+        single, single_labels = backend.spgf(depth[stream], K[stream], config, features=features[stream])
+        assert torch.equal(labels[stream], single_labels)
         for name, value in single.tensors().items():
-            torch.testing.assert_close(together.tensors()[name][own, : single.capacity], value, rtol=1e-13, atol=1e-14)
+            torch.testing.assert_close(
+                together.tensors()[name][stream, : single.capacity], value, rtol=1e-13, atol=1e-14
+            )
 
 
 def test_pruning_at_the_boundary(backend):
@@ -154,14 +156,14 @@ def test_pruning_at_the_boundary(backend):
     depth, K = torch.zeros(1, 6, 20, dtype=torch.float64), camera(40.0, 40.0, 10.0, 3.0)
     depth[:, 1:5, 3:18] = 1.0
 
-    def kept(pixels, rows, prune):
+    def segments(pixels, rows, prune):
         config = SPGFConfig(min_pixels=pixels, min_rows=rows, prune=prune, scale_with_image=False)
         mixture, labels = backend.spgf(depth, K, config)
         assert bool((labels >= 0).any()) == bool(mixture.components[0])
         return int(mixture.components[0])
 
     for prune, expected in (("either", [1, 0, 0, 0]), ("both", [1, 1, 1, 0]), ("none", [1, 1, 1, 1])):
-        actual = [kept(*limits, prune) for limits in ((60, 4), (61, 4), (60, 5), (61, 5))]
+        actual = [segments(*limits, prune) for limits in ((60, 4), (61, 4), (60, 5), (61, 5))]
         assert actual == expected, prune
 
 
@@ -185,10 +187,10 @@ def test_features_are_means(backend):
     [
         ("reference", True, (480, 640), 100.0, 2.4 / 525),
         ("reference", False, (480, 640), 100.0, 2.4 / 100),
-        # The camera's own focal length: an image of half the size has half of it, and the same threshold in metres.
+        # With the camera's focal length: an image of half the size has half of it, and the same threshold in metres.
         ("camera", True, (480, 640), 320.0, 2.4 / 320),
         ("camera", True, (240, 320), 160.0, 2.4 / 320),
-        # The centre of a 640 x 480 image, enlarged to its width: f is larger, and so is the resolution.
+        # A crop of a 640 x 480 image's centre, enlarged to the image's width: f and the resolution are larger.
         ("camera", True, (240, 640), 320.0, 2.4 / 320),
         ("camera", False, (240, 320), 160.0, 2.4 / 160),
     ],
@@ -202,11 +204,11 @@ def test_static_bounds_change_nothing(monkeypatch):
     """The loops and tables of an accelerator, run on the CPU."""
     depth, K = (torch.cat(parts) for parts in zip(clutter(8, 14, 22), clutter(9, 14, 22), strict=True))
     config = SPGFConfig(sparse=2, min_pixels=12, min_rows=3, scale_with_image=False)
-    given = [SegmentInput.of(depth, K, one) for one in (config, unpruned(config))]
-    expected = [segment.segment(one) for one in given]
+    inputs = [SegmentInput.of(depth, K, one) for one in (config, unpruned(config))]
+    expected = [segment.segment(one) for one in inputs]
     monkeypatch.setattr(segment_fusion, "reads_are_free", lambda device: False)
     monkeypatch.setattr(segment, "reads_are_free", lambda device: False)
-    for one, (mixture, labels) in zip(given, expected, strict=True):
+    for one, (mixture, labels) in zip(inputs, expected, strict=True):
         static, static_labels = segment.segment(one)
         assert torch.equal(labels, static_labels)
         for name, value in mixture.padded(static.capacity).tensors().items():
@@ -216,7 +218,7 @@ def test_static_bounds_change_nothing(monkeypatch):
 
 @pytest.mark.parametrize("prune", ["both", "either", "none"])
 def test_no_value_is_read_on_other_devices(prune):
-    """Reading one raises on the meta device, where tensors have no values."""
+    """On the meta device tensors have no values, and reading one raises."""
     b, height, width = 2, 6, 9
     depth = torch.empty(b, height, width, device="meta")
     config = SPGFConfig(sparse=2, min_pixels=7, min_rows=2, prune=prune, scale_with_image=False)
@@ -277,12 +279,12 @@ def test_single_pixels_have_no_covariance(backend):
 def test_dtypes(backend):
     depth, K = clutter(21, *((10, 14) if backend.slow else (20, 24)))
     for dtype in (torch.float64, torch.float32):
-        given = depth.to(dtype)
-        mixture, labels = backend.spgf(given, K, SMALL, features=given[:, None].nan_to_num(0, 0, 0))
+        converted = depth.to(dtype)
+        mixture, labels = backend.spgf(converted, K, SMALL, features=converted[:, None].nan_to_num(0, 0, 0))
         assert labels.max() >= 0
         assert {v.dtype for n, v in mixture.tensors().items() if n != "count"} == {dtype}
         assert (labels.dtype, mixture.count.dtype) == (torch.int64, torch.int64)
-        exact, same = backend.spgf(given.double(), K, SMALL)
+        exact, same = backend.spgf(converted.double(), K, SMALL)
         assert torch.equal(labels, same)
         torch.testing.assert_close(mixture.covariance, exact.covariance.to(dtype))
         assert torch.equal(mixture.weight, exact.weight.to(dtype))
@@ -297,7 +299,7 @@ def test_arguments_are_left_alone_and_may_be_views(backend):
     mixture, labels = backend.spgf(view, K.expand(1, 3, 3), SMALL, features=features)
     expected, same = backend.spgf(depth, K, SMALL, features=features)
     assert torch.equal(labels, same)
-    torch.testing.assert_close(mixture.mean, expected.mean, rtol=1e-14, atol=1e-15)  # strides may choose the loops
+    torch.testing.assert_close(mixture.mean, expected.mean, rtol=1e-14, atol=1e-15)  # the strides may select the loops
     for value in (view, features[:, 0]):
         assert torch.equal(value.nan_to_num(), depth.nan_to_num())
     with torch.inference_mode():

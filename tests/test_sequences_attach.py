@@ -1,4 +1,4 @@
-"""Trajectories of other programs on every layout: by time, by frame number, by place; nothing shifts silently."""
+"""Trajectories of other programs on every layout: by time, frame number, or position, without silent shifts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from layouts import quaternion_line
 from ufmstar_torch.eval.sequences import Trajectory, interpolate_pose, open_sequence
 
 FRAMES = 6
-# Frame numbers as the layouts' writers name them.
+# Frame numbers in the file names of the layouts' writers.
 NUMBERED = {
     "scannet": (layouts.write_scannet, range(FRAMES)),
     "7scenes": (layouts.write_seven_scenes, range(FRAMES)),
@@ -78,7 +78,7 @@ def test_kitti_rows_by_place_and_a_wrong_count(numbered):
 
 
 def test_orb_slam3_in_nanoseconds(tmp_path):
-    """EuRoC's format: whole nanoseconds since 1970, of a recording whose images have seconds."""
+    """EuRoC's format: integer nanoseconds since 1970, for a recording with image times in seconds."""
     path, _ = layouts.write_tum(tmp_path)
     text = (path / "rgb.txt").read_text()
     names = [line.split()[1] for line in text.splitlines()[1:]]
@@ -87,7 +87,7 @@ def test_orb_slam3_in_nanoseconds(tmp_path):
     write(tmp_path / "f_dataset.txt", seconds * 1e9, form="{:.6f}")
     sequence = open_sequence(path, trajectory=tmp_path / "f_dataset.txt")
     assert_moved(sequence, range(FRAMES))
-    write(tmp_path / "f_dataset.txt", (seconds + 0.01) * 1e9, form="{:.6f}")  # interpolated, not taken for the next
+    write(tmp_path / "f_dataset.txt", (seconds + 0.01) * 1e9, form="{:.6f}")  # interpolated
     sequence = open_sequence(path, trajectory=tmp_path / "f_dataset.txt")
     x = MOVED[1][0, 3] + (MOVED[2][0, 3] - MOVED[1][0, 3]) * 0.7
     assert sequence.entries[1].T_world_cam[0, 3] == pytest.approx(x, abs=1e-4)
@@ -103,7 +103,7 @@ def test_units_are_recognised_by_meeting_the_images(tmp_path, unit):
 
 @pytest.mark.parametrize("stamps", [np.arange(FRAMES) / 10, np.array([10e9])], ids=["another-time", "one-pose"])
 def test_a_trajectory_at_another_time_stays_as_it_is(tmp_path, stamps):
-    """0 to 0.5 s are no 0 to 0.5 ms, and one pose has no unit that its distances could confirm."""
+    """0 to 0.5 s are not read as ms; a single pose has no spacing that could confirm a unit."""
     path, _ = layouts.write_tum(tmp_path)
     write(tmp_path / "slam.txt", stamps, MOVED[: len(stamps)])
     with pytest.raises(ValueError, match=rf"{len(stamps)} poses at {stamps[0]:.3f} to {stamps[-1]:.3f} s"):
@@ -111,7 +111,7 @@ def test_a_trajectory_at_another_time_stays_as_it_is(tmp_path, stamps):
 
 
 def test_whole_seconds_of_a_video_are_seconds(tmp_path):
-    """A pose each second beside 10 images per second: numbers that some images have are no frame numbers."""
+    """A pose each second and 10 images per second: times that equal some frame numbers are not frame numbers."""
     poses = layouts.walk(41)
     images = [np.full((48, 64, 3), i, np.uint8) for i in range(41)]
     layouts.write_video(tmp_path / "walk.mkv", images, fps=10)

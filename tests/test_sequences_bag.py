@@ -1,4 +1,4 @@
-"""ROS bags: what is read equals what rosbags' writers wrote; choice of topics; truncated and hostile files."""
+"""ROS bags: the read data equals the written data; choice of topics; truncated and hostile files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KINDS = ("ros1", "db3", "mcap")
 
 
 def require_same(sequence, truth, atol=2e-4):
-    """Poses within the error of interpolating a jump of 11 cm in the middle: none, as both samples are the pose."""
+    """Poses must be equal: both samples around an image are its pose, so interpolation has no error."""
     assert len(sequence) == 6
     for i, frame in enumerate(sequence):
         np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-9)
@@ -141,7 +141,7 @@ def test_depth_of_another_camera_is_left_out_and_named(tmp_path, caplog):
 
 
 def test_the_frame_of_a_pose_can_be_named(tmp_path, capfd):
-    """A pose of the body without its name, and the world of tf."""
+    """A pose of the body without a frame name, and tf's world frame."""
     path, truth = written.write_bag(tmp_path / "tf", poses="tf")
     in_odom = open_sequence(path, topics=["/tf=odom"])
     for i, frame in enumerate(in_odom):
@@ -166,7 +166,7 @@ def test_the_frame_of_a_pose_can_be_named(tmp_path, capfd):
 
 
 def static(parent, child):
-    """Write a further transform that does not move."""
+    """Write a further static transform."""
     return lambda bag: bag.write("/tf_static", written.START, bag.tf(written.START, (parent, child, np.eye(4))))
 
 

@@ -1,4 +1,4 @@
-"""COLMAP, transforms.json, EuRoC, ARKit: what is read equals what was written; lenses; truncated and hostile files."""
+"""COLMAP, transforms.json, EuRoC, ARKit: the read data equals the written data; lenses; truncated and hostile files."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_what_is_read_is_what_was_written(tmp_path, kind):
 
 
 def distorted(x, y, coefficients, fisheye):
-    """The lens's equations, in NumPy alone."""
+    """The lens's equations, in NumPy only."""
     if fisheye:
         r = np.hypot(x, y)
         angle = np.arctan(r)
@@ -97,8 +97,8 @@ def distorted(x, y, coefficients, fisheye):
 
 @pytest.mark.parametrize(("coefficients", "fisheye"), [(RADIAL, False), (FISHEYE, True)])
 def test_a_lens_is_undone(tmp_path, coefficients, fisheye):
-    """An image that shows its own pixel positions, as depth and as colour: each undistorted pixel shows where the
-    lens's equations send its ray."""
+    """An image that encodes its pixel positions as depth and as colour: each undistorted pixel equals the position that
+    the lens's equations give for its ray."""
     path, _, _ = written.write_colmap(
         tmp_path, 1, model="OPENCV_FISHEYE" if fisheye else "OPENCV", coefficients=coefficients
     )
@@ -114,7 +114,7 @@ def test_a_lens_is_undone(tmp_path, coefficients, fisheye):
     u, v = written.K[0, 0] * x + written.K[0, 2], written.K[1, 1] * y + written.K[1, 2]
     assert np.hypot(u - column, v - row).max() > 1, "the lens moves pixels"
     assert u.min() > -0.5, "no pixel lies outside the lens's image"
-    assert max(u.min() - 0, v.min() - 0, 63 - u.max(), 47 - v.max()) < 3, "most of the image is kept"
+    assert max(u.min() - 0, v.min() - 0, 63 - u.max(), 47 - v.max()) < 3, "most of the image remains"
     np.testing.assert_allclose(frame.image[..., 0], 3 * u.clip(0, 63), atol=1.01)
     np.testing.assert_allclose(frame.image[..., 1], 4 * v.clip(0, 47), atol=1.01)
     np.testing.assert_allclose(frame.depth, 1 + u.clip(0, 63) + v.clip(0, 47), atol=1.02)
@@ -198,8 +198,8 @@ def test_colmap_landmarks_and_what_makes_it_metric(tmp_path, text):
     assert [(frame.name, frame.reason) for frame in sequence.skipped] == [("2", "missing image file")]
     lines = [f"{i} {layouts.quaternion_line(T)}" for i, T in enumerate(truth.T_world_cam)]
     (path / "slam.txt").write_text("\n".join(lines))
-    assert open_sequence(path, trajectory="slam.txt").metric, "the trajectory's own unit"
-    same = open_sequence(path / "sparse" / "0")  # the model's own folder: images two levels above
+    assert open_sequence(path, trajectory="slam.txt").metric, "the trajectory's unit"
+    same = open_sequence(path / "sparse" / "0")  # the model's folder: images are two levels above
     np.testing.assert_array_equal(same[0].image, truth.images[0])
 
 
@@ -309,7 +309,8 @@ def test_hostile_transforms(tmp_path, change, message):
 
 
 def test_transforms_of_other_programs(tmp_path):
-    """NeRF's synthetic scenes: no ending, one angle of view; a pose with NaN is skipped; images of half the size."""
+    """NeRF's synthetic scenes: no file extension, one field of view; a pose with NaN is skipped; images of half the
+    size."""
     path, truth = written.write_transforms(tmp_path)
 
     def change(content):
@@ -337,20 +338,20 @@ def test_euroc_without_truth_and_with_a_trajectory(tmp_path):
     times = [1403715273.262142976 + 0.05 * i for i in range(6)]
     lines = [f"{t:.9f} {layouts.quaternion_line(T)}" for t, T in zip(times, truth.T_world_cam, strict=True)]
     (path / "slam.txt").write_text("\n".join(lines))
-    for place in (path, path / "mav0" / "cam0"):
+    for folder in (path, path / "mav0" / "cam0"):
         trajectory = path / "slam.txt"
         np.testing.assert_allclose(
-            open_sequence(place, trajectory=trajectory)[4].T_world_cam, truth.T_world_cam[4], atol=1e-9
+            open_sequence(folder, trajectory=trajectory)[4].T_world_cam, truth.T_world_cam[4], atol=1e-9
         )
 
 
 def test_aliases_of_aliases_are_refused_before_they_are_expanded(tmp_path):
-    """Nine levels of nine are 400 million words where they are printed, from 500 bytes."""
+    """Nine levels of nine aliases expand 500 bytes to 400 million words."""
     path, _ = written.write_euroc(tmp_path)
     file = path / "mav0" / "cam0" / "sensor.yaml"
     levels = "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in pairwise("abcdefghij"))
-    kept = [line for line in file.read_text().splitlines() if not line.startswith(("%", "distortion_model"))]
-    file.write_text("\n".join(["a: &a [x]", levels + "distortion_model: *j", *kept]))
+    lines = [line for line in file.read_text().splitlines() if not line.startswith(("%", "distortion_model"))]
+    file.write_text("\n".join(["a: &a [x]", levels + "distortion_model: *j", *lines]))
     with pytest.raises(ValueError, match=r"sensor\.yaml: expected a sensor's YAML of names and values without aliases"):
         open_sequence(path)
 

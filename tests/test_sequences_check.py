@@ -1,4 +1,4 @@
-"""The check of a sequence recognises the mistakes people make, and finds nothing wrong where nothing is."""
+"""The check of a sequence reports common mistakes, and reports nothing for correct sequences."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from shared_data import require_shared
 
-from scenes import look
+from scenes import camera_pose
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.poses import OURS
@@ -30,7 +30,7 @@ def test_nonsense_poses_fit_no_reading(walk):
     rng = np.random.default_rng(0)
 
     def turned(T):
-        return T @ look(rng.normal(0, 1, 3), *rng.normal(0, 0.4, 2))
+        return T @ camera_pose(rng.normal(0, 1, 3), *rng.normal(0, 0.4, 2))
 
     result = check_sequence(with_poses(open_sequence(walk), turned))
     assert not result.ok
@@ -72,7 +72,7 @@ def recording(request):
 
 
 def warped_error(a, b):
-    """Median relative difference of a's depth, moved into b, from b's depth; plain loops' arithmetic."""
+    """Median relative difference between a's depth, transformed to b, and b's depth, in NumPy."""
     v, u = np.nonzero(a.depth > 0)
     z = a.depth[v, u].astype(np.float64)
     fx, fy, cx, cy = a.intrinsics[0, 0], a.intrinsics[1, 1], a.intrinsics[0, 2], a.intrinsics[1, 2]
@@ -128,8 +128,8 @@ def test_mocap_that_starts_late(tmp_path):
         (late / name).symlink_to(source / name)
     lines = (source / "groundtruth.txt").read_text().splitlines()
     start = float(lines[3].split()[0]) + 1
-    kept = [line for line in lines if line.startswith("#") or float(line.split()[0]) >= start]
-    (late / "groundtruth.txt").write_text("\n".join(kept))
+    late_lines = [line for line in lines if line.startswith("#") or float(line.split()[0]) >= start]
+    (late / "groundtruth.txt").write_text("\n".join(late_lines))
     sequence = open_sequence(late)
     expected = [name for name in sequence.names_on_disk if float(name) < start - 1e-3]
     assert [frame.name for frame in sequence.skipped] == expected

@@ -1,4 +1,4 @@
-"""Predicted depth of any other program: formats, scales, variance, pairing with frames."""
+"""Depth predicted by another program: formats, scales, variance, pairing with frames."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_png_scale_is_given_or_in_the_file(tmp_path):
         NAMES,
         [f"{name}_depth" for name in NAMES],
         ["pred_0", "pred_1", "pred_2"],
-        ["first", "second", "third"],  # nothing in common: sorted order, there are as many
+        ["first", "second", "third"],  # no common names: paired in sorted order, as the counts agree
     ],
 )
 def test_maps_pair_by_stem_by_number_or_in_order(tmp_path, names):
@@ -83,7 +83,7 @@ def test_variance_in_a_folder_of_its_own(tmp_path):
     for name, depth in zip(NAMES, DEPTHS, strict=True):
         np.save(tmp_path / "variance" / f"{name}.npy", depth**2)
     maps = DepthFolder(tmp_path / "depth", scale=1e-3, variance=tmp_path / "variance").for_frames(NAMES)
-    # the scale is the depth's, variance stays in m^2
+    # the scale applies to the depth; the variance stays in m^2
     assert [float(maps[i][1][0, 0]) for i in range(3)] == [1, 4, 9]
     np.save(tmp_path / "variance" / f"{NAMES[0]}.npy", np.ones((2, 2)))
     with pytest.raises(FrameError, match=r"the variance is \[2, 2\], its depth \[3, 4\]"):

@@ -1,4 +1,4 @@
-"""Sequences below a root: all of them, each once, by names that do not depend on the order on disk."""
+"""Sequences below a root: each exactly once, with names independent of the order on disk."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def found(root, **options):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """A disk with a sequence of each of several layouts, at different depths."""
+    """A folder with sequences of several layouts, at different depths."""
     root = tmp_path_factory.mktemp("disk")
     layouts.write_tum(root / "tum", frames=1)
     layouts.write_seven_scenes(root / "7scenes" / "chess", frames=1)
@@ -32,7 +32,7 @@ def written(tmp_path_factory):
 
 @pytest.fixture
 def root(written, tmp_path):
-    """A copy that may be changed."""
+    """A copy that the test may change."""
     return shutil.copytree(written, tmp_path / "disk")
 
 
@@ -83,7 +83,7 @@ def test_hidden_folders_and_those_of_others_are_left_out(root, monkeypatch):
     listing = type(root).iterdir
 
     def guarded(path):
-        if path == shut:  # a root user may read everything, so that modes would test nothing
+        if path == shut:  # the user root may read everything, so file modes would have no effect
             raise PermissionError(13, "Permission denied", str(path))
         return listing(path)
 

@@ -40,15 +40,15 @@ def test_intrinsics_in_every_form(tmp_path, form):
     four = [truth.K[0, 0], truth.K[1, 1], truth.K[0, 2], truth.K[1, 2]]
     padded = np.eye(4)
     padded[:3, :3] = truth.K
-    given = None
+    intrinsics = None
     if form == "line":
         np.savetxt(path / "K.txt", [four])
     elif form == "4x4":
         np.savetxt(path / "K.txt", padded)
     elif form == "numbers":
         (path / "K.txt").unlink()
-        given = four
-    np.testing.assert_allclose(open_sequence(path, intrinsics=given).intrinsics, truth.K, atol=1e-12)
+        intrinsics = four
+    np.testing.assert_allclose(open_sequence(path, intrinsics=intrinsics).intrinsics, truth.K, atol=1e-12)
 
 
 def test_missing_or_doubled_pieces_are_named(tmp_path):
@@ -162,8 +162,8 @@ def test_depth_of_another_size_scales_its_intrinsics(tmp_path):
         write_depth_png(path / "depth" / f"{i + 7}.png", np.ones((24, 24)), 1000)
     with pytest.raises(ValueError, match="not only a resize: pass intrinsics"):
         open_sequence(path)
-    own = (20, 20, 12, 12)
-    assert open_sequence(path, depth_intrinsics=own)[0].depth_intrinsics[0, 0] == 20
+    depth_camera = (20, 20, 12, 12)
+    assert open_sequence(path, depth_intrinsics=depth_camera)[0].depth_intrinsics[0, 0] == 20
 
 
 def test_video_with_kitti_rows(tmp_path):
@@ -191,7 +191,7 @@ def test_a_video_that_does_not_say_its_length_is_counted(tmp_path, monkeypatch):
     write_video(tmp_path / "walk.mkv", [np.zeros((48, 64, 3), np.uint8)] * 5)
     open_capture = cv2.VideoCapture
 
-    class Silent:  # no subclass: OpenCV's own types do not survive it
+    class Silent:  # no subclass: it would lose OpenCV's types
         def __init__(self, path):
             self.capture = open_capture(path)
 
@@ -261,7 +261,7 @@ def test_pairing_rules(tmp_path):
     assert pairs(["a", "b"], ["b.png", "c.png"]) == {"b": "b.png"}
     assert pairs(["frame-000012"], ["12_depth.png"]) == {"frame-000012": "12_depth.png"}
     assert pairs(["000001_left"], ["000001_left_depth.npy"]) == {"000001_left": "000001_left_depth.npy"}
-    # decimals are not whole numbers, and what is ambiguous pairs nothing
+    # decimals are not integers, and ambiguous names pair nothing
     assert pairs(["1.05"], ["1.5.png"]) == {}
     assert pairs(["1.05"], ["d_1.05.png"]) == {"1.05": "d_1.05.png"}
     assert pairs(["7"], ["a7.png", "b7.png"]) == {}

@@ -71,7 +71,7 @@ def test_color_is_rgb_whatever_the_file(tmp_path):
 
 
 def test_both_png_decoders_have_the_same_pixels(tmp_path):
-    """8-bit RGB is kornia_rs's, everything else is Pillow's."""
+    """kornia_rs decodes 8-bit RGB, Pillow everything else."""
     image, grey = RNG.integers(0, 255, (6, 5, 3), dtype=np.uint8), RNG.integers(0, 65535, (6, 5), dtype=np.uint16)
     palette = Image.fromarray(image).quantize(16)
     for name, picture, plain in (("rgb", Image.fromarray(image), True), ("palette", palette, False)):
@@ -169,7 +169,7 @@ def test_a_damaged_header_of_an_array_is_a_frame_error(tmp_path, kind, suffix):
 
 
 def test_an_array_that_expands_has_a_bound(tmp_path, monkeypatch):
-    """No more of a member is read than its entry states, and no more than the limit is allocated."""
+    """Reads at most a member's stated size, and allocates at most the limit."""
     file = tmp_path / "a.npz"
     np.savez_compressed(file, depth=np.zeros((2000, 5000), np.float32))
     monkeypatch.setattr(array_files, "LARGEST", 1_000_000)
@@ -189,11 +189,11 @@ def test_an_array_that_expands_has_a_bound(tmp_path, monkeypatch):
 def test_damage_at_any_byte_of_an_archive_is_a_frame_error(tmp_path):
     np.savez_compressed(tmp_path / "a.npz", depth=np.ones((4, 5), np.float32))
     content, file = (tmp_path / "a.npz").read_bytes(), tmp_path / "b.npz"
-    for place in range(len(content)):
-        file.write_bytes(content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :])
+    for index in range(len(content)):
+        file.write_bytes(content[:index] + bytes([content[index] ^ 0xFF]) + content[index + 1 :])
         with suppress(FrameError):
-            assert read_depth(file).shape == (4, 5)  # a byte that nothing depends on
-        file.write_bytes(content[:place])
+            assert read_depth(file).shape == (4, 5)  # a byte without effect
+        file.write_bytes(content[:index])
         with pytest.raises(FrameError, match=r"b\.npz"):
             read_depth(file)
 
@@ -205,7 +205,7 @@ def test_numbers_in_names_sort_by_value(tmp_path):
 
 
 def encode_exr(path, values, compression, pixel_type="float"):
-    """FFmpeg's encoder, an implementation of the format that is not ours (channel Y)."""
+    """FFmpeg's encoder, an independent implementation of the format (channel Y)."""
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     height, width = values.shape
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "grayf32le"]
@@ -216,18 +216,18 @@ def encode_exr(path, values, compression, pixel_type="float"):
 
 @pytest.mark.parametrize("pixel_type", ["float", "half"])
 @pytest.mark.parametrize("compression", ["none", "rle", "zip1", "zip16"])
-@pytest.mark.parametrize("smooth", [True, False])  # noise does not shrink: its chunks are stored as they are
+@pytest.mark.parametrize("smooth", [True, False])  # noise does not compress: its chunks are stored uncompressed
 def test_exr_equals_what_ffmpeg_wrote(tmp_path, compression, pixel_type, smooth):
     noise = RNG.uniform(0.1, 60, (37, 53))
     values = (np.linspace(1, 9, 37)[:, None] + np.linspace(0, 2, 53).round(1) if smooth else noise).astype(np.float32)
     if pixel_type == "half":
-        values = values.astype(np.float16).astype(np.float32)  # exact in half, so that rounding plays no part
+        values = values.astype(np.float16).astype(np.float32)  # exact in half precision: no rounding
     encode_exr(tmp_path / "d.exr", values, compression, pixel_type)
     np.testing.assert_array_equal(read_depth(tmp_path / "d.exr"), values)
 
 
 def write_exr(path, channels, compression="ZIP", **header):
-    """A file with [H, W] arrays by channel's name."""
+    """Write a file with [H, W] arrays by channel name."""
     OpenEXR = pytest.importorskip("OpenEXR")
     kind = OpenEXR.tiledimage if "tiles" in header else OpenEXR.scanlineimage
     header |= {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "type": kind}
@@ -259,7 +259,7 @@ def test_what_is_no_depth_in_an_exr_is_named(tmp_path, capfd):
 
 @pytest.mark.parametrize("name", ["d.png", "d.exr"])
 def test_a_file_that_claims_a_huge_image_is_a_frame_error(tmp_path, name):
-    """The size is in the header, nothing behind it: it is refused before memory is allocated."""
+    """A header with a huge size and no data is refused before memory is allocated."""
     path = tmp_path / name
     if name == "d.png":
         write_depth_png(path, np.ones((4, 5)), 1000)
@@ -279,7 +279,7 @@ def test_a_file_that_claims_a_huge_image_is_a_frame_error(tmp_path, name):
 
 @pytest.mark.parametrize("kind", [RuntimeError, MemoryError])
 def test_only_a_bare_exception_of_the_png_decoder_leaves_the_file_to_pillow(tmp_path, monkeypatch, kind):
-    """kornia_rs has no exception class of its own; an exception of another type is no damaged file."""
+    """kornia_rs raises plain Exception; another exception type does not mean a damaged file."""
     write_image(tmp_path / "a.png", np.full((4, 5, 3), 7, np.uint8))
 
     def fails(error):

@@ -1,4 +1,4 @@
-"""KITTI-360: calibration, poses by frame number, the laser's depth; what is broken is counted or named."""
+"""KITTI-360: calibration, poses by frame number, the laser's depth; defects are counted or named."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def written(tmp_path_factory):
 
 @pytest.fixture
 def root(written, tmp_path):
-    """A copy that may be spoiled."""
+    """A copy that the test may change."""
     return shutil.copytree(written[0], tmp_path / "KITTI-360")
 
 
@@ -53,7 +53,7 @@ def test_a_drive(written):
 
 
 def test_the_laser_gives_the_cameras_depth(written):
-    """Each point comes back to its pixel with its depth: rectification, mounting and the turning head are undone."""
+    """Each point projects to its pixel with its depth: rectification, mounting and the head's rotation are undone."""
     root, truth = written
     sequence = open_sequence(root)
     assert sequence.without_depth == ()
@@ -73,17 +73,17 @@ def test_neighbouring_scans_can_be_added(written):
     assert (added > 0).sum() > 1.5 * (alone > 0).sum()
     valid = added > 0
     error = np.abs(added - truth.depths[3])[valid] / truth.depths[3][valid]
-    assert np.median(error) < 0.01  # half a pixel; points seen past an edge are the rest
+    assert np.median(error) < 0.01  # half a pixel; the rest are points visible past an edge
     assert (added[alone > 0] <= alone[alone > 0] * (1 + 1e-6)).all()
     with pytest.raises(ValueError, match="scans must be a number of laser scans"):
         open_sequence(root, scans=-1)
 
 
-@pytest.mark.parametrize("place", ["", f"data_2d_raw/{DRIVE}", f"data_2d_raw/{DRIVE}/image_00", IMAGES])
-def test_every_way_to_name_a_drive(written, place, monkeypatch):
+@pytest.mark.parametrize("folder", ["", f"data_2d_raw/{DRIVE}", f"data_2d_raw/{DRIVE}/image_00", IMAGES])
+def test_every_way_to_name_a_drive(written, folder, monkeypatch):
     root, _ = written
-    assert open_sequence(root / place).names == NAMES
-    monkeypatch.chdir(root / place)
+    assert open_sequence(root / folder).names == NAMES
+    monkeypatch.chdir(root / folder)
     assert open_sequence(".").name == DRIVE
 
 
@@ -160,7 +160,7 @@ def test_missing_and_broken_files(root):
     torn.write_bytes(torn.read_bytes()[:-5])
     text = (root / POSES).read_text().splitlines()
     sequence = open_sequence(root)
-    assert sequence.names == NAMES[1:]  # nothing moves to another frame's pose
+    assert sequence.names == NAMES[1:]  # no frame gets another frame's pose
     assert float(text[1].split()[4]) == pytest.approx(sequence.entries[0].T_world_cam[0, 3])
     assert sequence.without_depth == (NAMES[3],)
     errors = []
@@ -187,7 +187,7 @@ def test_a_malformed_calibration_is_named(root, file, old, new, error):
 
 def test_a_missing_calibration_is_named(root):
     (root / "calibration" / "calib_cam_to_velo.txt").unlink()
-    assert open_sequence(root).without_depth == NAMES  # where the laser is mounted is not known
+    assert open_sequence(root).without_depth == NAMES  # the laser's mounting is unknown
     (root / "calibration" / "perspective.txt").unlink()
     with pytest.raises(FileNotFoundError, match=r"calibration is missing: no file .*perspective\.txt"):
         open_sequence(root)
@@ -206,7 +206,7 @@ def test_a_trajectory_by_time_and_by_frame_number(written, tmp_path):
         assert [frame.name for frame in sequence.skipped] == ["0000000005"]
         assert sequence.skipped[0].reason.startswith(reason)
         np.testing.assert_allclose(sequence[2].T_world_cam, moved[2], atol=1e-6)
-        # The frame's own scan needs no pose but for the motion of a turn, which a shift does not change.
+        # The scan needs poses only for the motion during a rotation of the head, which a shift does not change.
         np.testing.assert_allclose(sequence[3].depth[::2, ::3], truth.depths[3][::2, ::3], rtol=1e-4)
 
 

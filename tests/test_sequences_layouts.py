@@ -1,4 +1,4 @@
-"""Every dataset layout: what is read equals what was rendered, and what is broken is counted or named."""
+"""Every dataset layout: the read data equals the rendered data, and defects are counted or named."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_tum_intrinsics_follow_the_camera_or_the_user(tmp_path):
     listing = (renamed / "rgb.txt").read_text()
     (renamed / "rgb.txt").write_text("# file: 'rgbd_dataset_freiburg2_desk.bag'\n" + listing)
     np.testing.assert_allclose(open_sequence(renamed, distortion="none").intrinsics, truth.K, rtol=1e-12, atol=1e-12)
-    # of the dataset's own size
+    # of the dataset's size
     path = renamed.rename(tmp_path / "rgbd_dataset_freiburg3_x")
     for file in (path / "rgb").iterdir():
         write_image(file, np.zeros((480, 640, 3), np.uint8))
@@ -63,7 +63,7 @@ def test_seven_scenes_registers_depth_to_colour(tmp_path):
         np.testing.assert_array_equal(frame.image, of_color.images[i])
         valid = frame.depth > 0
         error = np.abs(frame.depth - of_color.depths[i])[valid] / of_color.depths[i][valid]
-        # forward warping moves a sample by up to half a pixel; the wall beside the pillar is the rest
+        # forward warping moves a sample by up to half a pixel; the rest is the wall beside the pillar
         assert np.median(error) < 0.002
         assert np.mean(error > 0.05) < 0.03
         assert 0.65 < valid.mean() < 0.9  # the colour camera sees further to all sides: (525 / 585)^2 = 0.8
@@ -75,7 +75,7 @@ def test_register_depth_closed_form():
     T[0, 3] = 0.1
     depth = np.zeros((3, 5), np.float32)
     depth[1, 1] = 1.0  # moves by fx 0.1 / 1 = 1 px
-    depth[1, 0] = 0.5  # by 2 px, onto the same pixel, and is nearer
+    depth[1, 0] = 0.5  # by 2 px to the same pixel, and is nearer
     depth[0, 4] = 1.0  # leaves the image
     out = register_depth(depth, K, K, T, (3, 5))
     expected = np.zeros((3, 5), np.float32)
@@ -105,7 +105,7 @@ def test_depth_has_a_camera_of_its_own(tmp_path, layout):
         np.testing.assert_allclose(frame.depth_intrinsics, of_depth.K, rtol=1e-6)  # float32 in .sens
         np.testing.assert_allclose(frame.depth, of_depth.depths[i], atol=5e-4 + 1e-6)
         np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i], atol=1e-6)
-        # JPEG keeps a smoothed image of the cells, with its noise
+        # JPEG smooths the cells and adds noise
         difference = np.abs(frame.image.astype(int) - of_color.images[i]).mean()
         other = np.abs(frame.image.astype(int) - of_color.images[(i + 5) % 11]).mean()
         assert difference < 0.5 * other

@@ -1,4 +1,5 @@
-"""NYU's h5 files as single images to judge a network on: no poses, known intrinsics, broken files counted."""
+"""NYU's h5 files as single images for the evaluation of networks: no poses, known intrinsics, counts of broken
+files."""
 
 from __future__ import annotations
 
@@ -59,7 +60,7 @@ def test_broken_files_are_counted(written):
     write_h5(val / "kitchen_1" / "10.h5", np.zeros((3, 24, 32), np.uint8), None)
     write_h5(val / "office_2" / "11.h5", np.zeros((3, 24, 32), np.uint8), np.ones((24, 32), np.float32))
     sequence, errors = open_sequence(root), []
-    assert sequence.image_size == (24, 32)  # of the first that can be read
+    assert sequence.image_size == (24, 32)  # of the first readable file
     assert [frame.name for frame in sequence.readable(errors.append)] == ["office_2__11"]
     for error, message in zip(
         errors, ("cannot be read", "no dataset 'depth'", "is 64x48, the sequence's"), strict=True

@@ -88,8 +88,8 @@ def test_poses_with_one_timestamp_that_contradict_each_other_are_refused(tmp_pat
     text = f"1 0 0 0 0 0 0 1\n2 0.02 0 0 0 0 0 1\n{second}\n"
     with pytest.raises(ValueError, match=r"txt:3: the pose has the timestamp of line 2, but lies .* degrees from it"):
         read_trajectory(write(tmp_path, text))
-    for alike in ("2 0.02 0 0 0 0 0 1", "2 0.025 0 0 0 0 0.005 0.9999875", "2 0.02 0 0 0 0 0 -1", "2 nan 0 0 0 0 0 1"):
-        assert len(read_trajectory(write(tmp_path, f"1 0 0 0 0 0 0 1\n2 0.02 0 0 0 0 0 1\n{alike}\n"))) == 2
+    for equal in ("2 0.02 0 0 0 0 0 1", "2 0.025 0 0 0 0 0.005 0.9999875", "2 0.02 0 0 0 0 0 -1", "2 nan 0 0 0 0 0 1"):
+        assert len(read_trajectory(write(tmp_path, f"1 0 0 0 0 0 0 1\n2 0.02 0 0 0 0 0 1\n{equal}\n"))) == 2
 
 
 @pytest.mark.parametrize("token", ["nan", "-inf", "-1.#IND", "1.#QNAN00", "-1.#INF"])
@@ -137,9 +137,9 @@ def test_interpolation_needs_samples_around(tmp_path):
     assert interpolate_pose(trajectory, 0.1, max_gap=0.2)[0, 3] == pytest.approx(0.5)
     assert interpolate_pose(trajectory, -0.006, max_gap=0.2) is None
     assert interpolate_pose(trajectory, 0.206, max_gap=0.2) is None
-    # outside, or in a gap, a sample within 5 ms is taken as it is
+    # outside, or in a gap, a sample within 5 ms is used unchanged
     assert [interpolate_pose(trajectory, t, max_gap=0.1)[0, 3] for t in (-0.0048, 0.0048, 0.196, 0.204)] == [0, 0, 1, 1]
-    # a sample at the image's own time needs no neighbour
+    # a sample at the image's time needs no neighbour
     assert interpolate_pose(trajectory, 0.2005, max_gap=0.1)[0, 3] == 1
     without_times = read_trajectory(write(tmp_path, "0 0 0 0 0 0 1\n"))
     with pytest.raises(ValueError, match="no timestamps"):
@@ -147,7 +147,7 @@ def test_interpolation_needs_samples_around(tmp_path):
 
 
 def brute_force_association(first, second, limit):
-    """All pairs within the limit, closest first, each index used once."""
+    """Associate all pairs within the limit, closest first, each index once."""
     pairs, used = {}, set()
     for _, i, j in sorted((abs(a - b), i, j) for i, a in enumerate(first) for j, b in enumerate(second)):
         if abs(first[i] - second[j]) <= limit and i not in pairs and j not in used:

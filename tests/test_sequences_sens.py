@@ -1,4 +1,4 @@
-"""ScanNet's .sens container: what is read equals what was written; truncation and compressions that are not read."""
+"""ScanNet's .sens container: the read data equals the written data; truncation; unsupported compressions."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def written(tmp_path_factory):
 
 @pytest.fixture
 def file(written, tmp_path):
-    """A copy that may be spoiled."""
+    """A copy that the test may change."""
     return shutil.copy(written[0], tmp_path / "scene.sens")
 
 
 def frame_offsets(path):
-    """Return the byte at which each frame begins, from the sizes in the file alone."""
-    data, here, result = path.read_bytes(), HEADER, []
+    """Return the byte offset of each frame, from the sizes in the file."""
+    data, position, result = path.read_bytes(), HEADER, []
     for _ in range(struct.unpack_from("<Q", data, HEADER - 8)[0]):
-        result.append(here)
-        color, depth = struct.unpack_from("<2Q", data, here + 64 + 16)
-        here += FRAME + color + depth
-    assert here == len(data) - 8  # the number of IMU frames
+        result.append(position)
+        color, depth = struct.unpack_from("<2Q", data, position + 64 + 16)
+        position += FRAME + color + depth
+    assert position == len(data) - 8  # the number of IMU frames
     return result
 
 
@@ -62,7 +62,7 @@ def test_a_folder_that_holds_one(written, tmp_path):
 
 
 def test_opening_takes_no_memory_for_what_the_frames_hold(tmp_path):
-    """Three frames with 4 MB behind each depth map: opening them allocates a small part of one."""
+    """Three frames with depth maps of 4 MB: opening them allocates a small part of one."""
     path, _, _ = write_sens(tmp_path / "a.sens", frames=3)
     data, offsets = path.read_bytes(), [*frame_offsets(path), path.stat().st_size - 8]
     parts, filler = [data[:HEADER]], bytes(4_000_000)
@@ -124,7 +124,7 @@ def test_what_cannot_be_read_is_refused(tmp_path, options, message):
 
 
 def test_depth_that_expands_without_limit(tmp_path):
-    """A map whose 300 kB expand to 300 MB, or whose size in the header would be 32 EB."""
+    """A depth map that expands from 300 kB to 300 MB, or has a size of 32 EB in its header."""
     path, _, _ = write_sens(tmp_path / "a.sens", frames=1)
     data, (offset,) = bytearray(path.read_bytes()), frame_offsets(path)
     color, _ = struct.unpack_from("<2Q", data, offset + 80)
@@ -145,7 +145,7 @@ def test_depth_that_expands_without_limit(tmp_path):
 
 @pytest.mark.parametrize(("frames", "message"), [(2**62, f"{2**62} frames"), (10**7, r"10000000 frames cannot be in")])
 def test_a_broken_header_is_refused(file, frames, message):
-    """Each claimed frame would be an entry: the number is bounded by the file's size."""
+    """The number of frames in the header is bounded by the file's size, because each frame needs an entry."""
     data = bytearray(file.read_bytes())
     struct.pack_into("<Q", data, HEADER - 8, frames)
     file.write_bytes(data)
@@ -173,15 +173,16 @@ def test_broken_frames_are_found_when_decoding(file):
 
 
 def test_frames_without_image_or_depth(file):
-    """The sizes in a frame's header may be 0: no image skips the frame, no depth map leaves it without one."""
+    """The sizes in a frame's header may be 0. A frame without an image is skipped; a frame without a depth map has
+    none."""
     data, offsets = file.read_bytes(), frame_offsets(file)
     out = bytearray(data[: offsets[0]])
     for number, (start, end) in enumerate(zip(offsets, [*offsets[1:], len(data) - 8], strict=True)):
         color, depth = struct.unpack_from("<2Q", data, start + 80)
-        kept = (0 if number == 3 else color, 0 if number == 4 else depth)
+        sizes = (0 if number == 3 else color, 0 if number == 4 else depth)
         body = data[start + FRAME : end]
-        out += data[start : start + 80] + struct.pack("<2Q", *kept)
-        out += body[color - kept[0] :][: kept[0]] + body[color : color + kept[1]]
+        out += data[start : start + 80] + struct.pack("<2Q", *sizes)
+        out += body[color - sizes[0] :][: sizes[0]] + body[color : color + sizes[1]]
     file.write_bytes(out)
     sequence = open_sequence(file)
     assert {f.name: f.reason for f in sequence.skipped} == {"2": "non-finite pose", "3": "no image in the file"}

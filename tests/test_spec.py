@@ -1,4 +1,4 @@
-"""NetworkSpec: what it accepts, JSON, and that the network built is the one described."""
+"""NetworkSpec: accepted values, JSON, and the network built from it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_the_input_is_what_the_network_wants(architecture, preprocess):
     assert spec.input() == (nyu if preprocess == "nyu" else Preprocess(size=(64, 96), **statistics))
     network = build_network(spec)
     assert network.preprocess == network.backbone.preprocess == spec.input()
-    if preprocess == "nyu":  # the architecture's own, so that nothing is said twice
+    if preprocess == "nyu":  # from the architecture
         kind = {"fastdepth": FastDepth, "monodepth2": MonodepthResNet}[architecture]
         assert kind(size=(64, 96)).preprocess == spec.input()
 
@@ -68,7 +68,7 @@ def test_the_method_decides_the_head(name):
     assert message.depth.shape == (6 if several else 2, 32, 64)
     assert isinstance(network, BatchEnsemble) == several
     if name == "mc_dropout":
-        assert (network(image).depth == network(image).depth).all()  # samples only within its wrapper
+        assert (network(image).depth == network(image).depth).all()  # samples only inside its wrapper
         sampled = MonteCarloDropout(network)
         assert (sampled(image).depth != sampled(image).depth).any()
 

@@ -25,7 +25,7 @@ K = torch.tensor(scenes.intrinsics(*SIZE))
 SMALL = SPGFConfig(min_pixels=100, min_rows=8)
 ON_CPU = pytest.mark.parametrize("backend", ["torch", "numba"], indirect=True)
 
-# Settings of UfM*, and the oracle's words for them.
+# Settings of UfM*, and the oracle's names for them.
 VARIANTS = {
     "default": (UfMStarConfig(segment=SPGF, unmeasured="paper", features=2, initial_capacity=8), {}),
     "overlap": (UfMStarConfig(segment=SPGF, unmeasured="paper", disagreement="overlap"), {"disagreement": "overlap"}),
@@ -40,7 +40,7 @@ VARIANTS = {
 
 @functools.cache
 def oracle_walk(variant: str, count: int):
-    """Depths, poses, K and A of a rendered walk, the oracle's maps and matches of its frames, and its mixture."""
+    """Depths, poses, K and A of a rendered walk; the oracle's maps and matches per frame, and its mixture."""
     config, words = VARIANTS[variant]
     depths, poses, camera = scenes.sequence(count, HEIGHT, WIDTH, 0.04)
     rng = np.random.default_rng(1)
@@ -55,7 +55,7 @@ def oracle_walk(variant: str, count: int):
 
 
 def assert_varied(maps, matches, mixture):
-    """The rendered sequence has what it is meant to test."""
+    """Assert that the rendered sequence contains the cases to test."""
     sizes = [len(frame.weights) for frame in maps]
     per_c = [len(ks) for frame in matches for ks in frame]
     per_k = [sum(k in ks for ks in frame) for frame in matches for k in range(100)]
@@ -73,7 +73,7 @@ def test_a_walk_agrees_with_the_oracle(backend, variant):
     count, streams = (2, 1) if backend.slow else (20 if variant == "default" else 4, 2)
     depths, poses, camera, aleatoric, maps, matches, expected = oracle_walk(variant, count)
     config = VARIANTS[variant][0]
-    if backend.name == "triton":  # what finds no slot is in the next frame's map (test_triton.py)
+    if backend.name == "triton":  # components without a slot appear in the next frame's map (test_triton.py)
         config = config.replace(initial_capacity=256)
     ufm = backend.module(config, torch.float64)
 
@@ -114,7 +114,7 @@ CONFIGS = {
 
 
 def frames(count: int, config: UfMStarConfig, dtype: torch.dtype, streams: int = 1, size: tuple[int, int] = SIZE):
-    """Arguments of ``UfMStar.forward``: streams that start at different places of one tour, with holes and faults."""
+    """Arguments of ``UfMStar.forward``: streams that start at different frames of one tour, with holes and faults."""
     depths, poses, camera = scenes.sequence(max(12, count + streams), *size, 0.05)
     generator = torch.Generator().manual_seed(0)
     for i in range(count):
@@ -145,7 +145,7 @@ def tensors(out) -> dict[str, torch.Tensor]:
 
 
 def assert_same(one, other, rows=slice(None)) -> None:
-    """Equal to the last bit, C_i up to its padding."""
+    """Assert equality bit for bit, for C_i up to its padding."""
     a, b = tensors(one), tensors(other)
     for name, value in a.items():
         present = b[name][rows]
@@ -182,7 +182,7 @@ def test_agrees_with_the_reference(compiled_backend, name, dtype, tolerance):
         found = getattr(fast.ufm, key).cpu()
         assert found.dtype == value.dtype
         if key in reference.mixture.tensors() or key in reference.state.by_component:
-            slots = min(found.shape[1], value.shape[1])  # a GPU's mixture grows ahead
+            slots = min(found.shape[1], value.shape[1])  # on a GPU the mixture grows one frame ahead
             assert not found[:, slots:].any()
             found, value = found[:, :slots], value[:, :slots]
         torch.testing.assert_close(found, value, rtol=10 * tolerance, atol=10 * tolerance, equal_nan=True)
@@ -193,8 +193,8 @@ def test_agrees_with_the_reference(compiled_backend, name, dtype, tolerance):
 def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(backend, name, monkeypatch):
     monkeypatch.setattr(threads_cpu, "_SHARE", 4 * 64)  # pixels; up to three parts of a stream
     config = CONFIGS[name].replace(on_bad_frame="skip", backend=backend.name)
-    counts = (1, 2, 3) if backend.name == "numba" else (1,)  # torch's own sums are not ours to answer for
-    # The reference walks through an image row by row: few of them.
+    counts = (1, 2, 3) if backend.name == "numba" else (1,)  # torch's sums are not deterministic
+    # The reference processes an image row by row, so the images have few rows.
     few = {"count": 4} if backend.name == "numba" else {"count": 3, "size": (24, 32)}
     together, alone = [UfMStar(config) for _ in counts], [UfMStar(config) for _ in range(3)]
     before = torch.get_num_threads()
@@ -225,17 +225,17 @@ def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(backend
 def test_the_state_before_is_not_modified(backend):
     config = CONFIGS["full"].replace(backend=backend.name)
     ufm = UfMStar(config)
-    given = list(frames(3, config, torch.float32))[::2]  # the frame between is at fault
-    ufm(*given[0][0], **given[0][1])
+    inputs = list(frames(3, config, torch.float32))[::2]  # the frame between is at fault
+    ufm(*inputs[0][0], **inputs[0][1])
     before = ufm.state
-    kept = {name: value.clone() for name, value in before.tensors().items()}
-    ufm(*given[1][0], **given[1][1])
+    copies = {name: value.clone() for name, value in before.tensors().items()}
+    ufm(*inputs[1][0], **inputs[1][1])
     for name, value in before.tensors().items():
-        assert torch.equal(value.nan_to_num(-1), kept[name].nan_to_num(-1)), name
+        assert torch.equal(value.nan_to_num(-1), copies[name].nan_to_num(-1)), name
 
 
 def hostile_cameras():
-    """Poses and intrinsics with every fault, several at once, and none."""
+    """Poses and intrinsics with each fault, with several, and with none."""
     eye, camera = torch.eye(4, dtype=torch.float64), K.double()
 
     def changed(value: torch.Tensor, i: int, j: int, entry: float) -> torch.Tensor:
@@ -271,14 +271,14 @@ def test_the_check_agrees_with_the_reference(compiled_backend, dtype):
     depth, a, e, features = hostile(b, *size), hostile(b, *size), hostile(b, *size), hostile(b, 2, *size)
     mask = torch.rand(b, *size, generator=generator) > 0.2
     for optional in ((a, e, features, mask), (None,) * 4, (None, e, None, mask)):
-        given = (depth, poses, cameras, *optional)
-        slow = check_values(*given, rotation_tolerance=0.01, max_depth=20.3)
-        fast = compiled_backend.check(*given, rotation_tolerance=0.01, max_depth=20.3)
+        arguments = (depth, poses, cameras, *optional)
+        slow = check_values(*arguments, rotation_tolerance=0.01, max_depth=20.3)
+        fast = compiled_backend.check(*arguments, rotation_tolerance=0.01, max_depth=20.3)
         for name, value in vars(slow).items():
             found = getattr(fast, name)
             if value is None:
                 assert found is None
-            elif found is not None or name != "known_fault":  # the GPU's is on the host alone where cameras are there
+            elif found is not None or name != "known_fault":  # GPUs: only with cameras on the host
                 assert found.dtype == value.dtype, name
                 torch.testing.assert_close(found, value, rtol=1e-14, atol=1e-14, equal_nan=True)
         assert set(range(10)) == set(slow.fault.tolist())
@@ -287,7 +287,7 @@ def test_the_check_agrees_with_the_reference(compiled_backend, dtype):
 
 
 def test_warming_up_compiles_all_that_a_frame_needs_and_touches_no_state():
-    """In this process everything is compiled: what is checked is that nothing is compiled after a warm-up."""
+    """Everything is compiled in this process already; the test checks that no compilation follows the warm-up."""
     from numba.core import event
 
     config = CONFIGS["anchored"].replace(features=2, initial_capacity=2)

@@ -1,4 +1,4 @@
-"""The loop over frames: the order of the sinks, what is decoded, what a skipped frame costs, stop and continue."""
+"""The loop over frames: order of the sinks, decoded images, cost of skipped frames, stopping and continuing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FRAMES = 6
 
 
 class Recorded(FrameSink):
-    """Notes every call in a list that sinks share, and keeps the results."""
+    """Records every call in a list shared by the sinks, and stores the results."""
 
     def __init__(self, name, calls):
         self.name, self.calls, self.results = name, calls, []
@@ -56,7 +56,7 @@ def tour():
 
 
 def counted(sequence, broken=()):
-    """The sequence, whose images note that they were decoded; some cannot be."""
+    """The sequence, with images that record their decoding; some cannot be decoded."""
     decoded = []
 
     def load(i, entry):
@@ -152,7 +152,7 @@ def test_it_stops_between_frames_and_goes_on(sequence):
 
 
 def rows_with_memory():
-    """UfM* with anchors that are tracked at drifting poses, and a row that leaves images out."""
+    """UfM* with tracked anchors at drifting poses, and a row that skips images."""
     expected = [
         row("UfM*-DepthOnly", anchors="corners", rotation_drift=0.3, translation_drift=0.01, seed=2),
         row("UfM*-DepthOnly", anchors="corners", rotation_drift=0.3, translation_drift=0.01, seed=2, posterior=True),

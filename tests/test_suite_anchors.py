@@ -1,4 +1,4 @@
-"""Rows with anchors: what a setting may say, and that the evaluation does what a loop written by hand does."""
+"""Rows with anchors: valid settings, and the evaluation against a loop written by hand."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FIGURES = ("delta1", "rmse", "nll", "ece_delta", "ece_q", "spearman")
 
 @pytest.fixture(scope="module")
 def tour():
-    """Ten decoded frames: rendering them again for every test would take most of the time."""
+    """Ten decoded frames, shared because rendering takes most of the time."""
     tour = open_tour("tour:300003?frames=16&size=96x128&sensor=0")
     return in_memory(replace(tour, entries=tour.entries[:10], names_on_disk=tour.names_on_disk[:10]))
 
@@ -113,7 +113,7 @@ def test_the_tracker_sees_the_noisy_poses_and_the_chosen_images(tour, networks):
     for one in (noisy, sparse):
         by = tracked_by(LandmarkTracker())
         assert_agrees(result[one.slug], *by_hand(tour, networks["depth_only"], by, setting=one.setting))
-    # And not the exact ones.
+    # The exact poses give other values.
     tracker = LandmarkTracker()
     _, used = by_hand(
         tour,
@@ -163,13 +163,13 @@ def test_track_noise_has_the_size_that_the_tracker_states_for_it(tour):
     for frame in frames:
         p = Biased().one(frame, 0)
         pair = []
-        for size, own in zip((0.0, 0.5), tracks, strict=True):
-            source = AnchorSource(Setting(anchors="corners", track_noise=size), own)
+        for size, corners in zip((0.0, 0.5), tracks, strict=True):
+            source = AnchorSource(Setting(anchors="corners", track_noise=size), corners)
             _, anchors, ms = source.of(frame, frame.T_world_cam, p, None)
             assert isinstance(anchors, Anchors)
             assert ms > 0
             pair.append(anchors)
-        assert torch.equal(pair[0].variance, pair[1].variance), "the tracker does not know of the noise"
+        assert torch.equal(pair[0].variance, pair[1].variance), "the tracker does not know the noise"
         clean.append(torch.cat([pair[0].pixel, pair[0].depth[..., None]], -1)[0])
         noisy.append(torch.cat([pair[1].pixel, pair[1].depth[..., None]], -1)[0])
         stated.append(pair[0].variance[0].sqrt())

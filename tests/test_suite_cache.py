@@ -1,4 +1,4 @@
-"""The cache of predictions: what is read is what was predicted, and nothing else is."""
+"""The cache of predictions: cached values equal the predictions; no wrong entry is read."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def maps(seed=0):
 
 
 class Counted(PredictionCache):
-    """Counts the predictions that were read, and those that were not."""
+    """Counts cache hits and misses."""
 
     hits = misses = 0
 
     def load(self, path, content, device):
-        known = super().load(path, content, device)
-        self.hits += known is not None
-        self.misses += known is None
-        return known
+        cached = super().load(path, content, device)
+        self.hits += cached is not None
+        self.misses += cached is None
+        return cached
 
 
 @pytest.mark.parametrize("left_out", [(), ("aleatoric_variance",), ("aleatoric_variance", "epistemic_variance")])
@@ -114,7 +114,7 @@ def test_from_the_cache_everything_is_as_from_the_networks(path, networks, tmp_p
     sequence, cache = open_sequence(path), Counted(tmp_path)
     without = evaluate(sequence, ROWS, networks)
     first = evaluate(sequence, ROWS, networks, cache)
-    requested = 4 * 6  # frames, and predictions of each: ensemble all and one, MC-Dropout both, two networks
+    requested = 4 * 6  # frames, and predictions per frame: ensemble full and single, MC-Dropout both, two networks
     assert (cache.hits, cache.misses) == (0, requested)
     again = Counted(tmp_path)
     second = evaluate(sequence, ROWS, networks, again)
@@ -123,16 +123,16 @@ def test_from_the_cache_everything_is_as_from_the_networks(path, networks, tmp_p
         assert same(result, first[slug])
         assert same(result, second[slug])
         assert "network" in first[slug].ms
-        assert "network" not in second[slug].ms, "nothing ran: there is no time to tell"
+        assert "network" not in second[slug].ms, "no network ran, so there is no time to report"
         assert "uncertainty" in second[slug].ms
 
 
 def test_another_image_under_the_same_name_is_predicted_anew(networks, tmp_path):
     path, scene = write_generic(tmp_path, frames=3)
-    rows, kept = [row("Evidential")], tmp_path / "cache"
-    before = evaluate(open_sequence(path), rows, networks, PredictionCache(kept))
+    rows, folder = [row("Evidential")], tmp_path / "cache"
+    before = evaluate(open_sequence(path), rows, networks, PredictionCache(folder))
     write_image(path / "images" / "8.png", 255 - scene.images[1])
-    cache = Counted(kept)
+    cache = Counted(folder)
     after = evaluate(open_sequence(path), rows, networks, cache)
     assert (cache.hits, cache.misses) == (2, 1)
     fresh = evaluate(open_sequence(path), rows, networks)

@@ -1,4 +1,4 @@
-"""``ufmstar eval`` as a user meets it: help, mistakes, dry run, tables, exit codes."""
+"""The command ``ufmstar eval``: help, mistakes, dry run, tables, exit codes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ufmstar_torch.eval.suite.shards import warned_once
 
 @pytest.fixture
 def stubbed(monkeypatch):
-    """The judge of sequences, replaced by one that draws figures; returns it."""
+    """Replace the evaluation of a sequence by a :class:`Stub`, and return the stub."""
     stub = Stub()
     monkeypatch.setattr("ufmstar_torch.eval.suite.evaluate.evaluate_sequence", stub)
     return stub
@@ -89,10 +89,10 @@ def test_several_roots_and_networks_and_a_file_of_options(rooms, tmp_path):
     words = words_for(rooms, "out", "--root", "tour:1?frames=2&size=32x48", "a=tour:2?frames=2", "--sequences", "1")
     job = job_from(read(list(map(str, words[1:]))))
     assert [item.dataset for item in job.items] == ["a", "rooms", "tour"]
-    given = {"suite": "depth-only", "root": [f"rooms={rooms}"], "network": [TRUTH], "out": "out", "seed": 3}
-    (tmp_path / "eval.yaml").write_text(json.dumps(given))
+    in_file = {"suite": "depth-only", "root": [f"rooms={rooms}"], "network": [TRUTH], "out": "out", "seed": 3}
+    (tmp_path / "eval.yaml").write_text(json.dumps(in_file))
     options = read(["--config", str(tmp_path / "eval.yaml"), "--seed", "4"])
-    assert (list(options.data.root), options.data.seed) == (given["root"], 4)
+    assert (list(options.data.root), options.data.seed) == (in_file["root"], 4)
     assert len(job_from(options).items) == 3
 
 

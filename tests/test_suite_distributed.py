@@ -1,4 +1,4 @@
-"""An evaluation divided into shards and processes: real ones, and the same result to the last bit."""
+"""An evaluation in shards and processes: real processes, and the same result bit for bit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import forked
 import process_parts
 import pytest
 import torch
-from tiny_suite import NAMES, TRUTH, go, job_on, kept
+from tiny_suite import NAMES, TRUTH, go, job_on, stored_results
 from trainings import SPEC
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
@@ -28,9 +28,9 @@ from ufmstar_torch.models.trained import save_trained
 
 @pytest.fixture
 def whole(rooms, tmp_path):
-    """The records that one undisturbed process leaves, from the real judge."""
+    """The stored results of one undisturbed process with the real evaluation."""
     go(job_on(rooms, tmp_path / "whole"), evaluate_sequence)
-    return kept(tmp_path / "whole")
+    return stored_results(tmp_path / "whole")
 
 
 # ---- processes ----
@@ -57,8 +57,8 @@ def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
         evaluate_suite(one, shard=Shard(), threads=1)
     finally:
         torch.set_num_threads(before)
-    assert len(kept(one.out)) == 12
-    assert kept(one.out) == kept(two.out)
+    assert len(stored_results(one.out)) == 12
+    assert stored_results(one.out) == stored_results(two.out)
 
 
 def is_alive(number):
@@ -69,7 +69,7 @@ def is_alive(number):
 
 
 def acting(folder, *acts):
-    """Words of an evaluation in two processes of sequences a, b, ... at which something happens."""
+    """The command of an evaluation in two processes, on sequences a, b, ... with the actions of process_parts.py."""
     folder.mkdir()
     roots = [folder / f"{name}.act" for name in "abcd"[: len(acts)]]
     for root, act in zip(roots, acts, strict=True):
@@ -81,12 +81,12 @@ def acting(folder, *acts):
 
 
 def at_work(folder):
-    """The numbers of the processes that have opened a sequence."""
+    """The ids of the processes that have opened a sequence."""
     return {int(path.suffix[1:]) for path in folder.glob("*.[0-9]*")}
 
 
 def in_two(words, stop=lambda: False):
-    """An evaluation in two processes: whether it finished, and its lines."""
+    """Run an evaluation in two processes: whether it finished, and its output lines."""
     lines: list[str] = []
     return evaluate_suite(job_from(read(words)), processes=2, threads=1, stop=stop, report=lines.append).finished, lines
 
@@ -96,7 +96,7 @@ def test_processes_end_in_good_order_by_a_stop_by_an_error_and_by_a_kill(tmp_pat
     monkeypatch.setattr(multiprocessing, "get_context", lambda _: forked.CONTEXT)  # the other tests here spawn
     with pytest.raises(RuntimeError, match=r"d/c: TypeError: a mistake"):
         in_two(acting(tmp_path / "a", "go", "wait", "fail"))
-    assert len(list(tmp_path.glob("a/out/records/*/*/DepthOnly.json"))) == 1, "finished records stay"
+    assert len(list(tmp_path.glob("a/out/records/*/*/DepthOnly.json"))) == 1, "finished records remain"
     finished, lines = in_two(acting(tmp_path / "b", "go", "wait", "kill"))
     assert (finished, lines[0].partition(":")[0]) == (False, "d/a")
     assert lines[1:] == ["a process was killed (for want of memory?) at one of d/b, d/c, which ends the others too"]
@@ -139,9 +139,9 @@ def test_shards_may_begin_in_any_order_and_share_a_folder(rooms, tmp_path, whole
     job = job_on(rooms, tmp_path / "out")
     outcomes = [go(job, evaluate_sequence, shard=Shard(number, 2))[0] for number in (2, 1)]
     assert [(outcome.finished, outcome.complete) for outcome in outcomes] == [(True, False), (True, True)]
-    assert kept(job.out) == whole
+    assert stored_results(job.out) == whole
     with pytest.raises(FolderError, match=r"other input: settings\.bins was null"):
         go(replace(job, bins="authors"), shard=Shard(1, 2))
     with pytest.raises(ValueError, match="--overwrite goes without shards"):
         go(job, shard=Shard(1, 2), overwrite=True)
-    assert kept(job.out) == whole
+    assert stored_results(job.out) == whole

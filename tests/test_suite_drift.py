@@ -1,4 +1,4 @@
-"""Drift: a random walk of the poses with the variance that was asked for, and that every row gets the same one."""
+"""Drift: a random walk of the poses with the requested variance, the same for every row."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BOTH = Setting(rotation_drift=0.5, translation_drift=0.02, seed=3)
 
 
 def walk(frames=24):
-    """[N, 4, 4] poses of a camera that turns and moves, no two steps alike."""
+    """[N, 4, 4] poses of a camera that turns and moves, with no two equal steps."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     t = np.arange(frames)
     turned = np.stack([0.1 * np.sin(0.5 * t), 0.08 * t, 0.05 * np.cos(0.3 * t)], axis=-1)
@@ -45,7 +45,7 @@ def drifted(setting, indices=EVERY):
 
 
 def steps(poses):
-    """[N - 1, 4, 4] each pose as the one before sees it."""
+    """[N - 1, 4, 4] each pose relative to the previous one."""
     return np.linalg.solve(poses[:-1], poses[1:])
 
 
@@ -82,7 +82,7 @@ def test_a_step_has_the_noise_that_was_asked_for():
 def test_translation_drift_leaves_orientations_and_rotation_drift_moves_the_path():
     moved, turned = drifted(Setting(translation_drift=0.05)), drifted(Setting(rotation_drift=1.0))
     np.testing.assert_allclose(moved[:, :3, :3], WALK[:, :3, :3], atol=1e-13)
-    # Where to the camera moves, as it sees it itself, is exact; the path in the world bends.
+    # The translation in the camera's frame is exact; the path in the world bends.
     np.testing.assert_allclose(steps(turned)[:, :3, 3], steps(WALK)[:, :3, 3], atol=1e-12)
     assert np.abs(turned[-1, :3, 3] - WALK[-1, :3, 3]).max() > 0.01
 
@@ -93,13 +93,13 @@ def test_drift_is_of_the_seed_and_only_its_size_of_the_setting():
     weak, strong = noise(Setting(rotation_drift=0.1)), noise(Setting(rotation_drift=1.0))
     np.testing.assert_allclose(strong[0], 10 * weak[0], atol=1e-12)
     np.testing.assert_allclose(noise(Setting(translation_drift=0.3, seed=3))[1], 15 * noise(BOTH)[1], atol=1e-12)
-    # Not the noise that single poses have, nor moved along with it.
+    # Independent of the noise of single poses, and not shifted with it.
     single = [perturbed(np.eye(4), Setting(translation_noise=1.0, seed=3), i)[:3, 3] for i in range(1, len(WALK))]
     assert np.abs(np.array(single) - noise(Setting(translation_drift=1.0, seed=3))[1]).min() > 1e-4
 
 
 def test_frames_left_out_drift_all_the_same():
-    """The step over three frames has the sum of their increments: 3 times the variance, of the same walk."""
+    """A step over three frames has the sum of their increments, with 3 times the variance, from the same walk."""
     every = [noise(Setting(translation_drift=0.01)), noise(Setting(rotation_drift=0.3))]
     third = [
         noise(Setting(translation_drift=0.01), range(0, 24, 3)),
@@ -133,7 +133,7 @@ def test_a_setting_of_drift(name):
 
 
 class Poses:
-    """An estimator that keeps the poses it is given."""
+    """An estimator that records its input poses."""
 
     def __init__(self):
         self.given = []
@@ -158,7 +158,7 @@ def test_a_row_sees_drift_and_noise_on_top_of_it():
 
 
 def test_rows_of_one_drift_share_a_tracker_and_a_reference():
-    alike = [
+    sharing = [
         row(NAME, anchors="corners", rotation_drift=0.1),
         row(NAME, anchors="corners", rotation_drift=0.1, posterior=True),
     ]
@@ -168,9 +168,9 @@ def test_rows_of_one_drift_share_a_tracker_and_a_reference():
         for seed in (0, 1)
     ]
     alone = [row(NAME), row(NAME, anchors="corners"), row(NAME, anchors="corners", skip=1)]
-    sources = anchor_sources([*alike, *others, *alone])
+    sources = anchor_sources([*sharing, *others, *alone])
     assert alone[0] not in sources
-    assert sources[alike[0]].tracks is sources[alike[1]].tracks
+    assert sources[sharing[0]].tracks is sources[sharing[1]].tracks
     assert len({id(source.tracks) for source in sources.values()}) == 7
     plain, drift = (row("UfM-Ensemble-100K", **values) for values in ({}, {"rotation_drift": 0.1}))
     rows = [plain, drift, row("UfM*-Ensemble", rotation_drift=0.1), row("UfM*-Ensemble", anchors="truth", seed=7)]

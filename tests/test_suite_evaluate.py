@@ -1,4 +1,4 @@
-"""Judging many rows in one pass equals judging each by hand, and what is left behind is what was computed."""
+"""The evaluation of many rows in one pass equals that of each row by hand, and stores the computed values."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def sequence(path):
 
 
 def members_of(text):
-    """The networks of a base in the form in which an evaluation runs them."""
+    """The networks of a base, in the form used by an evaluation."""
     file = text.partition(":")[2]
     return [Inference().ready(member, Path(file), CPU) for member in load_trained(file)]
 
@@ -67,7 +67,7 @@ def judged(sequence, maps, indices=None):
 
 
 def agrees(figures, expected):
-    """Compare all figures but those of the pixels left out, which a mask hides by hand."""
+    """Compare all figures except those of left-out pixels, which the loop by hand masks."""
     names = [name for name in expected if "left_out" not in name]
     assert figures.keys() == expected.keys()
     for name in names:
@@ -76,7 +76,7 @@ def agrees(figures, expected):
 
 
 def through(estimator, members, sequence, *, aleatoric=True, poses=None, indices=None):
-    """By hand: member n = i mod N of every image, then UfM or UfM*."""
+    """By hand: member n = i mod N for image i, then UfM or UfM*."""
     for i, (frame, image, pose, K) in enumerate(frames_of(sequence, indices)):
         with torch.no_grad():
             x, K = members[0].preprocess(image, K)
@@ -273,7 +273,7 @@ def test_the_nll_by_error_is_over_the_pixels_where_the_reference_is_confident(ne
     curves = actual["Aleatoric"].curves
     for name, curve in expected.compute().items():
         assert curves[f"{name}:Aleatoric"] == pytest.approx(curve.tolist(), rel=1e-12, nan_ok=True)
-    # The same pixels for all: with the same depth their errors are the same.
+    # All rows use the same pixels: with equal depth their errors are equal.
     key = "nll_by_error:Aleatoric"
     for slug in ("UfMstar-Aleatoric", "UfM-Aleatoric"):
         assert torch.equal(actual[slug].sums[key]["count"], actual["Aleatoric"].sums[key]["count"])
@@ -296,15 +296,15 @@ def test_broken_frames_are_left_out_by_all_rows_alike(networks, tmp_path):
     assert all(counts == frames[0] for counts in frames)
     assert (frames[0]["selected"], frames[0]["done"], frames[0]["judged"], frames[0]["skipped"]) == (7, 5, 5, 2)
     assert sum(frames[0]["reasons"].values()) == 2
-    kept = [0, 1, 3, 5, 6]
-    good = replace(sequence, entries=tuple(sequence.entries[i] for i in kept))
+    readable = [0, 1, 3, 5, 6]
+    good = replace(sequence, entries=tuple(sequence.entries[i] for i in readable))
     clean = evaluate(good, [row(name) for name in names], networks)
     for slug, result in clean.items():
-        assert repr(result.figures) == repr(outcome[slug].figures), "as if they had never been there, turns included"
+        assert repr(result.figures) == repr(outcome[slug].figures), "as if they did not exist"
 
 
 def test_frames_that_compare_nothing_are_counted(networks, sequence):
-    """Segments larger than the image, and poses a kilometre apart: no segment, and no match."""
+    """Minimum segments larger than the image give no segment; poses a kilometre apart give no match."""
     entries = [
         replace(entry, T_world_cam=entry.T_world_cam + np.pad([[1e3 * number]] * 3, ((0, 1), (3, 0))))
         for number, entry in enumerate(sequence.entries)

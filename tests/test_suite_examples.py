@@ -1,4 +1,4 @@
-"""The maps and mixtures that pictures are drawn from are those of the frame that they name."""
+"""The maps and mixtures of pictures belong to the named frame."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def test_fixed_param_takes_the_thresholds_as_they_stand_for_224():
 
     assert at(fixed, 518) == at(fixed, 224) == at(scaled, 224)
     assert at(scaled, 518)[0] == round(200 * (518 / 224) ** 2)
-    # a is a setting like the others: a z^2 / f with the image's f, where scaling keeps a / f.
+    # a is a setting like the others: a z^2 / f with the image's f; scaling keeps a / f constant.
     assert fixed.segment.slope(462.5) == pytest.approx(2.4 / 462.5)
     assert scaled.segment.slope(462.5) == pytest.approx(2.4 / 200)
     assert fixed == UfMStarConfig(on_bad_frame="skip", segment=fixed.segment)
@@ -211,10 +211,10 @@ def test_a_in_h_agrees_with_the_oracle():
         np.testing.assert_allclose(answer["variance"][0].numpy(), M + A, rtol=1e-3, atol=1e-5)
         frame = maps.depth, torch.tensor(T), torch.tensor(K), maps.aleatoric_variance
         mean = sampled.mean_uncertainty(*frame, features=torch.ones(1, 1, *depth.shape), fraction=1.0)
-        assert mean.aleatoric.mean.item() == pytest.approx(np.nanmean(A), rel=1e-4), "beside a feature, compiled"
+        assert mean.aleatoric.mean.item() == pytest.approx(np.nanmean(A), rel=1e-4), "together with a feature, compiled"
         assert mean.aleatoric.maximum.item() == pytest.approx(np.nanmax(A), rel=1e-4)
     assert sampled.query(torch.zeros(1, 2, 3)).features.shape == (1, 2, 1)
-    assert np.nanmax(np.abs(A - a)) > 0.01, "the mixture's average is not the pixel's own"
+    assert np.nanmax(np.abs(A - a)) > 0.01, "the mixture's average is not the pixel's value"
     with pytest.raises(ValueError, match="aleatoric must be given with config"):
         estimator.update(replace(maps, aleatoric_variance=None), torch.tensor(T))
 
@@ -231,7 +231,7 @@ def test_a_in_h_is_a_row_of_its_own():
 
 def test_a_row_prepares_its_images_as_it_says(tmp_path):
     source = base_network(f"aleatoric=trained:{write_network(tmp_path / 'aleatoric.safetensors')}")
-    own = source.networks[0].preprocess
+    default = source.networks[0].preprocess
     assert source.prepared("network") is source
     assert source.prepared("resize") is source, "the tiny networks resize the whole frame anyway"
     cropped = source.prepared("crop")
@@ -239,7 +239,7 @@ def test_a_row_prepares_its_images_as_it_says(tmp_path):
     assert len({cropped.digest, source.digest, ""}) == 3
     frame = Frame(0, "0", PICTURE, None, np.eye(4), np.array([[60.0, 0, 47], [0, 60, 35], [0, 0, 1]]))
     image, K = torch.from_numpy(PICTURE).permute(2, 0, 1)[None], torch.from_numpy(frame.intrinsics)[None]
-    for one, preprocess in ((source, own), (cropped, Preprocess.nyu(own.size))):
+    for one, preprocess in ((source, default), (cropped, Preprocess.nyu(default.size))):
         x, K_x = preprocess(image, K)
         with torch.no_grad():
             expected = source.networks[0](x)

@@ -1,4 +1,4 @@
-"""The way through the sequences: what is kept, what is computed again, what a broken one does to the rest."""
+"""The loop over sequences: stored results, recomputation, and the effect of a broken sequence on the rest."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from layouts_more import write_nyu
-from tiny_suite import NAMES, TRUTH, Stub, evaluate, go, job_on, kept, rows_of, write_rooms
+from tiny_suite import NAMES, TRUTH, Stub, evaluate, go, job_on, rows_of, stored_results, write_rooms
 
 from ufmstar_torch.eval.commands.evaluate import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
@@ -26,10 +26,10 @@ from ufmstar_torch.eval.suite.record import Record
 
 @pytest.fixture(scope="module")
 def whole(rooms, tmp_path_factory):
-    """The records of an undisturbed evaluation by the stub."""
+    """The stored results of an undisturbed evaluation by the stub."""
     out = tmp_path_factory.mktemp("whole")
     go(job_on(rooms, out))
-    return kept(out)
+    return stored_results(out)
 
 
 def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
@@ -54,9 +54,9 @@ def test_what_does_not_fit_together_is_named_before_it_is_judged(tmp_path, caplo
     np.savetxt(rooms / NAMES[1] / "poses.txt", poses.reshape(-1, 16))
     outcome, _ = go(job_on(rooms, tmp_path / "out"))
     assert outcome.finished
-    said = [text for text in caplog.messages if "ufmstar data check" in text]
-    assert [text.split(":")[0] for text in said] == [f"rooms/{NAMES[1]}"], said
-    assert "depth looks too small: times 1" in said[0]
+    warnings = [text for text in caplog.messages if "ufmstar data check" in text]
+    assert [text.split(":")[0] for text in warnings] == [f"rooms/{NAMES[1]}"], warnings
+    assert "depth looks too small: times 1" in warnings[0]
 
 
 def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
@@ -82,7 +82,7 @@ def test_resume_computes_rows_and_sequences_added_since(rooms, tmp_path, whole):
     go(job, stub, resume=True)
     names = [row.method.name for row in rows]
     assert stub.asked == [("ash", names[2:]), ("birch", names[2:]), ("cedar", names)]
-    assert kept(job.out) == whole
+    assert stored_results(job.out) == whole
 
 
 def test_missing_rows_are_judged_beside_their_references():
@@ -99,18 +99,18 @@ def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path, whole):
     outcome, message = go(job)
     assert outcome.finished
     assert "rooms/birch: failed: " in message[1]
-    assert sorted(path.split("/")[2] for path in kept(job.out)) == ["ash"] * 4 + ["cedar"] * 4
+    assert sorted(path.split("/")[2] for path in stored_results(job.out)) == ["ash"] * 4 + ["cedar"] * 4
     failed = json.loads((job.out / "records" / "rooms" / "birch" / "failed.json").read_text())
     assert (failed["sequence"], failed["dataset"], len(failed["rows"])) == ("birch", "rooms", 4)
     assert "poses.txt" in failed["reason"]
     assert job.folder.failures().keys() == {("rooms", "birch")}
-    # Mended, it is tried again.
+    # After the repair the sequence is evaluated again.
     write_rooms(root, ["birch"])
     stub = Stub()
     assert go(job, stub, resume=True)[0].finished
     assert [name for name, _ in stub.asked] == ["birch"]
     assert not job.folder.failures()
-    assert kept(job.out) == whole
+    assert stored_results(job.out) == whole
 
 
 def test_what_the_judge_cannot_use_is_broken_and_what_it_cannot_write_ends_all(rooms, tmp_path):
@@ -147,7 +147,7 @@ def test_images_without_poses_are_for_networks_alone(tmp_path):
     assert sum("failed" in line for line in message) == 1
     outcome, message = go(job, evaluate_sequence, resume=True)
     assert outcome.finished
-    assert sum("failed" in line for line in message) == 1, "it is told each time"
+    assert sum("failed" in line for line in message) == 1, "the failure is reported each time"
 
 
 def test_poses_of_another_program(tmp_path):
@@ -160,8 +160,8 @@ def test_poses_of_another_program(tmp_path):
     go(job)
     write_rooms(tmp_path / "plain", ["ash", "birch"], frames=3)
     go(job_on(tmp_path / "plain", tmp_path / "expected", suite=job.suite))
-    assert len(kept(job.out)) == 10
-    assert kept(job.out) == kept(tmp_path / "expected")
+    assert len(stored_results(job.out)) == 10
+    assert stored_results(job.out) == stored_results(tmp_path / "expected")
     assert json.loads((job.out / "eval.json").read_text())["settings"]["trajectory"] == "slam.txt"
     with pytest.raises(FolderError, match="settings"):
         go(job_from(read(words)), resume=True)
@@ -180,7 +180,7 @@ def test_another_sequence_of_the_name_is_refused(tmp_path):
         go(job, resume=True)
 
 
-# Python 3.12 warns of forks beside threads; this process uses none of what is not its own.
+# Python 3.12 warns of forks in a process with threads; the child uses no other thread's state.
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 def test_a_kill_loses_the_sequence_at_work_alone(rooms, tmp_path, whole):
@@ -193,16 +193,16 @@ def test_a_kill_loses_the_sequence_at_work_alone(rooms, tmp_path, whole):
     child.start()
     child.join(60)
     assert child.exitcode == -signal.SIGKILL
-    assert {path.split("/")[2] for path in kept(job.out)} == {"ash"}
-    place = job.folder.sequence_folder(job.items[1])
-    begun, own = place / ".A.pt.0123456789ab.tmp", place / ".mine.tmp"
-    for file in (begun, own):
+    assert {path.split("/")[2] for path in stored_results(job.out)} == {"ash"}
+    folder = job.folder.sequence_folder(job.items[1])
+    begun, mine = folder / ".A.pt.0123456789ab.tmp", folder / ".mine.tmp"
+    for file in (begun, mine):
         file.write_text("x")
     stub = Stub()
     assert go(job, stub, resume=True)[0].complete
     assert [name for name, _ in stub.asked] == ["birch", "cedar"]
-    assert (begun.exists(), own.exists()) == (False, True), "what a killed process had begun to write is removed"
-    assert kept(job.out) == whole
+    assert (begun.exists(), mine.exists()) == (False, True), "temporary files of a killed process are removed"
+    assert stored_results(job.out) == whole
 
 
 def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, whole, monkeypatch):
@@ -218,8 +218,8 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, who
     with pytest.raises(KeyboardInterrupt):
         go(job)
     monkeypatch.undo()
-    assert len(kept(job.out)) == 6
+    assert len(stored_results(job.out)) == 6
     stub = Stub()
     go(job, stub, resume=True)
     assert [(name, len(rows)) for name, rows in stub.asked] == [("birch", 2), ("cedar", 4)]
-    assert kept(job.out) == whole
+    assert stored_results(job.out) == whole

@@ -122,18 +122,18 @@ def test_files_of_someone_else_are_not_touched(tmp_path):
 def test_overwriting_removes_our_files_alone(tmp_path):
     root, out = write_rooms(tmp_path / "rooms", ["ash"]), tmp_path / "out"
     go(job_on(root, out))
-    own = [out / "notes.txt", out / "tables" / "mine.txt", out / "records" / "rooms" / "ash" / "note.md"]
-    for file in own:
+    users = [out / "notes.txt", out / "tables" / "mine.txt", out / "records" / "rooms" / "ash" / "note.md"]
+    for file in users:
         file.parent.mkdir(exist_ok=True)
         file.write_text("mine")
     made = [out / "tables" / "main.md", out / "results.csv", out / "cache" / "kept"]
     for file in made:
         file.write_text("made")
     enter(out, ABOUT, overwrite=True)
-    assert all(file.read_text() == "mine" for file in own)
+    assert all(file.read_text() == "mine" for file in users)
     assert [file.exists() for file in made] == [False, False, True]
-    left = {path.name for path in out.rglob("*") if path.is_file()}
-    assert left == {"eval.json", "eval.lock", "eval-1-of-1.lock", ".writable", "kept", *(file.name for file in own)}
+    after = {path.name for path in out.rglob("*") if path.is_file()}
+    assert after == {"eval.json", "eval.lock", "eval-1-of-1.lock", ".writable", "kept", *(file.name for file in users)}
 
 
 def test_a_shard_is_evaluated_by_one_process_and_not_overwritten_meanwhile(tmp_path):

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.methods.suite import names, suite_named
 from ufmstar_torch.eval.report.data import listed_rows
 from ufmstar_torch.eval.report.names import row_labels
 
-# The rows of the paper's tables, written off.
+# The rows of the paper's tables, copied.
 TABLE_1 = """
 Ensemble UfM-Ensemble UfM-Ensemble-100K UfM*-Ensemble
 MC-Dropout UfM-MCD UfM-MCD-100K UfM*-MCD
@@ -30,7 +30,7 @@ TABLE_3 = "UfM-DepthOnly-300K UfM*-DepthOnly-fixed-param UfM*-DepthOnly"
 
 
 def value_of(row, name):
-    """Return the value that a row gives to a name, or UfM*'s own."""
+    """Return a row's value of a setting, or UfM*'s default."""
     changed = row.setting.to_dict()
     return changed[name] if name in changed else default_of(name, row.setting.ufm_preset)
 
@@ -78,10 +78,10 @@ def test_one_preset_for_all_rows():
         suite = suite_named("paper-table-1", preset=preset)
         assert [row.method.name for row in suite.rows] == TABLE_1.split()
         assert all(row.setting.ufm_preset == preset for row in suite.rows if row.method.fusion == UFM_STAR)
-    # What the preset says anyway is no change; what an ablation varies stays.
+    # A value equal to the preset's is no change; an ablation's varied value stays.
     rows = suite_named("ablation-segmentation", preset="paper").rows
-    own = {value_of(row, "segment.min_pixels") for row in rows[1:] if row.setting.plain}
-    assert own == {2000}
+    limits = {value_of(row, "segment.min_pixels") for row in rows[1:] if row.setting.plain}
+    assert limits == {2000}
     assert {"none", "both", "either"} == {configured(r.setting).segment.prune for r in rows[1:]}
     tried = {configured(r.setting).regression for r in suite_named("ablation-regression", preset="paper").rows[1:]}
     assert tried == {"exact", "neighbourhood"}
@@ -126,9 +126,9 @@ def test_an_ablation_tries_the_default_and_others_against_the_base_alone(name, f
 
 
 def test_rows_without_a_network_are_left_out():
-    left = suite_named("paper-table-1").with_bases(["aleatoric", "depth_only"])
-    assert left.bases == ("aleatoric",)
-    assert len(left.rows) == 5
+    remaining = suite_named("paper-table-1").with_bases(["aleatoric", "depth_only"])
+    assert remaining.bases == ("aleatoric",)
+    assert len(remaining.rows) == 5
 
 
 # ---- TOML ----
@@ -164,7 +164,7 @@ methods = ["Ensemble"]
     assert [row.title for row in again.rows] == [*expected[:3], ""]
     listed = listed_rows({"rows": [row.to_dict() for row in suite.rows]})
     assert list(row_labels(listed).values()) == expected
-    assert listed[2] == Row(suite.rows[2].method, suite.rows[2].setting), "a label makes no other row"
+    assert listed[2] == Row(suite.rows[2].method, suite.rows[2].setting), "a label does not distinguish rows"
     for wrong in ("each = { eta = [0.1, 0.2] }\nlabel = 'x'", "label = 'x'"):
         (tmp_path / "own.toml").write_text(f"[[rows]]\nmethods = ['UfM*-Ensemble', 'Ensemble']\n{wrong}")
         with pytest.raises(ValueError, match="label 'x' names one row"):
@@ -198,9 +198,9 @@ each = { "segment.line_thresh" = [0.3, 0.6] }
     twice = {"segment.line_thresh": 2 * UfMStarConfig().segment.line_thresh}
     assert suite.rows[:3] == (*rows_of("Aleatoric", "UfM*-Aleatoric"), *rows_of("UfM*-Aleatoric", overrides=twice))
     assert set(suite.rows[3:]) == set(suite_named("ablation-eta", "aleatoric").rows[2:])
-    own = suite_named(str(tmp_path / "mine.toml"))
-    assert [row.method.name for row in own.rows[:2]] == ["UfM*-Ensemble"] * 2
-    assert "UfM*-FullEnsemble" in {row.method.name for row in own.rows}
+    mine = suite_named(str(tmp_path / "mine.toml"))
+    assert [row.method.name for row in mine.rows[:2]] == ["UfM*-Ensemble"] * 2
+    assert "UfM*-FullEnsemble" in {row.method.name for row in mine.rows}
 
 
 @pytest.mark.parametrize(

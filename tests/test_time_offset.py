@@ -29,27 +29,27 @@ def path(times):
     return T
 
 
-def errors_shown(truth, given, precision):
-    """Posterior mean and covariance of the errors of ``given``, of images that show all but a common error."""
+def errors_shown(truth, poses, precision):
+    """Posterior mean and covariance of the errors of ``poses``; images show all but a common error."""
     n = len(truth)
-    turn = (given[:, :3, :3].swapaxes(1, 2) @ truth[:, :3, :3]).reshape(n, 3, 3)
-    d = np.concatenate([Rotation.from_matrix(turn).as_rotvec(), truth[:, :3, 3] - given[:, :3, 3]], 1).ravel()
+    turn = (poses[:, :3, :3].swapaxes(1, 2) @ truth[:, :3, :3]).reshape(n, 3, 3)
+    d = np.concatenate([Rotation.from_matrix(turn).as_rotvec(), truth[:, :3, 3] - poses[:, :3, 3]], 1).ravel()
     A = 1e5 * np.kron(np.eye(n) - 1 / n, np.eye(6))
     C = np.linalg.inv(A + np.diag(precision))
     return C @ A @ d, C
 
 
 def learnt(lag, noise=0.0, frames=60, seed=0):
-    """The estimate at every image of a trajectory that is late."""
+    """The estimates after every image, for a late trajectory."""
     rng, offset, lags = np.random.default_rng(seed), TimeOffset(), []
     every = path(np.arange(frames) - lag)
     every = moved(every, noise * rng.normal(size=6 * frames))
     for k in range(3, frames):
         window = slice(max(k - 9, 0), k + 1)
-        given = every[window]
-        precision = np.full(6 * len(given), 1e4)
-        start = moved(given, offset.shift(given).ravel())
-        offset.learn(given, precision, *errors_shown(path(np.arange(frames))[window], start, precision))
+        poses = every[window]
+        precision = np.full(6 * len(poses), 1e4)
+        start = moved(poses, offset.shift(poses).ravel())
+        offset.learn(poses, precision, *errors_shown(path(np.arange(frames))[window], start, precision))
         lags.append(offset.lag)
     return offset, np.array(lags)
 
@@ -57,7 +57,7 @@ def learnt(lag, noise=0.0, frames=60, seed=0):
 @pytest.mark.parametrize("lag", [-1.5, -0.7, 0.0, 0.4, 1.0, 2.0])
 def test_a_late_or_early_trajectory_is_found(lag):
     _, lags = learnt(lag)
-    assert abs(lags[-1] - lag) < 0.05 + 0.2 * abs(lag), "what is not significant is not used"
+    assert abs(lags[-1] - lag) < 0.05 + 0.2 * abs(lag), "an insignificant offset is not used"
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -71,11 +71,11 @@ def test_the_shift_leads_to_the_poses_at_the_images_times():
     offset = TimeOffset()
     times = np.arange(8.0)
     for offset.lag in (1.0, -1.0):
-        given = path(times - offset.lag)
-        off = np.abs(moved(given, offset.shift(given).ravel()) - path(times)).max((1, 2))
+        poses = path(times - offset.lag)
+        off = np.abs(moved(poses, offset.shift(poses).ravel()) - path(times)).max((1, 2))
         extrapolated = off[-1] if offset.lag > 0 else off[0]
         np.testing.assert_allclose(np.delete(off, -1 if offset.lag > 0 else 0), 0, atol=1e-12)
-        assert extrapolated < 0.5 * np.abs(given - path(times)).max()
+        assert extrapolated < 0.5 * np.abs(poses - path(times)).max()
 
 
 def test_a_steady_motion_shows_nothing():
@@ -103,9 +103,9 @@ def test_depths_of_late_poses_are_right_and_the_offset_is_named(caplog):
     source, late = StreamLandmarks("dense"), [frames[0], *frames[:-1]]
     errors, lags = [], []
     with caplog.at_level(logging.WARNING, "ufmstar_torch"):
-        for i, (frame, given) in enumerate(zip(frames, late, strict=True)):
+        for i, (frame, earlier) in enumerate(zip(frames, late, strict=True)):
             image = torch.from_numpy(frame.image.copy()).permute(2, 0, 1)[None]
-            source.update(image, torch.from_numpy(given.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None])
+            source.update(image, torch.from_numpy(earlier.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None])
             landmarks = source.last[0]
             lags.append(landmarks.lag)
             if i >= 40:
@@ -118,8 +118,8 @@ def test_depths_of_late_poses_are_right_and_the_offset_is_named(caplog):
 
 def test_the_estimate_is_saved_with_the_state():
     frames, source = walk(), DenseEvidence()
-    for frame, given in zip(frames, [frames[0], *frames[:-1]], strict=True):
-        source.update(frame.image, given.T_world_cam, frame.intrinsics)
+    for frame, earlier in zip(frames, [frames[0], *frames[:-1]], strict=True):
+        source.update(frame.image, earlier.T_world_cam, frame.intrinsics)
     other = DenseEvidence()
     other.load_state(source.state())
     assert other.state()["corners_lag"].item() == source.state()["corners_lag"].item()
@@ -133,7 +133,7 @@ def test_recordings_have_no_offset_until_their_poses_are_late(name):
     K = frames[0].intrinsics
     for late in (0, 1):
         source = DenseEvidence()
-        for frame, given in zip(frames[late:], frames, strict=False):
-            lag = source.update(frame.image, given.T_world_cam, K).lag
+        for frame, earlier in zip(frames[late:], frames, strict=False):
+            lag = source.update(frame.image, earlier.T_world_cam, K).lag
         print(f"{name}, {late} late: {lag:.2f}")
         assert abs(lag) < 0.2 if late == 0 else 0.3 < lag < 1

@@ -1,4 +1,4 @@
-"""Tours: exact depth, ways clear of things, places seen again, styles that never mix, sequences by name."""
+"""Tours: exact depth, collision-free paths, revisited places, separate styles, sequences by name."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def mixed() -> Tour:
 
 
 def scene(*parts) -> Tour:
-    """Nothing but these primitives, in a room of 40 m."""
+    """Only these primitives, in a room of 40 m."""
     room = torch.tensor([[[-20.0, -20.0, -20.0], [20.0, 20.0, 20.0]]], dtype=torch.float64)
     lights = torch.zeros(1, 1, 7)
     lights[..., 3:] = 1
@@ -113,7 +113,7 @@ def test_entry_is_the_first_point_of_the_solid(seed, kind, taper):
     first = steps[result.argmax(0)]
     assert np.isfinite(t[hit]).all()
     assert ((first[hit] - t[hit] >= -1e-9) & (first[hit] - t[hit] <= 2e-3)).all()
-    # A ray that grazes an edge between two samples may hit without being found, but then on the surface.
+    # The samples may miss a hit where a ray grazes an edge, but the hit is then still on the surface.
     grazing = ~hit & np.isfinite(t)
     assert inside((o + t[grazing, None] * d[grazing]) * (1 - 1e-9)).all()
 
@@ -186,7 +186,7 @@ def test_poses_are_rigid_level_and_smooth(home):
     assert (R[:, 1, 1] > 0.9).all()  # the camera's down is the world's
     steps = (p[1:] - p[:-1]).norm(dim=1)
     assert steps.max() < 0.25
-    # Where the way turns back, the camera stops to turn; everywhere else the pace changes slowly.
+    # At reversals the camera stops and turns; everywhere else the speed changes slowly.
     assert ((steps[1:] - steps[:-1]).abs() < 0.06).double().mean() > 0.93
     angle = torch.rad2deg(torch.arccos((((R[1:] * R[:-1]).sum((1, 2)) - 1) / 2).clamp(-1, 1)))
     assert angle.max() < 12
@@ -195,7 +195,7 @@ def test_poses_are_rigid_level_and_smooth(home):
 
 
 def seen_from(tour: Tour, points: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
-    """[N] whether points [N, 3] lie on what a camera sees."""
+    """[N] whether points [N, 3] lie on the surface that a camera sees."""
     x, y, z = (points - pose[:3, 3]).matmul(pose[:3, :3]).unbind(1)
     front = z > 0.1
     u, v = (K[0, 0] * x / z + K[0, 2]).round().long(), (K[1, 1] * y / z + K[1, 2]).round().long()
@@ -217,7 +217,7 @@ def test_neighbouring_frames_overlap_and_places_are_seen_again(home):
     shares = [float(seen_from(home, world_points(home, a), b).double().mean()) for a, b in pairs]
     assert min(shares) > 0.5
     assert np.median(shares) > 0.7
-    assert len(set(rooms_at(home, poses[:, :3, 3]).tolist())) > 1, "the way leads through a doorway"
+    assert len(set(rooms_at(home, poses[:, :3, 3]).tolist())) > 1, "the path leads through a doorway"
     for i in range(0, 60, 12):
         early = world_points(home, poses[i])
         seen = np.array([float(seen_from(home, early, pose).double().mean()) for pose in poses[i::3]])

@@ -1,4 +1,4 @@
-"""Triangulation against closed forms, and what the tracker of corners alone must do."""
+"""Triangulation against closed forms, and the tracker of corners."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_exact_tracks_give_exact_points(seed, count):
     np.testing.assert_allclose(result.point, points, atol=1e-7)
     assert result.ahead.all()
     assert result.error.max() < 1e-6
-    # What a view did not see does not matter.
+    # The values at unseen views have no effect.
     spoiled = np.where(seen[..., None], seen_from(points, T), 1e4)
     np.testing.assert_allclose(triangulate(spoiled, seen, T, K).point, result.point, atol=1e-9)
 
@@ -142,12 +142,12 @@ def test_matches_lie_on_the_part_of_the_line_where_points_of_the_scene_are(turne
     assert distance < 1e-6
     np.testing.assert_allclose(rho, 1 / points[:, 2], rtol=1e-9)
     assert abs(off(then + np.array([0, 1.5]))[0] - 1.5) < 0.3, "across the line, nearly"
-    assert off(2 * seen_from(1e9 * points, before[None])[:, 0] - then)[0] > 5, "the wrong way: a baseline of 7 to 30 px"
-    assert off(seen_from(1e9 * points, before[None])[:, 0])[0] > 1.5, "no motion but the rotation's"
+    assert off(2 * seen_from(1e9 * points, before[None])[:, 0] - then)[0] > 5, "backwards: a baseline of 7 to 30 px"
+    assert off(seen_from(1e9 * points, before[None])[:, 0])[0] > 1.5, "no motion except the rotation's"
 
 
 def test_few_corners_of_a_camera_that_turns_are_none():
-    """With a baseline of 2 cm most corners show too little parallax; those that show more owe it to their errors."""
+    """With a baseline of 2 cm most corners have too little parallax; larger parallax is due to errors."""
     tracker, used = LandmarkTracker(), []
     for frame in islice(open_sequence("tour:832?style=blank&pan=1&frames=30&size=240x320"), 18):
         marks = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)

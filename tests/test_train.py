@@ -1,4 +1,4 @@
-"""Recipes, the training module's arithmetic, what a training leaves on disk, and its command line."""
+"""Recipes, the training module's arithmetic, a training's files, and its command line."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_every_method_trains(frames, tmp_path, network):
 
 
 def test_bfloat16_trains_and_its_loss_is_in_single_precision(frames, tmp_path):
-    """The loss of the first step: later ones depend on the weights that the earlier ones reached."""
+    """Compares the first step's loss; later losses depend on the updated weights."""
     recipe = replace(ONE_STEP, average=0.0)
     losses = []
     for name, precision in (("full", "32-true"), ("mixed", "bf16-mixed")):
@@ -153,16 +153,16 @@ def test_a_split_batch_trains_every_member_on_its_own_images(frames, tmp_path):
     image = torch.rand(4, 3, *recipe.network.size, generator=torch.Generator().manual_seed(0))
     distribution = module._distribution(image)
     assert len(distribution.depth) == 4
-    for n, own in enumerate(distribution.depth.split(2)):
+    for n, depth in enumerate(distribution.depth.split(2)):
         factor = module.network.factors()[0]
-        (gradient,) = torch.autograd.grad(own.sum(), factor, retain_graph=True)
+        (gradient,) = torch.autograd.grad(depth.sum(), factor, retain_graph=True)
         assert [bool(row.any()) for row in gradient] == [n == 0, n == 1]
     fit(tiny_job(frames, tmp_path / "out", replace(recipe, epochs=1, max_steps=1)))
 
 
 @pytest.mark.parametrize("average", [0.0, 0.9])
 def test_a_loss_that_is_not_finite_names_its_samples_and_loses_nothing(frames, tmp_path, monkeypatch, average):
-    """The second member diverges at its step 2, the first of the two is there nevertheless."""
+    """The second member diverges at its step 2; the first member's result remains."""
     recipe = replace(RECIPE, members=2, epochs=1, average=average)
     original = TrainingModule._distribution
 
@@ -260,7 +260,7 @@ def test_a_batch_ensemble_starts_from_weights_and_near_them(tmp_path, architectu
 
 @pytest.mark.parametrize(("held", "wanted"), [(18, 34), (34, 18)])
 def test_a_monodepth2_of_another_resnet_is_refused(tmp_path, held, wanted):
-    """Many of its tensors have the same names and shapes."""
+    """The two ResNets share many names and shapes of tensors."""
     network = MonodepthResNet(held)
     torch.save(
         {f"encoder.{key}": value for key, value in network.encoder.state_dict().items()}, tmp_path / "encoder.pth"
@@ -312,7 +312,7 @@ def test_only_the_named_part_is_trained(frames, tmp_path):
     before = {key: value.clone() for key, value in new_network(job, 0).state_dict().items()}
     fit(job)
     after, _ = read_safetensors(tmp_path / "out" / "member_0" / WEIGHTS, prefix="member.0.")
-    # Batch norms of the parts that are not trained keep their statistics, too.
+    # Batch norms of untrained parts keep their statistics, too.
     changed = {key for key in before if not torch.equal(before[key], after[key])}
     assert {".".join(key.split(".")[:3]) for key in changed} == {"head.weight", "head.bias", "backbone.decoder.4"}
 

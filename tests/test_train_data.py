@@ -39,7 +39,7 @@ def test_a_sample_is_what_the_network_and_the_losses_take():
     assert [sample[k].dtype for k in ("image", "depth", "valid", "intrinsics")] == [
         torch.float32, torch.float32, torch.bool, torch.float64,
     ]  # fmt: skip
-    assert np.isnan(depth[0, 2])  # the frame is left as it was
+    assert np.isnan(depth[0, 2])  # the frame is unchanged
 
 
 def test_epoch_and_index_decide_the_augmentation():
@@ -64,15 +64,15 @@ def test_a_broken_file_stops_the_run_with_its_name():
 @pytest.mark.parametrize("order", [range(6), reversed(range(6)), [3, 2, 3, 5, 5, 0, 2]], ids=["up", "down", "mixed"])
 def test_skipping_takes_the_next_good_frame_whatever_came_before(order, caplog):
     dataset = SampleDataset(Numbered(6, broken=(2, 3, 5)), PLAIN, on_bad_file="skip")
-    taken = {0: 0, 1: 1, 2: 4, 3: 4, 4: 4, 5: 0}
+    good_index = {0: 0, 1: 1, 2: 4, 3: 4, 4: 4, 5: 0}
     order = list(order)
     with caplog.at_level(logging.WARNING):
         for index in order:
-            assert dataset[index]["depth"][0, 0] == taken[index] + 1
+            assert dataset[index]["depth"][0, 0] == good_index[index] + 1
     assert set(dataset.bad_files()) == {"frame-2", "frame-3", "frame-5"} & set(dataset.bad_files())
-    # Frame 3 is met also where only 2 was asked for.
+    # A request for frame 2 also reads frame 3.
     assert dataset.bad_files() == ("frame-2", "frame-3", "frame-5")
-    assert len(caplog.records) == 3  # each one once
+    assert len(caplog.records) == 3  # each once
     assert "frame-2: torn" in caplog.text
 
 
@@ -130,10 +130,10 @@ def test_a_data_module_gives_each_process_its_share_and_tells_broken_files(tmp_p
     assert data.bad_files() == ("nyu_train/kitchen_1__9",)
 
 
-# Lightning 2.6 asks torch's pytree in a way that newer versions of torch deprecate.
+# Lightning 2.6 calls torch's pytree in a way that newer versions of torch deprecate.
 @pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")
 def test_lightning_walks_through_the_epochs(tmp_path):
-    """Its calls of set_epoch arrive, whatever it iterates over beforehand."""
+    """Lightning's calls of set_epoch reach the dataset, also after other iterations."""
     import lightning.pytorch as pl
 
     class Recorder(pl.LightningModule):
@@ -219,7 +219,7 @@ def test_loading_leaves_the_global_generator_alone():
 
 @pytest.mark.slow
 def test_worker_processes_load_the_same_and_report_broken_files(tmp_path):
-    """Spawned; what they find broken is known here, and they know what epoch it is."""
+    """Spawned workers report broken files to this process, and receive the epoch."""
     frames = SequenceFrames([open_sequence(write_nyu(tmp_path) / "train")])
     truncate(tmp_path / "train" / "kitchen_0" / "10.h5", 0.5)
 

@@ -32,7 +32,7 @@ from ufmstar_torch.train.member import WEIGHTS, make_data, new_network, train_me
 from ufmstar_torch.train.samples import clips
 
 CLIP, SIZE, FRAMES = 4, (48, 64), 16
-# [m] The depth that a full green channel stands for.
+# [m] The depth of a full green channel.
 FULL = 12.0
 
 
@@ -44,8 +44,8 @@ def walk():
 
 
 def coded(seed=0):
-    """A rendered tour whose images state the depth (green), which half of the room is hard (red), and by how much the
-    frame's prediction of it errs (blue, the same in the whole frame)."""
+    """A rendered tour whose images encode the depth (green), the hard half of the room (red), and the relative error of
+    its predicted depth (blue, constant per frame)."""
     (rendered, frames), rng = walk(), np.random.default_rng(seed)
     entries = []
     for entry, frame in zip(rendered.entries, frames, strict=True):
@@ -81,7 +81,7 @@ def batch_of(source):
 
 
 def correlation(network, batch):
-    """Spearman's, of what the head states and what UfM* computes."""
+    """Spearman's correlation between the head's variance and UfM*'s."""
     with torch.no_grad():
         d = network.eval().distribution(batch["image"])
     variance, measured = Teacher(CLIP)(d.depth, batch["T_world_cam"], batch["intrinsics"])
@@ -120,7 +120,7 @@ def test_the_target_is_ufmstars_of_every_clip_alone(room):
             expected = out.variance[0].clamp_min(1e-6)
             assert torch.equal(variance[i].nan_to_num(-1), expected.nan_to_num(-1))
             assert torch.equal(measured[i], (out.measured[0] >= 0.5) & expected.isfinite())
-        assert not measured[first].any(), "nothing to compare with"
+        assert not measured[first].any(), "no second view to compare with"
         assert measured[first + CLIP - 1].any()
     assert not measured[CLIP + 1].any()
 
@@ -138,10 +138,10 @@ def test_the_loss_is_the_sum_by_hand_and_its_minimum_lies_at_the_variance():
     target[0, 0, 0], valid[0, 0, 0], variance[0, 0, 1], measured[0, 0, 1] = np.nan, True, np.nan, False
     total = count = 0
     for at in np.ndindex(shape):
-        known = valid[at] and target[at] > 0
-        total += abs(depth[at] - target[at]) if known else 0
+        has_truth = valid[at] and target[at] > 0
+        total += abs(depth[at] - target[at]) if has_truth else 0
         total += 0.5 * (s[at] - math.log(variance[at])) ** 2 if measured[at] else 0
-        count += bool(known or measured[at])
+        count += bool(has_truth or measured[at])
     tensors = [torch.from_numpy(x) for x in (depth, s, target, valid, variance, measured)]
     depth, s, *rest = (tensors[0].float().requires_grad_(), tensors[1].float().requires_grad_(), *tensors[2:])
     actual, pixels = distillation_sums(GaussianDepth(depth, s), *rest)

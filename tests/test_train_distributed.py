@@ -18,15 +18,15 @@ from ufmstar_torch.models.checkpoints import read_safetensors
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.member import WEIGHTS, make_data
 
-# Sums depend on how many threads share them, and the processes that are compared have one.
+# Sums depend on the number of threads, and the compared processes have one.
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-# Without batch norm, whose statistics are those of each process's own part of the batch.
+# Without batch norm, whose statistics would differ between the processes' parts of the batch.
 PLAIN = replace(with_network(RECIPE, norm=False), epochs=1, learning_rate=0.002, clip=0.0)
 
 
 def command(job):
-    """The command line that means a job on two processes."""
+    """The command line of a job on two processes."""
     r, n = job.recipe, job.recipe.network
     words = ["--preset", "fastdepth-aleatoric", "--data", "sequences", "--root", *job.data.paths]
     words += ["--part", job.data.part, "--validation-part", job.data.validation_part, "--out", str(job.settings.out)]
@@ -45,7 +45,7 @@ def losses(out):
 
 @pytest.fixture(scope="module")
 def alone(frames, tmp_path_factory):
-    """The folder of a training by one process. Nobody may change it."""
+    """The folder of a training by one process. Tests must not change it."""
     out = tmp_path_factory.mktemp("alone") / "one"
     fit(tiny_job(frames, out, PLAIN))
     return out
@@ -79,8 +79,8 @@ def free_port():
 
 
 def train_as_two(job, launch):
-    """Train over what is in the job's folder, as two processes that somebody else has started; the second comes first,
-    by two seconds."""
+    """Train in the job's folder, as two externally started processes; the second starts two seconds before the
+    first."""
     environment = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
     processes = [start(_train, job, **launch(1), **environment)]
     try:
@@ -107,7 +107,7 @@ def as_two_computers(rank):
     ("launch", "settings"), [(as_torchrun, {"devices": 2}), (as_two_computers, {"devices": 1, "nodes": 2})]
 )
 def test_the_second_process_may_come_first(frames, alone, tmp_path, launch, settings):
-    """It must not see what an earlier training left."""
+    """It must not read an earlier training's files."""
     out = tmp_path / "out"
     fit(tiny_job(frames, out, replace(PLAIN, max_steps=2, learning_rate=0.1)))
     train_as_two(tiny_job(frames, out, PLAIN, strategy="ddp", **settings), launch)
@@ -116,7 +116,7 @@ def test_the_second_process_may_come_first(frames, alone, tmp_path, launch, sett
 
 @pytest.mark.slow
 def test_one_validation_frame_for_two_processes(frames, tmp_path):
-    """With batch norm, whose statistics DistributedDataParallel sends around in the first validation batch."""
+    """With batch norm, whose statistics DistributedDataParallel broadcasts in the first validation batch."""
     recipe = replace(with_network(PLAIN, norm=True), max_steps=2)
     job = tiny_job(frames, tmp_path / "out", recipe, strategy="ddp", devices=2)
     train_as_two(replace(job, data=replace(job.data, validation_part="12:13")), as_torchrun)
@@ -125,7 +125,7 @@ def test_one_validation_frame_for_two_processes(frames, tmp_path):
 
 @pytest.mark.slow
 def test_the_processes_above_had_unequal_numbers_of_valid_pixels(frames, tmp_path):
-    """Otherwise a mean of the processes' means would pass as well."""
+    """Otherwise the mean of the processes' means would pass as well."""
     data = make_data(tiny_job(frames, tmp_path, PLAIN), 0, 1)
     counts = [batch["valid"].flatten(1).sum(1) for batch in data.train_dataloader()]
     assert max(abs(int(c[::2].sum() - c[1::2].sum())) / int(c.sum()) for c in counts) > 0.03

@@ -1,4 +1,4 @@
-"""Heads on networks of one's own: modules that return depth or features, and tiny models of transformers."""
+"""Heads on a user's networks: modules that return depth or features, and tiny models of transformers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ufmstar_torch.train.member import new_network
 SIZE = (32, 32)
 QUIET = {"tensorboard": False, "progress": False, "accelerator": "cpu"}
 INPUT = Preprocess(size=SIZE)
-SEED = 5  # of a tiny relative network whose output falls with the frames' depth
+SEED = 5  # for a tiny relative network whose output decreases with depth
 
 
 class Own(nn.Module):
@@ -62,14 +62,14 @@ def image(seed=0):
 
 
 def test_a_frozen_network_keeps_its_depth_and_gets_a_variance(frames, tmp_path):
-    own = Own().eval()
-    before = {key: value.clone() for key, value in own.state_dict().items()}
-    trained = train(own, "aleatoric", frames, tmp_path, max_steps=12)
+    network = Own().eval()
+    before = {key: value.clone() for key, value in network.state_dict().items()}
+    trained = train(network, "aleatoric", frames, tmp_path, max_steps=12)
     prediction = trained(image())
-    torch.testing.assert_close(prediction.depth, interpolate(own(image()), SIZE, mode="bilinear")[:, 0])
+    torch.testing.assert_close(prediction.depth, interpolate(network(image()), SIZE, mode="bilinear")[:, 0])
     assert prediction.aleatoric_variance.min() > 0
     assert prediction.aleatoric_variance.std() > 0
-    assert all(torch.equal(value, before[key]) for key, value in own.state_dict().items())
+    assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())
     assert all(torch.equal(value, before[key]) for key, value in trained.backbone.network.state_dict().items())
     loaded = load_network("trained", tmp_path / "trained.safetensors", backbone=Own())
     assert torch.equal(loaded(image()).variance, prediction.variance)
@@ -89,13 +89,14 @@ def test_every_head_on_a_module(frames, tmp_path, head, members, fine_tune):
     assert trained(image()).variance.isfinite().all()
     assert read_info(tmp_path / "trained.safetensors").spec.module.part == "last"
     if head in ("evidential", "ensemble"):
-        start, kept = Own().state_dict(), loaded[0].backbone.network.state_dict()
+        start, state = Own().state_dict(), loaded[0].backbone.network.state_dict()
         for key in ("last.weight", "encoder.1.running_mean"):
-            assert torch.equal(kept[key], start[key]) != fine_tune, key
+            assert torch.equal(state[key], start[key]) != fine_tune, key
 
 
 def test_a_training_goes_on_and_starts_another(frames, tmp_path):
-    """A finished one is resumed without a change; its weights are the start of an ensemble and below another head."""
+    """Resuming a finished training changes nothing. Its weights can start an ensemble and a network with another
+    head."""
     train(Own(), "aleatoric", frames, tmp_path / "a")
     first = (tmp_path / "a" / "trained.safetensors").read_bytes()
     train(Own(), "aleatoric", frames, tmp_path / "a", resume=True)
@@ -122,7 +123,7 @@ def test_a_module_of_features_learns_its_depth(frames, tmp_path):
 
 
 def test_declared_outputs_and_other_parts(frames, tmp_path):
-    """``wrap_network`` declares what a module returns; the head reads what goes into the named part."""
+    """``wrap_network`` declares a module's outputs; the head reads the input of the named part."""
 
     class Two(Own):
         def forward(self, image):
@@ -136,7 +137,8 @@ def test_declared_outputs_and_other_parts(frames, tmp_path):
 
 @pytest.mark.parametrize("kind", ["metric", "relative"])
 def test_a_checkpoint_from_the_command_line(frames, tmp_path, kind, capsys):
-    """Its file is complete: the checkpoint may be gone. A relative one is aligned to the training depths."""
+    """The trained file is complete: the checkpoint is not needed any more. A relative checkpoint is aligned to the
+    training depths."""
     folder = write_depth_anything(tmp_path / "checkpoint", kind, seed=SEED)
     (tmp_path / "spec.json").write_text('{"size": [70, 84], "keep_aspect": false}')
     words = ["--backbone", folder, "--head", "aleatoric", "--spec", tmp_path / "spec.json", "--data", "sequences"]
@@ -161,11 +163,11 @@ def test_a_checkpoint_from_the_command_line(frames, tmp_path, kind, capsys):
 
 
 def test_a_checkpoint_without_its_image_processor(frames, tmp_path, capsys):
-    """That of Depth Anything is known; the error for another names the file and the declaration."""
+    """Depth Anything has a default image processor; the error for other models names the file and the declaration."""
     for folder in (write_depth_anything(tmp_path / "known", "metric"), write_other(tmp_path / "dpt", "dpt")):
         (folder / "preprocessor_config.json").unlink()
-    known = load_network("huggingface", tmp_path / "known")
-    assert known.preprocess == DepthAnything.from_pretrained(tmp_path / "known", keep_aspect=True).preprocess
+    by_name = load_network("huggingface", tmp_path / "known")
+    assert by_name.preprocess == DepthAnything.from_pretrained(tmp_path / "known", keep_aspect=True).preprocess
     (tmp_path / "spec.json").write_text('{"kind": "metric", "size": [64, 64]}')
     words = [
         "train",

@@ -1,4 +1,4 @@
-"""NYU Depth V2 for training: what is read is what was written, damage, conversion."""
+"""NYU Depth V2 for training: the read data equals the written data; damage; conversion."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ SCENES = ["attic_1", "attic_1", "bath_1", "cafe_1", "den_1", "den_1"]
 
 
 def write_mat(path, width=64, height=48):
-    """As MATLAB 7.3 writes it: columns first, strings as references to columns of UTF-16."""
+    """Write the file like MATLAB 7.3: column-major, strings as references to columns of UTF-16."""
     rng = np.random.default_rng(5)
     rgb = rng.integers(0, 256, (len(SCENES), height, width, 3), np.uint8)
     depth = rng.uniform(0.7, 9, (len(SCENES), height, width)).astype(np.float32)

@@ -26,7 +26,7 @@ def test_every_method_of_the_paper_is_a_preset_of_both_architectures():
     for name, recipe in PRESETS.items():
         if name in ("demo", "fastdepth-ufmstar"):
             continue
-        # Section VII, and of table 1 the heads' size.
+        # Section VII, and the heads' size from table 1.
         assert (recipe.network.size, recipe.epochs, recipe.weight_decay) == ((224, 224), 50, 1e-4)
         assert (recipe.beta1, recipe.beta2) == (0.9, 0.999)
         assert recipe.network.dropout == 0.2
@@ -49,7 +49,7 @@ def test_ensembles_of_different_seeds_share_no_member(tmp_path):
     jobs = [replace(job, settings=replace(job.settings, seed=seed)) for seed in range(3)]
     assert len({j.seed(member) for j in jobs for member in range(1000)}) == 3 * 1000
     assert [job.seed(member) for member in range(10)] == list(range(10))
-    # Weights come from the seed: the second member of one is not the first of the next.
+    # The seed determines the weights: one ensemble's second member differs from the next seed's first.
     second, first = new_network(jobs[0], 1), new_network(jobs[1], 0)
     key = "backbone.encoder.0.conv.weight"
     assert not torch.equal(second.state_dict()[key], first.state_dict()[key])
@@ -93,13 +93,13 @@ def test_the_yardstick_is_the_likelihood_of_one_variance():
     figures = validation.figures(Sums(0.3 * 11, 11))
     normal = torch.distributions.Normal(predicted[valid], 0.3**0.5)
     assert figures["val_nll"] == pytest.approx(-float(normal.log_prob(depth[valid]).mean()), rel=1e-12)
-    # The head's variance is the same everywhere, so it gains nothing.
+    # A constant variance has no gain.
     assert figures["val_nll_constant"] == pytest.approx(figures["val_nll"], rel=1e-12)
     assert figures["val_rmse"] == pytest.approx(np.sqrt((error**2).mean()))
     assert figures["val_rel"] == pytest.approx((abs(error) / truth).mean())
     ratio = np.maximum((truth + error) / truth, truth / (truth + error))
     assert figures["val_delta1"] == pytest.approx(((ratio < 1.25) & (ratio > 0)).mean())
-    # No constant does better than the mean squared error.
+    # The mean squared error is the best constant variance.
     constants = [validation.figures(Sums(v, 1))["val_nll_constant"] for v in np.geomspace(1e-3, 10, 200)]
     best = validation.figures(Sums((error**2).mean(), 1))["val_nll_constant"]
     assert figures["val_nll_constant_best"] == pytest.approx(best)

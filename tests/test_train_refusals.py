@@ -1,4 +1,4 @@
-"""Settings that a training refuses: the call, and the field that the message names."""
+"""Invalid settings of a training: the message names the field."""
 
 from __future__ import annotations
 

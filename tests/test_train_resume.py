@@ -1,4 +1,4 @@
-"""A training that is killed, stopped or fails goes on from its last epoch, and loses nothing that was finished."""
+"""A killed, stopped or failed training continues from its last epoch, with all finished results."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.member import RESULT, WEIGHTS
 
-# Sums depend on how many threads share them, and the processes that are compared have one.
+# Sums depend on the number of threads, and the compared processes have one.
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-# Dropout, batch norm, augmentation, a schedule and a running mean: whatever could be out of step.
+# All parts with a state: dropout, batch norm, augmentation, a schedule and a running mean.
 DROPOUT = with_network(method="mc_dropout", dropout=0.2)
 
 
 @pytest.fixture(scope="module")
 def uninterrupted(frames, tmp_path_factory):
-    """The folder of a training that nothing disturbed."""
+    """The folder of an undisturbed training."""
     out = tmp_path_factory.mktemp("reference") / "out"
     assert fit(tiny_job(frames, out, DROPOUT))["stopped"] is None
     return out
@@ -56,7 +56,7 @@ def assert_same_result(out, reference, member=0):
 
 
 def stop_after(steps):
-    """Asks to stop after so many steps of the first member (it is asked once before them)."""
+    """Request a stop after ``steps`` steps of the first member (the callback runs once before the first step)."""
     count = iter(range(10_000))
     return lambda: next(count) >= steps
 
@@ -65,7 +65,7 @@ def stop_after(steps):
 
 
 def _killed(job):
-    """Train; killed after step 5 of 9, the last checkpoint being that of step 3."""
+    """A training that is killed after step 5 of 9; its last checkpoint is from step 3."""
     ask = stop_after(5)
     fit(job, asked=lambda: ask() and os.kill(os.getpid(), signal.SIGKILL))
 
@@ -84,13 +84,13 @@ def test_killed_in_the_middle_of_an_epoch_it_repeats_the_epoch_bit_for_bit(frame
 
 @pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_stopped_again_and_again_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path, workers, monkeypatch):
-    """Two steps into the second and the third of three epochs of three steps; weights are there after each session."""
+    """Stops two steps into the second and third of three epochs of three steps; weights exist after each session."""
     monkeypatch.setattr(torch.multiprocessing, "get_context", lambda _: CONTEXT)  # test_train_data.py spawns
     job = tiny_job(frames, tmp_path / "out", DROPOUT)
     job = replace(job, data=replace(job.data, workers=workers))
-    for reached, kept in ((5, 3), (8, 6), (9, 9)):
+    for reached, checkpointed in ((5, 3), (8, 6), (9, 9)):
         summary = fit(job, resume=True, asked=stop_after(5))
-        assert (summary["members"][0]["steps"], stored(tmp_path / "out")["global_step"]) == (reached, kept)
+        assert (summary["members"][0]["steps"], stored(tmp_path / "out")["global_step"]) == (reached, checkpointed)
         assert (tmp_path / "out" / WEIGHTS).is_file()
     assert summary["stopped"] is None
     assert_same_result(tmp_path / "out", uninterrupted)
@@ -109,7 +109,7 @@ def test_a_time_budget_is_shared_by_the_members_and_resuming_goes_on(frames, tmp
 def test_a_finished_member_is_not_trained_again(frames, tmp_path):
     recipe = replace(RECIPE, members=2, epochs=1)
     out = tmp_path / "out"
-    # Asked once before each member and once after each step: stop before the second member.
+    # The callback runs before each member and after each step: stop before the second member.
     count = iter(range(100))
     summary = fit(tiny_job(frames, out, recipe), asked=lambda: next(count) >= 4)
     assert [m["finished"] for m in summary["members"]] == [True]
@@ -122,14 +122,14 @@ def test_a_finished_member_is_not_trained_again(frames, tmp_path):
     both = tensors(out / WEIGHTS)
     key = "backbone.encoder.0.conv.weight"
     assert not torch.equal(both[f"member.0.{key}"], both[f"member.1.{key}"])
-    # A second look at a finished training trains nothing, more members are added to it.
+    # Resuming a finished training trains nothing; further members are added.
     more = replace(recipe, members=3)
     assert [m["seed"] for m in fit(tiny_job(frames, out, more), resume=True)["members"]] == [0, 1, 2]
     assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
 
 
 def test_sigterm_reaches_who_asks_for_the_stop(frames, tmp_path):
-    """Lightning's own handler would end the program with success, without weights and without a result."""
+    """Lightning's handler would end the program with exit code 0, without weights and result."""
     received = []
 
     def asked():
@@ -194,7 +194,7 @@ def test_a_folder_is_refused_that_is_not_this_training(frames, tmp_path):
     for other, message in others:
         with pytest.raises(FolderError, match=message):
             fit(other, resume=True)
-    # Whatever changes the speed only is no other training.
+    # Settings that only affect the speed do not make another training.
     same = replace(job, settings=replace(job.settings, log_every=7, max_minutes=3.0))
     assert fit(same, resume=True)["stopped"] is None
     (tmp_path / "home").mkdir()

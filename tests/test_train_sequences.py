@@ -1,4 +1,4 @@
-"""Recorded sequences and rendered tours for training: parts, poses or none, the cache of tours."""
+"""Recorded sequences and rendered tours for training: parts, sequences without poses, the cache of tours."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_tours_are_rendered_once_and_completed(tours, tmp_path):
     again = tour_frames([5, 6], replace(TINY, cache=str(tmp_path / "cache")))
     assert tour_file(inside, 5).stat().st_mtime_ns == times["5.npy"]
     np.testing.assert_array_equal(again.load(4).image, frames.load(4).image)
-    assert sorted(times) == sorted(path.name for path in inside.iterdir())  # nothing temporary is left
+    assert sorted(times) == sorted(path.name for path in inside.iterdir())  # no temporary file is left
 
 
 def test_a_truncated_cache_file_is_named(tours, tmp_path):

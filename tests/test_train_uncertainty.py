@@ -1,4 +1,4 @@
-"""The validation of uncertainty on sequences: figures of the evaluation, logged by a Lightning module of one's own."""
+"""The validation of uncertainty on sequences: figures of the evaluation, logged by a user's Lightning module."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Own(nn.Module):
 
 
 class Training(pl.LightningModule):
-    """The user's own module."""
+    """A user's training module."""
 
     def __init__(self, network) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Trained checkpoints: what was saved is what is loaded, and every bad file is named; and ``ufmstar run`` with them."""
+"""Trained checkpoints: saving and loading, errors that name a bad file, and ``ufmstar run``."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def members_of(networks):
 
 
 def ready(network):
-    """The form in which a run has it."""
+    """The network in the form used by a run."""
     return Inference().ready(network, Path("net.safetensors"), torch.device("cpu"))
 
 
@@ -131,7 +131,7 @@ def test_half_precision_is_half_the_file_and_nearly_the_network(tmp_path, image,
     for one, other in zip(full, half, strict=True):
         for a, b in zip(one.state_dict().values(), other.state_dict().values(), strict=True):
             assert a.dtype == b.dtype
-            # 2^-11 relative, or half the distance of the subnormal numbers.
+            # 2^-11 relative, or half the spacing of subnormal numbers.
             torch.testing.assert_close(b, a, rtol=2**-11, atol=2**-25)
         torch.testing.assert_close(predict(other, image), predict(one, image), rtol=0.02, atol=0.02)
 
@@ -142,8 +142,8 @@ def test_statistics_that_half_precision_cannot_hold_stay(tmp_path):
     with torch.no_grad():
         norms[0].running_var[0] = 1e5  # would be infinite
         norms[1].running_mean[0] = -7e4
-        norms[2].running_var[0] = 1e-6  # would have 4 bits left
-        norms[3].weight[0] = 1e-9  # may become 0: it is not divided by
+        norms[2].running_var[0] = 1e-6  # would keep 4 bits
+        norms[3].weight[0] = 1e-9  # may become 0: no division by it
     save_trained(tmp_path / "n.safetensors", network, spec_of(), half=True)
     (restored,) = load_trained(tmp_path / "n.safetensors")
     again = [m for m in restored.modules() if isinstance(m, nn.BatchNorm2d)]
@@ -152,8 +152,8 @@ def test_statistics_that_half_precision_cannot_hold_stay(tmp_path):
     assert torch.equal(again[2].running_var, norms[2].running_var)
     assert again[3].weight[0] == 0
     stored = load_file(tmp_path / "n.safetensors")
-    kept = [key for key, value in stored.items() if value.dtype == torch.float32]
-    assert len(kept) == 3
+    float32_keys = [key for key, value in stored.items() if value.dtype == torch.float32]
+    assert len(float32_keys) == 3
     assert {value.dtype for value in stored.values()} == {torch.float16, torch.float32, torch.int64}
     assert {value.dtype for value in restored.state_dict().values()} == {torch.float32, torch.int64}
 
@@ -185,7 +185,7 @@ def file(tmp_path):
 
 
 def rewritten(path, change):
-    """The file with its tensors and metadata changed in place by ``change``."""
+    """Rewrite the file after ``change`` has edited its tensors and metadata."""
     from safetensors import safe_open
 
     with safe_open(path, framework="pt") as opened:
@@ -256,13 +256,13 @@ def test_a_file_as_one_network(tmp_path, image):
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """A generic sequence of 4 frames, 48x64. Nobody may change it."""
+    """A generic sequence of 4 frames, 48x64. Tests must not change it."""
     return write_generic(tmp_path_factory.mktemp("scene"), frames=4)[0]
 
 
 @pytest.fixture
 def ufmstar(capfd, scene, tmp_path):
-    """Runs the scene into a folder: (exit code, stdout, stderr)."""
+    """Run the scene's sequence into a folder: (exit code, stdout, stderr)."""
 
     def call(*words, out="out"):
         capfd.readouterr()
@@ -281,7 +281,7 @@ def depths(out):
 
 
 def by_hand(scene, members, mode="alternate"):
-    """The depths of a run."""
+    """The depths of a run, computed by hand."""
     from ufmstar_torch.eval.sequences import open_sequence
 
     pipeline = UncertainDepth(members, mode=mode, preprocess=members[0].preprocess)

@@ -1,6 +1,6 @@
-"""Properties of the GPU kernels besides the parts of a step (``conftest.backend``): late growth, bits of matches.
+"""Properties of the GPU kernels beyond the steps (fixture ``backend``): delayed growth, bits of matches.
 
-In Triton's interpreter, on CPU tensors, with ``TRITON_INTERPRET=1``; on a GPU as they are (``pytest -m gpu``).
+With ``TRITON_INTERPRET=1`` in Triton's interpreter, on CPU tensors; ``pytest -m gpu`` runs them on a GPU.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ def test_bits_of_matches():
 
 
 def test_late_growth():
-    """Every output is the CPU's, except for the map that was regressed while components waited for slots."""
+    """Every output equals the CPU's, except a map that was regressed while components waited for slots."""
     config = UfMStarConfig(segment=SPGF, unmeasured="paper", initial_capacity=2)
     modules = [make_backend(name).module(config) for name in ("triton", "numba")]
     late = []
     for i, (depth, pose, K, _) in enumerate(walks(1, 4, SIZE)):
-        given = torch.full_like(depth, torch.nan) if i == 1 else depth
-        a, e = (module(given, pose, K, (given / 100).nan_to_num()) for module in modules)
+        pixels = torch.full_like(depth, torch.nan) if i == 1 else depth
+        a, e = (module(pixels, pose, K, (pixels / 100).nan_to_num()) for module in modules)
         late.append(bool((a.statistics.components < e.statistics.components).any()))
         if not late[-1]:
             close(a.variance, e.variance, 1e-8, 1e-10)
@@ -79,7 +79,7 @@ def test_late_growth():
 
 @pytest.mark.skipif(not INTERPRETED, reason="on a GPU tests/test_gpu.py records a graph")
 def test_capture_keeps_the_state_in_place(monkeypatch):
-    """The bookkeeping of a capture, with a function in the place of the graph; and the launches of a step."""
+    """The bookkeeping of a capture, with a function instead of the graph; and the launches of a step."""
     from triton.runtime.jit import KernelInterface
 
     from ufmstar_torch.capture import Captured
@@ -91,11 +91,11 @@ def test_capture_keeps_the_state_in_place(monkeypatch):
     )
 
     config = UfMStarConfig(segment=SPGF, backend="triton", on_bad_frame="skip", initial_capacity=16, max_components=16)
-    given = [frame[:3] for frame in walks(1, 2, SIZE)]
+    inputs = [frame[:3] for frame in walks(1, 2, SIZE)]
     ufm, plain = UfMStar(config), UfMStar(config)
-    captured = Captured(ufm, *given[0], record=lambda run: run)
+    captured = Captured(ufm, *inputs[0], record=lambda run: run)
     memory = ufm.mean
-    for i, frame in enumerate(given):
+    for i, frame in enumerate(inputs):
         if i == 1:
             ufm.reset()
             plain.reset()
@@ -107,20 +107,20 @@ def test_capture_keeps_the_state_in_place(monkeypatch):
         assert ufm.mean is memory
     assert torch.equal(ufm.frames, plain.frames)
     with pytest.raises(ValueError, match="depth must be as at the capture"):
-        captured(given[0][0][:, :5], *given[0][1:])
+        captured(inputs[0][0][:, :5], *inputs[0][1:])
     with pytest.raises(ValueError, match=r"a capture needs on_bad_frame='skip'.*a mixture that grows"):
-        Captured(UfMStar(UfMStarConfig(backend="triton")), *given[0])
+        Captured(UfMStar(UfMStarConfig(backend="triton")), *inputs[0])
 
 
 def test_what_the_limit_leaves_without_a_slot_counts_as_dropped():
-    """The CPU counts it in its own frame; here it may have waited for the next one."""
+    """The CPU counts a dropped component in its frame; the GPU may count it in the next frame."""
     dropped = {}
     for backend, device in (("numba", "cpu"), ("triton", DEVICE)):
         ufm = UfMStar(UfMStarConfig(segment=SPGF, backend=backend, initial_capacity=2, max_components=3))
         outputs = [ufm(*(v.to(device) for v in frame[:3])) for frame in walks(1, 2)]
         dropped[backend] = [int(out.statistics.dropped) for out in outputs]
         assert int(ufm.mixture.components) == 3
-    assert dropped["triton"][0] == 0 < dropped["numba"][0], "the first frame was to wait"
+    assert dropped["triton"][0] == 0 < dropped["numba"][0], "components of the first frame must wait"
     assert sum(dropped["triton"]) == sum(dropped["numba"])
 
 

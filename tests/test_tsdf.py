@@ -1,4 +1,4 @@
-"""The example of a TSDF: weights choose between views, and a run of perfect depth has a small error."""
+"""The example tsdf.py: weighted averages of views, and a small error for a run with exact depth."""
 
 from __future__ import annotations
 

@@ -85,9 +85,9 @@ def test_every_package_of_an_extra_is_known():
 def test_what_is_missing_without_extras_is_named():
     script = f"EXTRAS = {set(EXTRAS)}\n{BARE}"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=200, check=False)
-    said = done.stdout + done.stderr
-    assert done.returncode == 0, said
-    assert "tensor(" in said, said
+    output = done.stdout + done.stderr
+    assert done.returncode == 0, output
+    assert "tensor(" in output, output
     for who, package, extra in (
         ("trajectory ufmstar_torch.eval.sequences.read_trajectory", "scipy", "eval"),
         ("hugging_face", "transformers", "models"),
@@ -96,15 +96,15 @@ def test_what_is_missing_without_extras_is_named():
         ("ufmstar rank: failed: this command", r"\w+", "eval"),
         ("metrics ufmstar_torch.eval.metrics.mean_and_ci", "torchmetrics", "eval"),
     ):
-        (line,) = (line for line in said.splitlines() if line.startswith(who))
+        (line,) = (line for line in output.splitlines() if line.startswith(who))
         assert re.search(rf"needs the package {package}: pip install 'ufmstar-torch\[{extra}\]'", line), line
-    assert "chosen [1, 0] True" in said, said
-    assert "corners landmarks of images need OpenCV: pip install 'ufmstar-torch[eval]'" in said
+    assert "chosen [1, 0] True" in output, output
+    assert "corners landmarks of images need OpenCV: pip install 'ufmstar-torch[eval]'" in output
 
 
 @pytest.mark.slow
 def test_a_type_checker_knows_what_a_call_returns_and_accepts_the_short_examples(tmp_path):
-    """Strictly, against the package as a wheel has it."""
+    """mypy --strict, with the package as in a wheel."""
     package = tmp_path / "ufmstar_torch"
     package.mkdir()
     for part in [*(ROOT / "ufmstar_torch").iterdir(), *(ROOT / name for name in ("models", "eval", "train"))]:
@@ -115,10 +115,10 @@ def test_a_type_checker_knows_what_a_call_returns_and_accepts_the_short_examples
         example = Path(shutil.copy(ROOT / "examples" / name, tmp_path))
         assert len([line for line in example.read_text().splitlines() if line]) < 60, name
     mypy = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "own.py", *names]
-    said = subprocess.run(mypy, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
-    assert 'own.py:7: note: Revealed type is "ufmstar_torch.pipeline.UncertainPrediction"' in said, said
-    assert 'own.py:8: note: Revealed type is "torch._tensor.Tensor"' in said, said
-    assert "own.py:9: error: Too few arguments" in said, said
-    assert 'own.py:10: error: Argument "mode"' in said, said
-    assert 'own.py:10: error: Argument "anchors"' in said, said
-    assert said.count("error:") == 3, said
+    output = subprocess.run(mypy, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
+    assert 'own.py:7: note: Revealed type is "ufmstar_torch.pipeline.UncertainPrediction"' in output, output
+    assert 'own.py:8: note: Revealed type is "torch._tensor.Tensor"' in output, output
+    assert "own.py:9: error: Too few arguments" in output, output
+    assert 'own.py:10: error: Argument "mode"' in output, output
+    assert 'own.py:10: error: Argument "anchors"' in output, output
+    assert output.count("error:") == 3, output

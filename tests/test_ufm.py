@@ -1,4 +1,4 @@
-"""UfM, the pointwise baseline, against loops written from its description, closed forms and properties."""
+"""UfM, the point-cloud baseline: against loops written from its description, closed forms and properties."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ K = torch.tensor(K_)
 
 
 def variances(seed=0):
-    """A per frame [H, W] [m^2], with a few entries that no network should hand over."""
+    """A per frame [H, W] [m^2], with a few invalid entries."""
     rng = np.random.default_rng(seed)
     maps = [np.exp(rng.normal(-4, 1, (H, W))) for _ in range(FRAMES)]
     for map_ in maps:
@@ -43,7 +43,7 @@ def expected(oracle, i, s2, pose=None):
 
 
 def agree(ufm, oracle, tolerance=1e-9):
-    """The points, in order, against the oracle's (which stand in the present camera)."""
+    """Compare the points, in order, with the oracle's, which are in the current camera frame."""
     cloud, T = ufm.cloud, np.linalg.inv(oracle.pose) @ ufm.T_world_first[0].numpy()
     mean = cloud.mean.numpy() @ T[:3, :3].T + T[:3, 3]
     cov = T[:3, :3] @ cloud.covariance.numpy() @ T[:3, :3].T
@@ -75,7 +75,7 @@ def test_single_precision_stays_close_to_double():
     single, double = UfM(), UfM(dtype=torch.float64)
     for i, s2 in enumerate(variances()):
         a, b = single(*frame(i, s2, torch.float32)), double(*frame(i, s2))
-    # A landing point within 1e-6 px of a border may go either way: hardly any pixel.
+    # A projection within 1e-6 px of a pixel border may be rounded either way; this affects few pixels.
     close = torch.isclose(a.variance.double(), b.variance, rtol=1e-3, atol=1e-6, equal_nan=True)
     assert close.double().mean() > 0.99
     assert a.variance.dtype == torch.float32
@@ -85,7 +85,7 @@ def test_single_precision_stays_close_to_double():
 
 
 def still(depth, s2, frames, K=None):
-    """A camera that does not move; constant maps or [H, W] arrays, one per frame."""
+    """A resting camera with one constant or one map [H, W] per frame."""
     ufm = UfM(dtype=torch.float64)
     K = K if K is not None else torch.tensor(scenes.intrinsics(4, 6))
     for n in range(frames):
@@ -123,12 +123,12 @@ def test_halves_are_rounded_to_even():
     ufm(plane(1.0), moved(0.5), K1)
     assert ufm.cloud.count.tolist() == [2, 2, 2, 2, 1, 1]
     x = ufm.cloud.mean[4:, 0]
-    assert x.tolist() == [1.5, 3.5], "columns 1 and 3 met nobody"
+    assert x.tolist() == [1.5, 3.5], "no point lands on columns 1 and 3"
 
 
 def test_points_out_of_view_are_pruned_first_and_the_oldest_of_them():
     ufm = UfM(9, dtype=torch.float64)
-    for x in (0.0, 100.0, 200.0):  # three views that share nothing, of four points each
+    for x in (0.0, 100.0, 200.0):  # three disjoint views of four points each
         ufm(plane(1.0), moved(x), K1)
     assert ufm.cloud.mean[:, 0].tolist() == [3, 100, 101, 102, 103, 200, 201, 202, 203]
     ufm(plane(1.0), moved(0.0), K1)  # the oldest is in view again, the others are not
@@ -202,13 +202,13 @@ def test_reset_forgets_all_frames():
 @given(seed=st.integers(0, 10**6), world=st.integers(0, 10**6))
 def test_the_world_frame_does_not_matter(seed, world):
     rng = np.random.default_rng(world)
-    T = scenes.look(rng.normal(0, 50, 3), rng.uniform(-3, 3), rng.uniform(-1, 1))
+    T = scenes.camera_pose(rng.normal(0, 50, 3), rng.uniform(-3, 3), rng.uniform(-1, 1))
     start = seed % (FRAMES - 4)
-    here, present = UfM(dtype=torch.float64), UfM(dtype=torch.float64)
+    original, shifted = UfM(dtype=torch.float64), UfM(dtype=torch.float64)
     for i in range(start, start + 4):
         depth, pose, intrinsics = frame(i)
-        a = here(depth, pose, intrinsics, torch.full_like(depth, 0.01)).variance
-        b = present(depth, torch.tensor(T) @ pose, intrinsics, torch.full_like(depth, 0.01)).variance
+        a = original(depth, pose, intrinsics, torch.full_like(depth, 0.01)).variance
+        b = shifted(depth, torch.tensor(T) @ pose, intrinsics, torch.full_like(depth, 0.01)).variance
     assert torch.isclose(a, b, atol=1e-8, equal_nan=True).double().mean() > 0.99  # roundings to a pixel may differ
 
 

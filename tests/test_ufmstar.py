@@ -25,7 +25,7 @@ VARIANTS = {
 
 
 class Products(TorchDispatchMode):
-    """The matrix products that run: BLAS chooses their order of summation by shape and processor."""
+    """Records matrix products: BLAS chooses their order of summation by shape and processor."""
 
     def __init__(self):
         super().__init__()
@@ -39,7 +39,7 @@ class Products(TorchDispatchMode):
 
 
 class Trace:
-    """An observer that writes down what it is called with."""
+    """An observer that records its arguments."""
 
     def __init__(self):
         self.events = []
@@ -83,11 +83,11 @@ def test_no_matrix_product_in_a_step(backend, variant):
 
 def test_rigid_motion_of_the_world_changes_nothing():
     depths, poses, K = scenes.sequence(10, HEIGHT, WIDTH, 0.04)
-    world = scenes.look((512.0, -64.0, 2048.0), 0.7, -0.4)
+    world = scenes.camera_pose((512.0, -64.0, 2048.0), 0.7, -0.4)
     config = CONFIG
-    _, here = run(config, depths, poses, K)
-    ufm, present = run(config, depths, [world @ T for T in poses], K)
-    for a, b in zip(here, present, strict=True):
+    _, original = run(config, depths, poses, K)
+    ufm, shifted = run(config, depths, [world @ T for T in poses], K)
+    for a, b in zip(original, shifted, strict=True):
         torch.testing.assert_close(a.variance, b.variance, rtol=0, atol=1e-10, equal_nan=True)
     points = torch.tensor([[[0.1, 0.2, 2.0]]], dtype=torch.float64)
     moved = torch.einsum("ij,bnj->bni", torch.tensor(world[:3, :3] @ poses[0][:3, :3]), points) + torch.tensor(
@@ -103,9 +103,9 @@ def test_kilometres_from_the_origin_float32_loses_nothing():
     far = np.eye(4)
     far[:3, 3] = 4.5e6, -3.2e6, 120.0  # easting and northing of a map projection
     config = CONFIG
-    _, here = run(config, depths, poses, K, dtype=torch.float32)
-    _, present = run(config, depths, [far @ T for T in poses], K, dtype=torch.float32)
-    for a, b in zip(here, present, strict=True):
+    _, near = run(config, depths, poses, K, dtype=torch.float32)
+    _, distant = run(config, depths, [far @ T for T in poses], K, dtype=torch.float32)
+    for a, b in zip(near, distant, strict=True):
         torch.testing.assert_close(a.std, b.std, rtol=0, atol=1e-4, equal_nan=True)
 
 
@@ -115,7 +115,7 @@ def test_identical_views_do_not_disagree(backend):
     ufm, outputs = run(CONFIG.replace(backend=backend), depths * 5, poses * 5, K, torch.float32)
     assert outputs[-1].statistics.new.item() == 0
     assert outputs[-1].statistics.matched.item() == outputs[-1].statistics.segments.item()
-    same = ufm.mixture.count == 5  # matched with themselves only; others met a neighbour that overlaps them
+    same = ufm.mixture.count == 5  # matched with themselves only; the others also match an overlapping neighbour
     assert same.sum() >= 3
     assert ufm.mixture.disagreement[same].max() < 1e-12
     valid = outputs[-1].valid
@@ -123,7 +123,7 @@ def test_identical_views_do_not_disagree(backend):
 
 
 def test_more_depth_noise_more_disagreement():
-    """Seen from one place, where segments do not slide: M and the mixture's m both rise with the noise."""
+    """From a fixed pose, where segments do not slide, M and the mixture's m rise with the noise."""
     K, T = scenes.intrinsics(HEIGHT, WIDTH), scenes.tour(30)[0]
     exact = scenes.render(T, K, HEIGHT, WIDTH)
     dense, stored = [], []
@@ -139,7 +139,7 @@ def test_more_depth_noise_more_disagreement():
 
 def test_a_place_never_seen_starts_afresh():
     depths, poses, K = scenes.sequence(4, HEIGHT, WIDTH, 0.04)
-    elsewhere = [poses[0], poses[1], scenes.look((500.0, 0, 300.0), 2.0), poses[3]]
+    elsewhere = [poses[0], poses[1], scenes.camera_pose((500.0, 0, 300.0), 2.0), poses[3]]
     _, outputs = run(CONFIG.replace(ema_alpha=1.0), depths, elsewhere, K)
     jump = outputs[2]
     assert jump.statistics.matched.item() == 0
@@ -153,12 +153,12 @@ def test_total_variance(which):
     a, e = torch.full((1, HEIGHT, WIDTH), 0.25).double(), torch.full((1, HEIGHT, WIDTH), 0.5).double()
     config = CONFIG.replace(add_aleatoric=which != "off", add_epistemic=which != "off")
     ufm = UfMStar(config, dtype=torch.float64)
-    given = {
+    network_variances = {
         "aleatoric": a if which in ("a", "both", "off") else None,
         "epistemic": e if which in ("e", "both", "off") else None,
     }
     for depth, T in zip(depths, poses, strict=True):
-        out = ufm(torch.tensor(depth)[None], torch.tensor(T), torch.tensor(K), **given)
+        out = ufm(torch.tensor(depth)[None], torch.tensor(T), torch.tensor(K), **network_variances)
     added = {"none": 0.0, "a": 0.25, "e": 0.5, "both": 0.75, "off": 0.0}[which]
     torch.testing.assert_close(out.variance, out.disagreement + added, equal_nan=True)
     torch.testing.assert_close(out.std, out.variance.sqrt(), equal_nan=True)
@@ -176,7 +176,7 @@ def test_variance_floor_is_off_by_default_and_leaves_nan():
 
 
 def test_identical_near_and_fine_views_do_not_disagree():
-    """A checkerboard of small near tiles: segments a few centimetres wide are matched with themselves only."""
+    """A checkerboard of small near tiles: segments a few centimetres wide match themselves only."""
     v, u = torch.meshgrid(torch.arange(240), torch.arange(320), indexing="ij")
     depth = torch.where((v // 24 + u // 32) % 2 == 0, 0.45, 0.65)[None]
     ufm = UfMStar(UfMStarConfig(segment=SPGFConfig.preset("tum"), unmeasured="paper"))

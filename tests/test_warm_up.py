@@ -1,4 +1,4 @@
-"""Compilation: before the first frame, kept on disk, through numba's private parts."""
+"""Compilation before the first frame, cached on disk, with numba's private API."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def summed(values):
 
 
 def compiled_function():
-    """A new kernel of which no cache has a copy, with a part and a leaf."""
+    """A new, uncached kernel that calls a function, which calls another."""
     names: dict = {"shifted": shifted, "summed": summed}
     exec("def both(n):\n    rows = shifted(n, 1)\n    return summed(rows[0]), rows", names)
     return kernel(names["both"])
@@ -135,7 +135,7 @@ def test_a_cold_start_compiles_all_and_a_warm_one_nothing(tmp_path):
 
 @pytest.fixture
 def hits(tmp_path):
-    """Defines a kernel anew and calls it; returns how often it was found on disk."""
+    """Define a kernel again and call it; return the number of cache hits."""
     path = tmp_path / "one_kernel.py"
     path.write_text(
         "from ufmstar_torch.kernels.compile_cpu import kernel\n\n\n@kernel\ndef plus_one(x):\n    return x + 1\n"

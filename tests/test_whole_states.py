@@ -1,4 +1,5 @@
-"""A state is whole: as it was where a frame raises or a saved state is refused, also when warnings are errors."""
+"""A state stays consistent: it is unchanged if a frame raises or a saved state is refused, also if warnings are
+errors."""
 
 from __future__ import annotations
 
@@ -21,12 +22,12 @@ KINDS = {
     "dense": {"config": UfMStarConfig(segment=SPGF, anchors=AnchorConfig()), "anchors": "dense"},
     "posterior": {"posterior": True},
 }
-# A texture that moves with the camera, so that landmarks have something to follow.
+# A texture that moves with the camera, for the landmark tracker.
 _TEXTURE = np.random.default_rng(0).integers(0, 255, (H + 8, W + 8, 3), dtype=np.uint8)
 
 
 class Warner(Recalibration):
-    """Warns once the step is through, where ``loud``."""
+    """Warns after the step if ``loud``."""
 
     loud = False
 
@@ -37,7 +38,7 @@ class Warner(Recalibration):
 
 
 class Network(nn.Module):
-    """Depth of a rendered scene: the frame's number stands in the first pixel."""
+    """Depth of a rendered scene; the image's first pixel is the frame's number."""
 
     def __init__(self):
         super().__init__()
@@ -68,8 +69,8 @@ def snapshot(model):
 
 
 def unchanged(model, before):
-    now = snapshot(model)
-    return now.keys() == before.keys() and all(same(now[n].double(), v.double()) for n, v in before.items())
+    after = snapshot(model)
+    return after.keys() == before.keys() and all(same(after[n].double(), v.double()) for n, v in before.items())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -97,7 +98,7 @@ def test_a_frame_that_raises_leaves_everything_as_it_was(kind):
 
 
 def at_end(change):
-    """The last number of a tensor replaced."""
+    """Replace the last number of a tensor."""
 
     def damaged(value):
         value = value.clone()

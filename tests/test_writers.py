@@ -174,7 +174,7 @@ def test_everything_a_summary_holds(tmp_path):
     "error", [OSError(errno.ENOSPC, "No space left on device"), OSError("9 requested and 4 written")]
 )
 def test_a_full_disk_is_reported_with_the_file(tmp_path, error):
-    """NumPy's error has no number, and neither has a name."""
+    """NumPy's error has no errno, and neither error has a file name."""
 
     def write(file):
         file.write(b"begun")

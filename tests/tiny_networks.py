@@ -11,8 +11,8 @@ from ufmstar_torch.models.preprocess import Preprocess
 
 
 class Linear(Backbone):
-    """Two channels of features, the image's first two (dropped out where asked); depth is ``offset`` plus their
-    weighted sum."""
+    """Two feature channels, the image's first two (optionally with dropout); depth is ``offset`` plus their weighted
+    sum."""
 
     feature_channels = 2
 

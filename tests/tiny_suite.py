@@ -1,4 +1,4 @@
-"""Small networks in files, rows on small sequences, and evaluations of a second: rooms of 48x64, a stub as judge."""
+"""Small networks in files, rows on small sequences, and fast evaluations: rooms of 48x64, a stub for the evaluation."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ SPECS = {
 
 
 def spec_of(method="aleatoric"):
-    """FastDepth of a twentieth of the width, 32 x 64."""
+    """FastDepth with a twentieth of the channels, input 32 x 64."""
     return NetworkSpec(
         method=method, widths=0.05, positive="softplus", size=(32, 64), preprocess="resize", **SPECS[method]
     )
 
 
 def make_networks(spec, count=2, seed=0):
-    """Networks in eval mode whose weights and statistics have moved from where they began."""
+    """Networks in eval mode with non-initial weights and statistics."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         networks = [build_network(spec) for _ in range(count)]
@@ -62,14 +62,14 @@ def make_networks(spec, count=2, seed=0):
 
 
 def write_network(path, method="aleatoric", count=1, seed=0):
-    """A file of such networks; the file."""
+    """Write such networks to a file, and return its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     save_trained(path, make_networks(spec_of(method), count, seed), spec_of(method))
     return path
 
 
 def write_networks(folder):
-    """One file for every base: {base: what a user types}."""
+    """Write one file for every base: {base: "BASE=trained:FILE"}."""
     kinds = {
         "ensemble": ("aleatoric", 3),
         "mc_dropout": ("mc_dropout", 1),
@@ -83,22 +83,22 @@ def write_networks(folder):
 
 
 def base_network(text, **options):
-    """Load the network that a user typed."""
+    """Load a network from an argument of ``--network``."""
     return NetworkChoice.parse(text).load(CPU, **options)
 
 
 def row(name, **setting):
-    """The row of a name, under a setting."""
+    """The row with this name and setting."""
     return Row(Method.parse(name), Setting(**setting))
 
 
 def rows_of(*names, **setting):
-    """The rows of some names, under one setting."""
+    """The rows with these names and one setting."""
     return tuple(row(name, **setting) for name in names)
 
 
 def evaluate(sequence, rows, networks, store=None, *, sinks=(), progress=lambda _: None, stop=lambda: False, **judge):
-    """The results of a sequence on the CPU, by the row's slug."""
+    """Evaluate a sequence on the CPU: {slug of the row: result}."""
     how = Judge(networks, CPU, store, **judge)
     results = evaluate_sequence(sequence, rows, how, sinks=sinks, progress=progress, stop=stop)
     assert [result.row for result in results] == list(rows)
@@ -108,9 +108,9 @@ def evaluate(sequence, rows, networks, store=None, *, sinks=(), progress=lambda 
 def unbatched(source, frame, n=0):
     """A source's prediction for a frame without the leading dimension."""
     maps = source.one(frame, n)
-    own = {"aleatoric": maps.aleatoric_variance, "epistemic": maps.epistemic_variance}
-    own = {name: None if value is None else value[0] for name, value in own.items()}
-    return SimpleNamespace(depth=maps.depth[0], intrinsics=maps.K[0], size=maps.size, **own)
+    variances = {"aleatoric": maps.aleatoric_variance, "epistemic": maps.epistemic_variance}
+    variances = {name: None if value is None else value[0] for name, value in variances.items()}
+    return SimpleNamespace(depth=maps.depth[0], intrinsics=maps.K[0], size=maps.size, **variances)
 
 
 def same(one, other):
@@ -126,7 +126,7 @@ def same(one, other):
 
 
 class Biased:
-    """The truth, but what is farther than 2 m is put 40 % too far; as much of a ``DepthSource`` as is asked of it."""
+    """A minimal ``DepthSource``: the true depth, but 40 % too far beyond 2 m."""
 
     digest, passes, needs_image, cacheable, networks, runtime = "biased", 1, False, False, (), None
     max_depth, states_confidence = None, False
@@ -150,7 +150,7 @@ class Biased:
 
 
 def write_rooms(root, names=NAMES, frames=4):
-    """Generic sequences of the same walk; those that are there are written anew."""
+    """Write generic sequences of one walk, replacing existing ones."""
     first, _ = write_generic(root, frames, folder=names[0])
     for name in names[1:]:
         shutil.copytree(first, root / name, dirs_exist_ok=True)
@@ -158,7 +158,7 @@ def write_rooms(root, names=NAMES, frames=4):
 
 
 def job_on(root, out, **changes):
-    """The first four rows of depth alone on the sequences of a folder."""
+    """A job: the first four rows of the suite ``depth-only`` on the sequences of a folder."""
     whole = suite_named("depth-only")
     job = EvalJob(
         suite=replace(whole, rows=whole.rows[:4]),
@@ -171,10 +171,10 @@ def job_on(root, out, **changes):
 
 
 class Stub:
-    """Judges nothing: figures are numbers drawn from the names of row and sequence.
+    """Replaces the evaluation of a sequence: random figures, seeded by the names of row and sequence.
 
     Args:
-        before: called with the sequence's name and the frames that are done.
+        before: called with the sequence's name and the number of finished frames.
 
     Attributes:
         asked: (sequence, rows) of each call.
@@ -203,16 +203,16 @@ def _drawn(sequence, row):
 
 
 def go(job, evaluate=None, **how):
-    """Evaluate in this process by a judge of one sequence (None: :class:`Stub`): (outcome, lines that were
-    reported)."""
+    """Run the job in this process: (outcome, reported lines). ``evaluate`` evaluates one sequence (None:
+    :class:`Stub`)."""
     lines: list[str] = []
     with mock.patch("ufmstar_torch.eval.suite.evaluate.evaluate_sequence", evaluate or Stub()):
         outcome = evaluate_suite(job, **how, report=lines.append)
     return outcome, lines
 
 
-def kept(out):
-    """Return the figures, curves and sums by file, which depend on no process and no clock."""
+def stored_results(out):
+    """Return the stored figures, curves and sums by file; they do not depend on processes or clocks."""
     result = {}
     for path in sorted((out / "records").rglob("*.json")):
         values = json.loads(path.read_text())

@@ -36,7 +36,7 @@ def write_nyu(root, frames=6):
 
 
 class Numbered:
-    """A source whose frame i is grey i at depth i + 1; those in ``broken`` cannot be read."""
+    """A source whose frame i has grey level i and depth i + 1. Frames in ``broken`` cannot be read."""
 
     def __init__(self, length: int, broken: tuple[int, ...] = ()) -> None:
         self.length, self.broken = length, broken

@@ -1,4 +1,4 @@
-"""Trainings of a second or two: frames whose depth can be read off their brightness, and jobs on them."""
+"""Trainings of a second or two: frames whose brightness encodes the depth, and jobs on them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RECIPE = Recipe(SPEC, epochs=3, batch_size=4, learning_rate=0.01, average=0.9, c
 
 
 def scenes(count, size=SIZE, noisy=False):
-    """Images [N, H, W, 3] uint8, their depth [N, H, W] [m], where it is missing, and which half of the image is red.
+    """Images [N, H, W, 3] uint8, their depth [N, H, W] [m], the mask of missing depth, and the mask of the red half.
 
     Depth is smooth, 1 to 3 m, the image's grey 80 times the depth; a fifth of the depth is missing. If ``noisy``, the
     right half of even images and the left one of odd ones is red, the other half has no red.
@@ -62,7 +62,7 @@ def tiny_job(frames, out, recipe=RECIPE, augment=True, **settings):
 
 
 def logged(out, name, member=0):
-    """The logged values of a name, in the order of their steps, over all sessions of a training."""
+    """All logged values of a metric, in the order of their steps, over all sessions of a training."""
     found = []
     for file in sorted((out / f"member_{member}").glob("version_*/metrics.csv")):
         with file.open(newline="") as rows:
@@ -71,5 +71,5 @@ def logged(out, name, member=0):
 
 
 def with_network(recipe=RECIPE, **changes):
-    """The recipe with another network."""
+    """The recipe with changed settings of the network."""
     return replace(recipe, network=replace(recipe.network, **changes))

@@ -1,8 +1,7 @@
-"""Every Triton kernel compiled for an H100 without one: a program of its own, started by tests/test_kernels.py.
+"""Compiles every Triton kernel for an H100, without a GPU. tests/test_kernels.py runs this program.
 
-The Python functions run on CPU tensors, with launches replaced by compilation: a kernel is compiled for the very
-arguments that it would be launched with. Nothing runs, so the results hold no values.
-"""
+The Python functions run on CPU tensors, with launches replaced by compilation for the launch's arguments. No kernel
+runs, so the results are undefined."""
 
 from __future__ import annotations
 
@@ -37,16 +36,16 @@ TYPES = {
 OPTIONS = ("num_warps", "enable_fp_fusion")
 
 
-def compiled(kernel: Any, arguments: tuple[Any, ...], known: dict[str, Any]) -> Any:
-    """The kernel compiled for a launch with these arguments."""
-    options = {name: known.pop(name) for name in OPTIONS if name in known}
+def compiled(kernel: Any, arguments: tuple[Any, ...], constants: dict[str, Any]) -> Any:
+    """Compile a kernel for a launch with these arguments."""
+    options = {name: constants.pop(name) for name in OPTIONS if name in constants}
     names = [p.name for p in kernel.params]
-    given = dict(zip(names, arguments, strict=False))
-    signature = {n: TYPES[v.dtype] if isinstance(v, torch.Tensor) else "i32" for n, v in given.items()}
-    assert all(isinstance(v, torch.Tensor | int) for v in given.values()), "a float would arrive as float32"
-    known |= {n: 1 for n, v in given.items() if isinstance(v, int) and v == 1}  # as a launch does
-    signature |= dict.fromkeys(known, "constexpr")
-    source = ASTSource(fn=kernel, signature={n: signature[n] for n in names}, constexprs=known)
+    by_name = dict(zip(names, arguments, strict=False))
+    signature = {n: TYPES[v.dtype] if isinstance(v, torch.Tensor) else "i32" for n, v in by_name.items()}
+    assert all(isinstance(v, torch.Tensor | int) for v in by_name.values()), "a float would arrive as float32"
+    constants |= {n: 1 for n, v in by_name.items() if isinstance(v, int) and v == 1}  # as a launch does
+    signature |= dict.fromkeys(constants, "constexpr")
+    source = ASTSource(fn=kernel, signature={n: signature[n] for n in names}, constexprs=constants)
     return triton.compile(source, target=TARGET, options=options)
 
 
@@ -57,8 +56,8 @@ def usage(cubin: bytes) -> str:
         file.write(cubin)
         file.flush()
         command = [str(tool), "-res-usage", file.name]
-        said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    return " ".join(re.findall(r"(?:REG|STACK|SHARED):\d+", said))
+        output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return " ".join(re.findall(r"(?:REG|STACK|SHARED):\d+", output))
 
 
 SIZE = (37, 52)
@@ -80,7 +79,7 @@ def cases() -> dict[str, Callable[[], object]]:
     def bits() -> None:
         previous, new = correspond.candidates(m.to(torch.float32), still, current, K.contiguous(), SIZE, config)
         words, _ = correspond.match_bits(previous, new, config, torch.zeros(2, dtype=torch.int64))
-        matches = words, new.index, previous.place, new.count
+        matches = words, new.index, previous.position, new.count
         fuse.fuse_bits(m.to(torch.float32), current, still, matches, config)
 
     def device(streams: int = 2, **settings: Any) -> None:
@@ -102,7 +101,7 @@ def cases() -> dict[str, Callable[[], object]]:
         )  # fmt: skip
 
     values = depth, torch.eye(4).double().expand(2, 4, 4), K, depth, depth, depth[:, None], depth > 0
-    given = SegmentInput.of(depth, K, config.segment, depth[:, None])
+    segment_input = SegmentInput.of(depth, K, config.segment, depth[:, None])
     return {
         "regress": lambda: regress.regress_image(m, depth, K, depth > 0, config),
         "regress_subset": lambda: regress.regress_image(
@@ -113,7 +112,7 @@ def cases() -> dict[str, Callable[[], object]]:
         "fuse": lambda: fuse.fuse(m, current, pairs, config.replace(overlap_weighted=True)),
         "check": lambda: check.check_values(*values, rotation_tolerance=0.01, max_depth=20.0),
         "floor": lambda: fuse.floor_covariance(m.covariance, m.weight),
-        "segment": lambda: segment.segment(given),
+        "segment": lambda: segment.segment(segment_input),
         "device": device,
         "device_one": lambda: device(1),
         "device_relative": lambda: device(unmeasured="relative"),
@@ -125,11 +124,11 @@ def main() -> None:
     seen = {}
 
     def compile_instead(kernel: Any, grid: tuple[int, ...]) -> Any:
-        def launch(*arguments: Any, **known: Any) -> None:
+        def launch(*arguments: Any, **constants: Any) -> None:
             dtypes = tuple(a.dtype if isinstance(a, torch.Tensor) else int for a in arguments)
-            key = (kernel.__name__, dtypes, tuple(sorted(known.items())))
+            key = (kernel.__name__, dtypes, tuple(sorted(constants.items())))
             if key not in seen:
-                seen[key] = compiled(kernel, arguments, known)
+                seen[key] = compiled(kernel, arguments, constants)
                 note = usage(seen[key].asm["cubin"]) if "-v" in sys.argv else ""
                 print("compiled", kernel.__name__, note, flush=True)
 

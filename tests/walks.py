@@ -1,4 +1,4 @@
-"""Small rendered walks that several tests share, and the oracle's run over one of them."""
+"""Small rendered walks for several tests, and the oracle's result on one of them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def oracle_settings(config: SPGFConfig) -> oracle.Segmentation:
 
 
 def walks(streams, frames=8, size=(HEIGHT, WIDTH)):
-    """Rendered sequences of ``streams`` cameras with anchors: the arguments of every frame, batched over streams."""
+    """Rendered sequences of ``streams`` cameras with anchors: the arguments of every frame, batched."""
     rng = np.random.default_rng(0)
     data = [scenes.sequence(frames, *size, 0.03 * (s + 1), seed=s) for s in range(streams)]
     K = torch.tensor(np.stack([scenes.intrinsics(*size, 60 + 5 * s) for s in range(streams)]))
@@ -50,7 +50,7 @@ def walks(streams, frames=8, size=(HEIGHT, WIDTH)):
 
 
 def walk(config, frames, streams=slice(None)):
-    """The outputs for some of the streams, and the module."""
+    """Run a walk for a subset of the streams: the outputs and the module."""
     ufm, outputs = UfMStar(config), []
     for depth, pose, K, anchors in frames:
         parts = [anchors.pixel, anchors.depth, anchors.variance]

@@ -121,10 +121,10 @@ class TrainOptions:
     def job(self) -> Job:
         """The training that the options mean. Raises ValueError: an option is missing, options contradict each other,
         or a value is impossible."""
-        d, s, own = self.source, self.session, self.own
-        if self.preset is not None and own.backbone is not None:
+        d, s, chosen = self.source, self.session, self.own
+        if self.preset is not None and chosen.backbone is not None:
             raise ValueError("--preset and --backbone contradict each other")
-        recipe = None if own.backbone is not None else self.recipe()
+        recipe = None if chosen.backbone is not None else self.recipe()
         if d.data is None or self.out is None:
             raise ValueError(f"--{'data' if d.data is None else 'out'} is missing; ufmstar train --help")
         if self.resume and self.overwrite:
@@ -144,14 +144,14 @@ class TrainOptions:
             return Job(recipe, data, settings)
         from ufmstar_torch.train.own_network import own_job
 
-        assert own.backbone is not None
+        assert chosen.backbone is not None
         how: dict[str, Any] = {
-            "fine_tune": own.fine_tune,
-            "features": own.features,
-            "spec": own.spec,
+            "fine_tune": chosen.fine_tune,
+            "features": chosen.features,
+            "spec": chosen.spec,
             "network": self.changes.network,
         }
-        return own_job(own.backbone, own.head, data, settings, members=self.members, **how, **self.changes.recipe)
+        return own_job(chosen.backbone, chosen.head, data, settings, members=self.members, **how, **self.changes.recipe)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -72,8 +72,8 @@ class TrainingModule(pl.LightningModule):
     @property
     def result(self) -> DepthNetwork:
         """The network to keep: the running mean if there is one."""
-        kept: DepthNetwork = self.network if self.averaged is None else self.averaged
-        return kept
+        judged: DepthNetwork = self.network if self.averaged is None else self.averaged
+        return judged
 
     # ---- training ----
 

@@ -114,7 +114,12 @@ class UncertaintyCallback(pl.Callback):
             return
         judged = judge_network(self._network(pl_module), self._sequences, device=pl_module.device, **self._how)
         figures = {row: metrics.compute() for row, metrics in judged.items()}
-        logged = {f"{row}/{name}": own[name] for row, own in figures.items() for name in LOGGED if name in own}
+        logged = {
+            f"{row}/{name}": row_figures[name]
+            for row, row_figures in figures.items()
+            for name in LOGGED
+            if name in row_figures
+        }
         pl_module.log_dict(logged, rank_zero_only=True)
         curves = {name: metrics.curves() for name, metrics in judged.items() if metrics.with_variance}
         if curves:

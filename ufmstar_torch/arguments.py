@@ -130,8 +130,10 @@ def _of_intrinsics(values: Tensor) -> bool:
 
 def _camera(value: object) -> PinholeCamera | None:
     """A camera of kornia, which need not be imported for that; None: something else."""
-    known = any(cls.__name__ == "PinholeCamera" and cls.__module__.startswith("kornia.") for cls in type(value).__mro__)
-    return cast("PinholeCamera", value) if known else None
+    is_kornia = any(
+        cls.__name__ == "PinholeCamera" and cls.__module__.startswith("kornia.") for cls in type(value).__mro__
+    )
+    return cast("PinholeCamera", value) if is_kornia else None
 
 
 def _numbers(name: str, value: object) -> Tensor:

@@ -46,8 +46,8 @@ class Captured:
         _require_fixed(ufm)
         if record is None and depth.device.type != "cuda":
             raise ValueError(f"depth must lie on a CUDA device to be captured, got {depth.device}")
-        given = (depth, pose, intrinsics, aleatoric, epistemic, valid)
-        self._inputs = tuple(None if v is None else v.detach().to(depth.device, copy=True) for v in given)
+        frame = (depth, pose, intrinsics, aleatoric, epistemic, valid)
+        self._inputs = tuple(None if v is None else v.detach().to(depth.device, copy=True) for v in frame)
         self._ufm = ufm
         shape = (depth.shape[0], *depth.shape[-2:])
         with torch.no_grad():
@@ -71,14 +71,16 @@ class Captured:
             ValueError: another number of arguments, or a shape or dtype other than at the capture.
         """
         absent = (None,) * (len(self._inputs) - len(frame))
-        for name, own, new in zip(_NAMES, self._inputs, (*frame, *absent), strict=True):
-            if (own is None) != (new is None) or (own is not None and new is not None and own.shape != new.shape):
-                raise ValueError(f"{name} must be as at the capture, {_shape(own)}, got {_shape(new)}")
+        for name, buffer, new in zip(_NAMES, self._inputs, (*frame, *absent), strict=True):
+            if (buffer is None) != (new is None) or (
+                buffer is not None and new is not None and buffer.shape != new.shape
+            ):
+                raise ValueError(f"{name} must be as at the capture, {_shape(buffer)}, got {_shape(new)}")
         if self._ufm.mean is not self._state["mean"]:
             self._take_over()
-        for own, new in zip(self._inputs, frame, strict=False):
-            if own is not None and new is not None:
-                own.copy_(new, non_blocking=True)
+        for buffer, new in zip(self._inputs, frame, strict=False):
+            if buffer is not None and new is not None:
+                buffer.copy_(new, non_blocking=True)
         self._replay()
         return self._out
 
@@ -102,7 +104,7 @@ class Captured:
             self._restart()
         else:
             new = self._ufm.state.tensors()
-            if any(new[n].shape != own.shape for n, own in self._state.items()):
+            if any(new[n].shape != buffer.shape for n, buffer in self._state.items()):
                 raise ValueError("the module's state has another shape than at the capture: capture again")
             for name, value in new.items():
                 self._state[name].copy_(value)

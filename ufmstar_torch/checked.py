@@ -74,10 +74,10 @@ class Checked:
         Raises:
             ValueError: an unknown key, a field without default that is missing, or an impossible value.
         """
-        known = {f.name: f for f in fields(cls)}
-        if unknown := sorted(set(values) - set(known)):
-            raise ValueError(f"{cls.__name__} has no {unknown}; it has {list(known)}")
-        needed = [n for n, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
+        by_name = {f.name: f for f in fields(cls)}
+        if unknown := sorted(set(values) - set(by_name)):
+            raise ValueError(f"{cls.__name__} has no {unknown}; it has {list(by_name)}")
+        needed = [n for n, f in by_name.items() if f.default is MISSING and f.default_factory is MISSING]
         if missing := [name for name in needed if name not in values]:
             raise ValueError(f"{cls.__name__} needs {missing}")
         return cls(**{name: _rich(cls, name, value) for name, value in values.items()})
@@ -118,16 +118,16 @@ class Checked:
         changes: dict[str, Any] = {}
         within: dict[str, dict[str, Any]] = {}
         for name, value in values.items():
-            group, _, own = name.partition(".")
-            if own:
-                within.setdefault(group, {})[own] = value
+            group, _, field_name = name.partition(".")
+            if field_name:
+                within.setdefault(group, {})[field_name] = value
             else:
                 changes[name] = value
-        known = {f.name: f for f in fields(self)}
-        if unknown := sorted((changes.keys() | within.keys()) - known.keys()):
-            raise ValueError(f"{type(self).__name__} has no {unknown}; it has {list(known)}")
+        by_name = {f.name: f for f in fields(self)}
+        if unknown := sorted((changes.keys() | within.keys()) - by_name.keys()):
+            raise ValueError(f"{type(self).__name__} has no {unknown}; it has {list(by_name)}")
         for group, inner in within.items():
-            kind = known[group].metadata.get("section")
+            kind = by_name[group].metadata.get("section")
             if kind is None:
                 raise ValueError(f"{type(self).__name__}.{group} is no section, got {group}.{next(iter(inner))}")
             start = changes.get(group, getattr(self, group))

@@ -40,10 +40,10 @@ def choose(
         raise ValueError(f"scores must be [N], got {tuple(score.shape)}")
     left = torch.where(score.isnan(), -torch.inf, score)
     scored = left > -torch.inf
-    known = int(scored.sum())
+    scored_count = int(scored.sum())
     if count is not None and not (isinstance(count, int) and 0 <= count <= len(score)):
         raise ValueError(f"count must lie in 0 to the number of images {len(score)}, got {count}")
-    count = known if count is None else min(count, known)
+    count = scored_count if count is None else min(count, scored_count)
     if poses is None:
         order: list[int] = left.argsort(descending=True, stable=True)[:count].tolist()
         return order

@@ -75,9 +75,9 @@ class Learnt:
 
     def added(self, c: Tensor, y: Tensor, w: Tensor, limit: int) -> Learnt:
         """With the anchors of a frame [B, n], of which at most ``limit`` are taken, evenly; the oldest go."""
-        taken = evenly(w > 0, limit)
+        chosen = evenly(w > 0, limit)
         pairs = ((self.c, c), (self.y, y), (self.w, w))
-        every = [torch.cat([own, torch.where(taken, new, 0)], 1) for own, new in pairs]
+        every = [torch.cat([old, torch.where(chosen, new, 0)], 1) for old, new in pairs]
         order = (every[2] > 0).to(torch.int8).argsort(dim=1, stable=True)[:, c.shape[1] :]
         return replace(self, **dict(zip("cyw", (value.gather(1, order) for value in every), strict=True)))
 
@@ -110,9 +110,9 @@ def factors(learnt: Learnt, config: ConfidenceConfig) -> tuple[Tensor, Tensor, T
 
     Bin k holds the c with k edges at or below it. The edges are the anchors at equal steps of the rank.
     """
-    known, bins = learnt.w > 0, config.bins
-    ordered = torch.where(known, learnt.c, torch.inf).sort(1).values
-    step = torch.arange(1, bins, device=ordered.device) * known.sum(1, keepdim=True) // bins
+    learnt_from, bins = learnt.w > 0, config.bins
+    ordered = torch.where(learnt_from, learnt.c, torch.inf).sort(1).values
+    step = torch.arange(1, bins, device=ordered.device) * learnt_from.sum(1, keepdim=True) // bins
     edges = ordered.gather(1, step)
     at = torch.searchsorted(edges.contiguous(), learnt.c.contiguous(), right=True)
     w, wy = (torch.zeros_like(ordered[:, :bins]).scatter_add(1, at, v) for v in (learnt.w, learnt.w * learnt.y))
@@ -177,11 +177,11 @@ class ConfidenceFrame(FrameExtension):
         assert anchors is not None
         c = self._c.flatten(1).gather(1, anchors.index).to(dtype)
         V = variance.detach().flatten(1).gather(1, anchors.index).double()
-        known = anchors.valid & V.isfinite() & (V > 0) & ~c.isnan()
-        V = torch.where(known, V, torch.ones_like(V))
+        usable = anchors.valid & V.isfinite() & (V > 0) & ~c.isnan()
+        V = torch.where(usable, V, torch.ones_like(V))
         spread = V + anchors.variance
         y = ((anchors.depth - anchors.predicted).square() / spread).clamp_max(self._config.largest).to(dtype)
-        w = torch.where(known, (V / spread).square(), torch.zeros_like(V)).to(dtype)
+        w = torch.where(usable, (V / spread).square(), torch.zeros_like(V)).to(dtype)
         edges, h, one = factors(learnt, self._config)
         likelihood = [-0.5 * (y / f + f.log()) for f in (read(c, edges, h), torch.ones_like(one), one)]
         weight = w.sum(1)
@@ -216,23 +216,31 @@ class ConfidenceExtension(Extension):
             raise ValueError("confidence holds impossible errors, weights or gains")
 
     def of_frame(
-        self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool
+        self,
+        frame: FrameInput,
+        network_variances: Sequence[Tensor],
+        argument: Any,
+        before: Sequence[FrameExtension],
+        *,
+        dense: bool,
     ) -> FrameExtension:
         """Without a confidence it does nothing; of a subset of pixels it applies what was learnt, and learns nothing.
 
         Raises:
             TypeError, ValueError: ``confidence`` is no map of the depth's shape.
         """
-        if given is None:
+        if argument is None:
             return FrameExtension()
         of_anchors = [one for one in before if isinstance(one, AnchorFrame)] if dense else []
-        return ConfidenceFrame(as_confidence(given, frame), of_anchors[0] if of_anchors else None, frame, self._config)
+        return ConfidenceFrame(
+            as_confidence(argument, frame), of_anchors[0] if of_anchors else None, frame, self._config
+        )
 
 
-def as_confidence(given: Any, frame: FrameInput) -> Tensor:
+def as_confidence(values: Any, frame: FrameInput) -> Tensor:
     """[B, H, W] float32, as large as finite numbers are. Raises TypeError, ValueError: it is no map of the depth's
     shape."""
     size = tuple(frame.depth.shape)
-    c = require_float("confidence", given, [size, (size[0], 1, *size[1:])], frame.depth).detach()
+    c = require_float("confidence", values, [size, (size[0], 1, *size[1:])], frame.depth).detach()
     limit = torch.finfo(torch.float32).max
     return c.reshape(size).float().clamp(-limit, limit)

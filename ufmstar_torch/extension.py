@@ -121,19 +121,25 @@ class Extension:
         return {}
 
     def of_frame(
-        self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool
+        self,
+        frame: FrameInput,
+        network_variances: Sequence[Tensor],
+        argument: Any,
+        before: Sequence[FrameExtension],
+        *,
+        dense: bool,
     ) -> FrameExtension:
         """The extension during a frame.
 
         Args:
             frame: checked.
-            own: the network's own variances that count, A and E [B, H, W] [m^2].
-            given: what the frame brings under ``argument``, or None.
+            network_variances: the network's own variances that count, A and E [B, H, W] [m^2].
+            argument: what the frame brings under ``argument``, or None.
             before: the extensions that come before this one, during the same frame.
             dense: whether the whole map is regressed.
 
         Raises:
-            TypeError, ValueError: ``given`` is not what the extension takes.
+            TypeError, ValueError: ``argument`` is not what the extension takes.
         """
         return FrameExtension()
 
@@ -256,7 +262,7 @@ class Extensions:
         )
 
     def of_frame(
-        self, frame: FrameInput, own: Sequence[Tensor], inputs: Mapping[str, Any], *, dense: bool
+        self, frame: FrameInput, network_variances: Sequence[Tensor], inputs: Mapping[str, Any], *, dense: bool
     ) -> FrameExtensions:
         """All of them during a frame.
 
@@ -264,15 +270,15 @@ class Extensions:
             TypeError: an argument of no extension, or as :meth:`Extension.of_frame`.
             ValueError: an argument of an extension that is off, or as :meth:`Extension.of_frame`.
         """
-        known = {one.argument for one in self.each}
-        for name in sorted(inputs.keys() - known):
+        arguments = {one.argument for one in self.each}
+        for name in sorted(inputs.keys() - arguments):
             if name not in UfMStarConfig.__dataclass_fields__:
                 raise TypeError(f"UfM* takes no argument {name!r}")
             if inputs[name] is not None:
                 raise ValueError(f"{name} must be None where UfMStarConfig.{name} is None, which switches it off")
         each: list[FrameExtension] = []
         for one in self.each:
-            each.append(one.of_frame(frame, own, inputs.get(one.argument), each, dense=dense))
+            each.append(one.of_frame(frame, network_variances, inputs.get(one.argument), each, dense=dense))
         return FrameExtensions(each) if each else NONE
 
     def map_variance(self, variance: Tensor) -> Tensor:

@@ -106,14 +106,14 @@ def check_values(
     pose, intrinsics = (of_streams(camera, len(depth)) for camera in (pose, intrinsics))
     deviation = rotation_deviation(pose[..., :3, :3])
     faults = pose_fault(pose, deviation, rotation_tolerance), intrinsics_fault(intrinsics, depth.shape[-2:])
-    known = _first(*faults, torch.device("cpu")) if pose.device.type == intrinsics.device.type == "cpu" else None
-    fault = _first(*faults, device) if known is None else _moved(known, device)
+    host_fault = _first(*faults, torch.device("cpu")) if pose.device.type == intrinsics.device.type == "cpu" else None
+    fault = _first(*faults, device) if host_fault is None else _moved(host_fault, device)
     fine = fault == 0
-    given = (depth > 0) & (depth < torch.inf) & fine[:, None, None]  # NaN is neither
+    has_depth = (depth > 0) & (depth < torch.inf) & fine[:, None, None]  # NaN is neither
     if mask is not None:
-        given = given & mask
-    beyond = given & (depth > max_depth)
-    near = given & ~beyond
+        has_depth = has_depth & mask
+    beyond = has_depth & (depth > max_depth)
+    near = has_depth & ~beyond
     use = near & (depth >= DEPTH_RANGE[0]) & (depth <= DEPTH_RANGE[1])
     for variance in (aleatoric, epistemic):
         if variance is not None:
@@ -124,7 +124,7 @@ def check_values(
     safe_depth = torch.where(use, depth, torch.zeros_like(depth))
     return FrameInput(
         safe_depth, T_safe, K_safe, aleatoric, epistemic, features, use, fault, _moved(deviation, device),
-        beyond.sum((1, 2)), (near & ~use).sum((1, 2)), known,
+        beyond.sum((1, 2)), (near & ~use).sum((1, 2)), host_fault,
     )  # fmt: skip
 
 
@@ -170,10 +170,10 @@ def check_frame(
     plain = _as(_constant(depth), size, dtype)
     shapes = [shape, size]
 
-    def own(name: str, value: Array | None) -> Tensor | None:
+    def converted(name: str, value: Array | None) -> Tensor | None:
         return None if value is None else _as(require_float(name, as_tensor(name, value), shapes, depth), size, dtype)
 
-    a, e = own("aleatoric", aleatoric), own("epistemic", epistemic)
+    a, e = converted("aleatoric", aleatoric), converted("epistemic", epistemic)
     extra = _features(features, feature_count, plain)
     if aleatoric_in_h:
         if a is None:

@@ -117,14 +117,14 @@ def append(mixture: GaussianMixture, current: GaussianMixture, new: Tensor) -> t
     fits = new & (slot < capacity)
     slot = torch.where(fits, slot, torch.full_like(slot, capacity))  # one slot more catches what is not added
 
-    def place(old: Tensor, value: Tensor) -> Tensor:
+    def scattered(old: Tensor, value: Tensor) -> Tensor:
         room = torch.cat([old, old.new_zeros(b, 1, *old.shape[2:])], dim=1)
         index = slot.view(*slot.shape, *[1] * (old.dim() - 2)).expand(*slot.shape, *old.shape[2:])
         return room.scatter(1, index, value.to(old.dtype))[:, :capacity]
 
-    placed = {name: place(old, getattr(current, name)) for name, old in mixture.tensors().items()}
-    placed["disagreement"] = place(mixture.disagreement, torch.zeros_like(current.disagreement))
-    placed["count"] = place(mixture.count, torch.ones_like(current.count))
+    placed = {name: scattered(old, getattr(current, name)) for name, old in mixture.tensors().items()}
+    placed["disagreement"] = scattered(mixture.disagreement, torch.zeros_like(current.disagreement))
+    placed["count"] = scattered(mixture.count, torch.ones_like(current.count))
     return GaussianMixture(**placed), (new & ~fits).sum(dim=1)
 
 

@@ -191,12 +191,12 @@ class LiveDepth:
         stamp, pose = _seconds(stamp), _pose(T, self.model.ufm.config.rotation_tolerance)
         with self._changed:
             self._counts["poses"] += 1
-            place = bisect_left(self._times, stamp)
-            if place < len(self._times) and self._times[place] == stamp:
-                self._poses[place] = pose
+            index = bisect_left(self._times, stamp)
+            if index < len(self._times) and self._times[index] == stamp:
+                self._poses[index] = pose
             else:
-                self._times.insert(place, stamp)
-                self._poses.insert(place, pose)
+                self._times.insert(index, stamp)
+                self._poses.insert(index, pose)
             del self._times[:-_POSES], self._poses[:-_POSES]
             self._changed.notify_all()
 
@@ -303,8 +303,8 @@ class LiveDepth:
 
     def _pose_at(self, stamp: float) -> np.ndarray | None:
         """The pose [4, 4] at a moment [s]; NaN or None as ``interpolate_pose``."""
-        place = bisect_left(self._times, stamp)
-        around = slice(max(place - 1, 0), place + 1)
+        index = bisect_left(self._times, stamp)
+        around = slice(max(index - 1, 0), index + 1)
         if not self._times[around]:
             return None
         trajectory = Trajectory(np.array(self._times[around]), np.stack(self._poses[around]))

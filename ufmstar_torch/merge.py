@@ -64,7 +64,13 @@ class MergeExtension(Extension):
         self._config = config
 
     def of_frame(
-        self, frame: FrameInput, own: Sequence[Tensor], given: object, before: Sequence[FrameExtension], *, dense: bool
+        self,
+        frame: FrameInput,
+        network_variances: Sequence[Tensor],
+        argument: object,
+        before: Sequence[FrameExtension],
+        *,
+        dense: bool,
     ) -> FrameExtension:
         """Merging after this frame."""
         return _MergeFrame(frame, self._config)
@@ -178,8 +184,8 @@ def _close_pairs(g: Components, fresh: Tensor, limit: float) -> tuple[Tensor, Te
         for axis in range(3):
             variance = share * spread[i, None, axis] + (1 - share) * spread[:, axis]
             close &= (mean[i, None, axis] - mean[:, axis]).square() <= reach * variance
-        place, j = close.nonzero().unbind(1)
-        pair = torch.stack([torch.minimum(i[place], j), torch.maximum(i[place], j)])
+        row, j = close.nonzero().unbind(1)
+        pair = torch.stack([torch.minimum(i[row], j), torch.maximum(i[row], j)])
         first, second = ({name: value[which] for name, value in g.items()} for which in pair)
         a, b = _parts(first, second)
         volume = _log_det(_joint(first, second)["covariance"]) - a * log_det[pair[0]] - b * log_det[pair[1]]
@@ -249,9 +255,9 @@ def own_shares(g: Components, prior_weight: float) -> Tensor:
         for axis in range(3):
             gap = (mean[i, None, axis] - mean[:, axis]).abs()
             near &= gap <= _REACH * sigma[i, None, axis] + radius * sigma[:, axis]
-        place, k = near.nonzero().unbind(1)
-        squared = ((points[i[place]] - mean[k, None]) @ whitening[k].mT).square().sum(-1)
-        evidence.index_add_(0, i[place], torch.exp(log_peak[k, None] - 0.5 * squared))
+        row, k = near.nonzero().unbind(1)
+        squared = ((points[i[row]] - mean[k, None]) @ whitening[k].mT).square().sum(-1)
+        evidence.index_add_(0, i[row], torch.exp(log_peak[k, None] - 0.5 * squared))
     return (torch.exp(log_peak - 1.5)[:, None] / evidence).mean(1)
 
 
@@ -278,12 +284,12 @@ def dissolve(g: Components, config: UfMStarConfig) -> Components:
     share = _mean_shares(g, _cubature(g)[weak], config) * ~weak
     rest = total(share, 1)
     enough = rest >= 1 - config.merge.share
-    given = share[enough] / rest[enough, None]
+    split = share[enough] / rest[enough, None]
     goes = weak.nonzero().flatten()[enough]
 
     w, values = g["weight"][:, None], torch.cat([g["disagreement"][:, None], g["features"]], -1)
     gifts = torch.cat([w, w * values, g["sums"]], -1)[goes]
-    gain = torch.stack([total(given * gift[:, None], 0) for gift in gifts.unbind(-1)], -1)
+    gain = torch.stack([total(split * gift[:, None], 0) for gift in gifts.unbind(-1)], -1)
     weight, more, learnt = gain.split([1, values.shape[1], g["sums"].shape[1]], -1)
     values = torch.where(weight > 0, (w * values + more) / (w + weight), values)
     after = g | {

@@ -139,7 +139,9 @@ def own_preprocess(networks: Sequence[nn.Module]) -> Preprocess:
     Raises:
         ValueError: they have different ones.
     """
-    stated = [own for network in networks if callable(own := getattr(network, "preprocess", None))]
+    stated = [
+        stated_preprocess for network in networks if callable(stated_preprocess := getattr(network, "preprocess", None))
+    ]
     if any(other != stated[0] for other in stated):
         raise ValueError(f"networks must have the same preprocess, or UncertainDepth be given one, got {stated}")
     return stated[0] if stated else in_unit_range
@@ -176,5 +178,5 @@ def combine(predictions: Sequence[DepthPrediction]) -> DepthPrediction:
 
 
 def _mean(maps: Sequence[Tensor | None]) -> Tensor | None:
-    known = [value for value in maps if value is not None]
-    return torch.stack(known).mean(0) if len(known) == len(maps) else None
+    stated = [value for value in maps if value is not None]
+    return torch.stack(stated).mean(0) if len(stated) == len(maps) else None

@@ -122,8 +122,8 @@ class TrainDecision:
 
     def _checked(self, statistics: Tensor) -> Tensor:
         """[F] float64. Raises ValueError: not as many as before, or not finite."""
-        values, known = statistics.detach().flatten().double(), len(self._sums) - 2
-        if not bool(values.isfinite().all()) or known not in (-2, len(values)):
-            expected = known if known > 0 else "some"
+        values, size = statistics.detach().flatten().double(), len(self._sums) - 2
+        if not bool(values.isfinite().all()) or size not in (-2, len(values)):
+            expected = size if size > 0 else "some"
             raise ValueError(f"statistics must be {expected} finite values as before, got {values.tolist()}")
         return values

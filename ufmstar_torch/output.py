@@ -71,8 +71,8 @@ class FrameStatistics:
 
     def __repr__(self) -> str:
         """The counts of every stream that are not 0, in a line."""
-        kept = (f.name for f in fields(self) if f.name != "rotation_deviation")
-        counts = {name: getattr(self, name) for name in kept if getattr(self, name) is not None}
+        names = (f.name for f in fields(self) if f.name != "rotation_deviation")
+        counts = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         shown = [f"{name}={_short(value)}" for name, value in counts.items() if _any(value)]
         return f"FrameStatistics({', '.join(shown)})"
 

@@ -397,14 +397,18 @@ class UncertainDepth(NetworksInTurn):
             destination.update({f"{prefix}landmarks.{n}": value for n, value in self.landmarks.state().items()})
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
-        own = f"{prefix}landmarks."
+        landmark_prefix = f"{prefix}landmarks."
         try:
             if f"{prefix}image_index" in state_dict:
                 _require_count(state_dict[f"{prefix}image_index"])
             self.ufm.accepted(state_dict, f"{prefix}ufm.")
             if self.landmarks is not None:
                 self.landmarks.load_state(
-                    {key[len(own) :]: state_dict.pop(key) for key in list(state_dict) if key.startswith(own)}
+                    {
+                        key[len(landmark_prefix) :]: state_dict.pop(key)
+                        for key in list(state_dict)
+                        if key.startswith(landmark_prefix)
+                    }
                 )
         except ValueError as error:
             args[-1].append(str(error))

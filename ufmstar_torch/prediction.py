@@ -88,8 +88,8 @@ def stated_range(networks: Iterable[Callable[..., Any]]) -> float | None:
     """[m] The largest depth that any of the networks can predict, by their attribute ``max_depth``; None unless each of
     them states one, a positive number."""
     stated = [getattr(network, "max_depth", None) for network in networks]
-    known = [float(value) for value in stated if isinstance(value, int | float) and value > 0]
-    return max(known) if known and len(known) == len(stated) else None
+    ranges = [float(value) for value in stated if isinstance(value, int | float) and value > 0]
+    return max(ranges) if ranges and len(ranges) == len(stated) else None
 
 
 def states_confidence(networks: Iterable[Callable[..., Any]]) -> bool:

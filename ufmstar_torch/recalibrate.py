@@ -103,14 +103,20 @@ class Recalibration(Checked, Extension):
         return torch.lerp(h.log()[upper - 1], h.log()[upper], share).exp().nan_to_num(1.0)
 
     def of_frame(
-        self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool
+        self,
+        frame: FrameInput,
+        network_variances: Sequence[Tensor],
+        argument: Any,
+        before: Sequence[FrameExtension],
+        *,
+        dense: bool,
     ) -> FrameExtension:
         """A map of the confidence during a frame. Raises ValueError: it is one, and the frame brings no confidence."""
         if self.covariate == VARIANCE:
             return FrameExtension()
-        if given is None:
+        if argument is None:
             raise ValueError("the recalibration is one of the confidence, but the network states none")
-        return _Scaled(self.factor(as_confidence(given, frame)))
+        return _Scaled(self.factor(as_confidence(argument, frame)))
 
     def require(self, config: UfMStarConfig, network: str = "") -> None:
         """Check that V means what it meant when the map was fitted.
@@ -155,6 +161,6 @@ class _Scaled(FrameExtension):
         return variance * chosen(self._factor).to(variance.dtype)
 
 
-def beside(weights: str | Path) -> Path:
+def stored_next_to(weights: str | Path) -> Path:
     """The file of a recalibration that lies beside weights: fastdepth.onnx -> fastdepth.recalibration.json."""
     return Path(weights).with_suffix(".recalibration.json")

@@ -87,8 +87,8 @@ def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]
             break
         requested *= 2
     behind = usable.sum(1, keepdim=True) + (~usable).cumsum(1) - 1
-    place = torch.where(usable, usable.cumsum(1) - 1, behind)  # the valid ones first, each part in the random order
-    index = torch.empty_like(place).scatter_(1, place, order.expand_as(place))[:, :count]
+    position = torch.where(usable, usable.cumsum(1) - 1, behind)  # the valid ones first, each part in the random order
+    index = torch.empty_like(position).scatter_(1, position, order.expand_as(position))[:, :count]
     return index, torch.gather(flat, 1, index)
 
 
@@ -101,12 +101,12 @@ def sample_statistics(values: Tensor) -> SampleStatistics:
     Returns:
         [..., B] of each.
     """
-    known = ~values.isnan()
-    count = known.sum(-1)
-    mean = total(torch.where(known, values, 0), -1) / count  # 0/0 = NaN without a pixel
-    squares = total(torch.where(known, (values - mean[..., None]) ** 2, 0), -1)
+    present = ~values.isnan()
+    count = present.sum(-1)
+    mean = total(torch.where(present, values, 0), -1) / count  # 0/0 = NaN without a pixel
+    squares = total(torch.where(present, (values - mean[..., None]) ** 2, 0), -1)
     variance = torch.where(count > 1, squares / (count - 1).clamp_min(1), torch.nan)
-    largest = torch.where(known, values, -torch.inf).amax(-1)
+    largest = torch.where(present, values, -torch.inf).amax(-1)
     return SampleStatistics(
         mean, variance, values.nanmedian(-1).values, torch.where(count > 0, largest, torch.nan), count
     )

@@ -21,7 +21,7 @@ from ufmstar_torch.segment_scanline import Frame, Segments, scanlines
 
 
 @torch.no_grad()
-def segment(given: SegmentInput) -> tuple[GaussianMixture, Tensor]:
+def segment(inputs: SegmentInput) -> tuple[GaussianMixture, Tensor]:
     """Fit Gaussians to the surfaces of B depth maps, float64 inside.
 
     Nothing is differentiated. Nothing waits for an accelerator: there, loops and tables have their static bounds.
@@ -33,7 +33,7 @@ def segment(given: SegmentInput) -> tuple[GaussianMixture, Tensor]:
         pruning rule implies.
         Labels [B, H, W] int64: each pixel's slot, -1 = none.
     """
-    frame = Frame.of(given)
+    frame = Frame.of(inputs)
     segments = scanlines(frame)
     return _output(frame, segments, *fuse_segments(frame, segments))
 
@@ -42,23 +42,23 @@ def _output(
     frame: Frame, segments: Segments, emitted: Tensor, count: Tensor, member: Tensor
 ) -> tuple[GaussianMixture, Tensor]:
     """Prune, and write the mixture and the labels."""
-    given = frame.given
+    inputs = frame.inputs
     total = emitted.shape[1]
     g = parts(emitted)
     exists = torch.arange(total, device=count.device) < count[:, None]
-    kept = exists & _keeps(g.n[..., 0], g.merged[..., 0], given.config)
-    capacity = max(1, int(kept.sum(1).max())) if reads_are_free(count.device) else min(total, most_kept(given))
+    retained = exists & _keeps(g.n[..., 0], g.merged[..., 0], inputs.config)
+    capacity = max(1, int(retained.sum(1).max())) if reads_are_free(count.device) else min(total, most_kept(inputs))
     table = emitted.new_zeros(emitted.shape[0], capacity + 1, GAUSSIAN_WIDTH)
-    append(table, torch.zeros_like(count), emitted, kept)
+    append(table, torch.zeros_like(count), emitted, retained)
 
     # A pixel's segment of its row -> Gaussian in order of creation -> slot.
     created = torch.where(exists, g.born[..., 0].to(torch.int64), total)
-    slot = torch.where(kept, kept.cumsum(1) - 1, -1)
+    slot = torch.where(retained, retained.cumsum(1) - 1, -1)
     slot_of = slot.new_zeros(slot.shape[0], total + 1).scatter(1, created, slot)
-    segment = segments.pixel.view(given.depth.shape)
+    segment = segments.pixel.view(inputs.depth.shape)
     gaussian = member.gather(2, segment.clamp_min(0)).flatten(1).clamp_min(0)
     labels = torch.where(segment < 0, -1, slot_of.gather(1, gaussian).view_as(segment))
-    return _mixture(parts(table[:, :capacity]), labels, given), labels
+    return _mixture(parts(table[:, :capacity]), labels, inputs), labels
 
 
 def _keeps(pixels: Tensor, merged: Tensor, limits: SPGFConfig) -> Tensor:
@@ -69,30 +69,30 @@ def _keeps(pixels: Tensor, merged: Tensor, limits: SPGFConfig) -> Tensor:
     return large | tall if limits.prune == "both" else large & tall
 
 
-def most_kept(given: SegmentInput) -> int:
+def most_kept(inputs: SegmentInput) -> int:
     """Bound on the Gaussians of an image that survive pruning: each has at least so many pixels."""
-    _, height, width = given.depth.shape
-    limits = given.config
+    _, height, width = inputs.depth.shape
+    limits = inputs.config
     by_rows = limits.min_rows * (limits.sparse + 1)  # of min_rows segments, each with more than ``sparse``
     least = {"none": 1, "both": min(limits.min_pixels, by_rows), "either": max(limits.min_pixels, by_rows)}
     return max(1, height * width // least[limits.prune])
 
 
-def _mixture(g: Gaussian, labels: Tensor, given: SegmentInput) -> GaussianMixture:
+def _mixture(g: Gaussian, labels: Tensor, inputs: SegmentInput) -> GaussianMixture:
     n = g.n[..., 0]
     covariance = torch.where(g.n > 1, g.scatter / (g.n - 1).clamp_min(1.0), 0)
     xx, xy, xz, yy, yz, zz = covariance.unbind(-1)
     full = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).unflatten(-1, (3, 3))
     features = n.new_zeros(*n.shape, 0)
-    if given.features is not None:
-        features = _feature_means(given.features.to(n.dtype), labels, n)
+    if inputs.features is not None:
+        features = _feature_means(inputs.features.to(n.dtype), labels, n)
     return GaussianMixture(
-        mean=g.mean.to(given.depth.dtype),
-        covariance=full.to(given.depth.dtype),
-        weight=n.to(given.depth.dtype),
-        disagreement=torch.zeros_like(n, dtype=given.depth.dtype),
+        mean=g.mean.to(inputs.depth.dtype),
+        covariance=full.to(inputs.depth.dtype),
+        weight=n.to(inputs.depth.dtype),
+        disagreement=torch.zeros_like(n, dtype=inputs.depth.dtype),
         count=(n > 0).to(torch.int64),
-        features=features.to(given.depth.dtype),
+        features=features.to(inputs.depth.dtype),
     )
 
 

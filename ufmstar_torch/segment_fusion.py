@@ -44,7 +44,7 @@ def _lift(frame: Frame, segments: Segments) -> Tensor:
     mean_x, mean_z = s.x_left + s.dx / n, s.z_left + s.dz / n
     xx, xz, zz = s.dxx - s.dx * s.dx / n, s.dxz - s.dx * s.dz / n, s.dzz - s.dz * s.dz / n
     none = torch.zeros_like(s.n)
-    b, height, _ = frame.given.depth.shape
+    b, height, _ = frame.inputs.depth.shape
     row = torch.arange(height, device=n.device).repeat(b).to(n)[:, None, None].expand_as(n)
     return torch.cat(
         Gaussian(
@@ -75,9 +75,9 @@ def fuse_segments(frame: Frame, segments: Segments) -> tuple[Tensor, Tensor, Ten
         The emitted Gaussians [B, G, 25] in order, their number [B], and of every segment the Gaussian's
         index in order of creation [B, H, M].
     """
-    b, height, _ = frame.given.depth.shape
+    b, height, _ = frame.inputs.depth.shape
     present = segments.count.view(b, height)
-    trips, wide, total = _trip_counts(frame.given, present)
+    trips, wide, total = _trip_counts(frame.inputs, present)
     lifted = _lift(frame, segments).view(b, height, -1, GAUSSIAN_WIDTH)[:, :, :wide]
     slot = torch.arange(wide, device=present.device)
     nothing = present.new_zeros(b)
@@ -88,10 +88,10 @@ def fuse_segments(frame: Frame, segments: Segments) -> tuple[Tensor, Tensor, Ten
         exists = slot < active_count[:, None]
         active, joined = _join_row(frame, active, exists, lifted[:, v], present[:, v], trips[v])
         alone = (joined < 0) & (slot < present[:, v, None])
-        own = created[:, None] + alone.cumsum(1) - 1
+        new_index = created[:, None] + alone.cumsum(1) - 1
         created = created + alone.sum(1)
-        member[:, v] = torch.where(alone, own, joined)
-        fresh = torch.cat([lifted[:, v, :, :-1], own[..., None].to(lifted)], -1)
+        member[:, v] = torch.where(alone, new_index, joined)
+        fresh = torch.cat([lifted[:, v, :, :-1], new_index[..., None].to(lifted)], -1)
 
         both, exists = torch.cat([active, fresh], 1), torch.cat([exists, alone], 1)
         # After the last row all are complete together, in the order of the active list.
@@ -108,14 +108,14 @@ def reads_are_free(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
-def _trip_counts(given: SegmentInput, present: Tensor) -> tuple[list[int], int, int]:
+def _trip_counts(inputs: SegmentInput, present: Tensor) -> tuple[list[int], int, int]:
     """Segments to visit in each row, the most in any row, and the most Gaussians of any stream.
 
     Read from the data on the CPU; elsewhere bounds, since reading would wait for the device.
     """
-    height = given.depth.shape[1]
+    height = inputs.depth.shape[1]
     if not reads_are_free(present.device):
-        most = given.segments_per_row
+        most = inputs.segments_per_row
         return [most] * height, most, most * height
     trips = present.amax(0).tolist()
     return trips, max(1, *trips), max(1, int(present.sum(1).max()))
@@ -165,7 +165,7 @@ def _best_overlap(o: Gaussian, exists: Tensor, h: Gaussian) -> tuple[Tensor, Ten
 
 def _same_plane(o: Gaussian, h: Gaussian, frame: Frame) -> Tensor:
     """[B, 1] does segment h continue the surface of Gaussian o?"""
-    limits = frame.given.config
+    limits = frame.inputs.config
     reach = frame.lengths2.gather(1, o.nearest[..., 0].to(torch.int64))
     (hx, _, hz), (ox, oy, oz) = h.l.unbind(-1), o.l.unbind(-1)
     dot = hx * ox + hz * oz

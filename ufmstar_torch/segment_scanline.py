@@ -41,7 +41,7 @@ class OpenSegment(NamedTuple):
 class Frame:
     """The images as R = B H rows [R, W] in float64, 0 where a pixel does not take part."""
 
-    given: SegmentInput
+    inputs: SegmentInput
     z: Tensor
     use: Tensor
     rx: Tensor  # [R, W] and [R, 1], the rays
@@ -51,38 +51,38 @@ class Frame:
     lengths2: Tensor  # [B, bins] [m^2]
 
     @classmethod
-    def of(cls, given: SegmentInput) -> Frame:
+    def of(cls, inputs: SegmentInput) -> Frame:
         dtype = torch.float64
-        b, height, width = given.depth.shape
-        limits = given.config
-        z = given.depth.to(dtype)
+        b, height, width = inputs.depth.shape
+        limits = inputs.config
+        z = inputs.depth.to(dtype)
         use = (z > 0) & (z <= limits.depth_limit)
         z = torch.where(use, z, 0)
-        K = given.intrinsics.to(dtype)
+        K = inputs.intrinsics.to(dtype)
         fx, fy, cx, cy = focal_and_centre(K)
         rx = (torch.arange(width, dtype=dtype, device=z.device) - cx[:, None]) / fx[:, None]
         ry = (torch.arange(height, dtype=dtype, device=z.device) - cy[:, None]) / fy[:, None]
-        lengths, edges = _depth_bins(given, 0.5 * torch.minimum(width / fx, height / fy))
+        lengths, edges = _depth_bins(inputs, 0.5 * torch.minimum(width / fx, height / fy))
         # An accelerator does not refuse a camera of NaN, since the check would wait: no index beyond the table then.
-        bins = torch.searchsorted(edges, z.reshape(b, -1)).clamp_max(given.depth_bins - 1)
+        bins = torch.searchsorted(edges, z.reshape(b, -1)).clamp_max(inputs.depth_bins - 1)
         return cls(
-            given, z.reshape(-1, width), use.reshape(-1, width),
+            inputs, z.reshape(-1, width), use.reshape(-1, width),
             rx.repeat_interleave(height, 0), ry.reshape(-1, 1), limits.slope(torch.minimum(fx, fy))[:, None],
             bins.reshape(-1, width), lengths * lengths,
         )  # fmt: skip
 
     def per_row(self, value: Tensor) -> Tensor:
         """[B, ...] to [R, ...]."""
-        return value.repeat_interleave(self.given.depth.shape[1], 0)
+        return value.repeat_interleave(self.inputs.depth.shape[1], 0)
 
 
-def _depth_bins(given: SegmentInput, s: Tensor) -> tuple[Tensor, Tensor]:
+def _depth_bins(inputs: SegmentInput, s: Tensor) -> tuple[Tensor, Tensor]:
     """Lengths and far edges [B, bins] of the depth bins [m]; edges beyond max_depth do no harm."""
-    limits = given.config
+    limits = inputs.config
     length = torch.full_like(s, limits.min_gaussian_length)
     edge = torch.zeros_like(s)
     lengths, edges = [], []
-    for _ in range(given.depth_bins):
+    for _ in range(inputs.depth_bins):
         edge = edge + length
         lengths.append(length)
         edges.append(edge)
@@ -118,7 +118,7 @@ class _Column:
 
 
 def _columns(frame: Frame) -> Iterator[_Column]:
-    limits = frame.given.config
+    limits = frame.inputs.config
     t = frame.per_row(frame.slope) * frame.z * frame.z
     maps = {
         "x": frame.rx * frame.z,
@@ -139,13 +139,13 @@ def scanlines(frame: Frame) -> Segments:
 
     ``queue`` [R, max_open, 15] holds the open segments, newest first; an empty place has n = 0.
     """
-    limits = frame.given.config
+    limits = frame.inputs.config
     rows, width = frame.z.shape
     y_factor = 1.0 + frame.ry * frame.ry
     queue = frame.z.new_zeros(rows, limits.max_open, len(OpenSegment._fields))
     started = frame.z.new_zeros(rows, 1)
     owner = torch.full_like(frame.bins, -1)
-    done = _Finished(frame.z, frame.given.segments_per_row, limits.sparse)
+    done = _Finished(frame.z, frame.inputs.segments_per_row, limits.sparse)
     for p in _columns(frame):
         fits = _fits(OpenSegment(*queue.unbind(-1)), p, limits)
         start = p.use & ~fits.any(-1, keepdim=True)
@@ -162,7 +162,7 @@ def scanlines(frame: Frame) -> Segments:
     for q in range(limits.max_open):
         done.add(queue[:, q], torch.ones_like(done.count, dtype=torch.bool))
     # An owner of -1 looks up place -1, which is the last one and holds -1.
-    pixel = done.place.gather(1, torch.where(owner < 0, width, owner))
+    pixel = done.finished_index.gather(1, torch.where(owner < 0, width, owner))
     return Segments(done.table[:, :-1], done.count, pixel)
 
 
@@ -209,7 +209,7 @@ class _Finished:
         rows, width = z.shape
         self.sparse, self.most, self.width = sparse, most, width
         self.table = z.new_zeros(rows, most + 1, len(OpenSegment._fields))
-        self.place = torch.full((rows, width + 1), -1, dtype=torch.int64, device=z.device)
+        self.finished_index = torch.full((rows, width + 1), -1, dtype=torch.int64, device=z.device)
         self.count = torch.zeros(rows, dtype=torch.int64, device=z.device)
 
     def add(self, segment: Tensor, mask: Tensor) -> None:
@@ -219,5 +219,5 @@ class _Finished:
         at = torch.where(keep, self.count, self.most)[:, None, None].expand(-1, 1, segment.shape[1])
         self.table.scatter_(1, at, segment[:, None])
         start = torch.where(keep, open_.born.to(torch.int64), self.width)
-        self.place.scatter_(1, start[:, None], torch.where(keep, self.count, -1)[:, None])
+        self.finished_index.scatter_(1, start[:, None], torch.where(keep, self.count, -1)[:, None])
         self.count = self.count + keep

@@ -92,8 +92,8 @@ class UfMStarState:
         }  # fmt: skip
         tensors = self.tensors()
         for name, shape in shapes.items():
-            if (given := tuple(tensors[name].shape)) != shape:
-                raise ValueError(f"{name} must have shape {shape} beside weight {(b, k)}, got {given}")
+            if (actual := tuple(tensors[name].shape)) != shape:
+                raise ValueError(f"{name} must have shape {shape} beside weight {(b, k)}, got {actual}")
         if config.max_components is not None and k > max(config.max_components, 1):
             raise ValueError(f"{k} slots exceed max_components = {config.max_components}")
         if self.weight.device.type == "meta":

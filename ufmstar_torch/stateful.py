@@ -44,11 +44,11 @@ class StatefulModule(nn.Module):
         """Bool mask [count] of streams given as indices or as a mask, on the state's device. Raises IndexError: an
         index is out of range; ValueError: a mask of the wrong length."""
         device = getattr(self, self.STATE[0]).device
-        given = torch.as_tensor(streams, device=device)
-        if given.dtype == torch.bool and given.shape != (count,):
-            raise ValueError(f"streams as a mask must have shape ({count},), got {tuple(given.shape)}")
+        indices = torch.as_tensor(streams, device=device)
+        if indices.dtype == torch.bool and indices.shape != (count,):
+            raise ValueError(f"streams as a mask must have shape ({count},), got {tuple(indices.shape)}")
         chosen = torch.zeros(count, dtype=torch.bool, device=device)
-        chosen[given if given.numel() else given.long()] = True
+        chosen[indices if indices.numel() else indices.long()] = True
         return chosen
 
     def _settle(self) -> None:
@@ -126,18 +126,18 @@ class StatefulModule(nn.Module):
         if prefix + "_extra_state" in state_dict:
             self._warn_of_config(state_dict[prefix + "_extra_state"])  # an error for some: before anything changes
         for name, value in saved.items():
-            if value.shape != (own := getattr(self, name)).shape:
-                setattr(self, name, torch.empty(value.shape, dtype=own.dtype, device=own.device))
+            if value.shape != (buffer := getattr(self, name)).shape:
+                setattr(self, name, torch.empty(value.shape, dtype=buffer.dtype, device=buffer.device))
         super()._load_from_state_dict(state_dict, prefix, metadata, strict, missing, unexpected, errors)
 
 
-def _fitting(name: str, saved: object, own: Tensor) -> Tensor:
+def _fitting(name: str, saved: object, buffer: Tensor) -> Tensor:
     """A saved tensor in the dtype of its buffer. Raises ValueError: it is no tensor, or of another kind of dtype."""
     kind = saved.dtype if isinstance(saved, Tensor) else type(saved).__name__
-    both_floats = isinstance(saved, Tensor) and saved.is_floating_point() and own.is_floating_point()
-    if not isinstance(saved, Tensor) or not (both_floats or saved.dtype == own.dtype):
-        raise ValueError(f"{name} must be a tensor that fits {own.dtype}, got {kind}")
-    return saved.detach().to(own.dtype)
+    both_floats = isinstance(saved, Tensor) and saved.is_floating_point() and buffer.is_floating_point()
+    if not isinstance(saved, Tensor) or not (both_floats or saved.dtype == buffer.dtype):
+        raise ValueError(f"{name} must be a tensor that fits {buffer.dtype}, got {kind}")
+    return saved.detach().to(buffer.dtype)
 
 
 @lru_cache(maxsize=16)

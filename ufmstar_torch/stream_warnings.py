@@ -160,7 +160,7 @@ class StreamWarnings:
             if (track := self._tracks.get(b)) is None:
                 self._tracks[b] = track = _Track(T, focal, sums[b], _position(T))
             else:
-                yield from ((b, *said) for said in track.follow(T, focal, rows[b], sums[b]))
+                yield from ((b, *warning) for warning in track.follow(T, focal, rows[b], sums[b]))
             if used is not None and (text := track.anchored(used[b], _mean(rows[b], sums[b]))):
                 yield b, "anchors", text
 

@@ -29,7 +29,7 @@ from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.prediction import DepthPrediction
 
 TOUR = "tour:1"
-ARCHITECTURES = ("fastdepth", "monodepth2")  # that are timed with random weights
+ARCHITECTURES = ("fastdepth", "monodepth2")  # can be timed with random weights
 _ERROR, _GRID = 0.03, 4  # [1] standard deviation of a network's smooth relative error, and its nodes per side
 Progress = Callable[[str], object]
 
@@ -45,8 +45,8 @@ class BenchSettings:
     Attributes:
         sequence: folder of a recording, or tour:SEED
         model: kind of network, as in `ufmstar run`; without --weights fastdepth or monodepth2
-        weights: its file or directory
-        spec: JSON file that declares what the weights do not say, as in `ufmstar run`
+        weights: file or directory of the network's weights
+        spec: JSON file that declares what the weights do not contain, as in `ufmstar run`
         runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
         sizes: sides of the square images without --weights [px], multiples of 32
         backends: implementations of the step that are timed
@@ -54,7 +54,7 @@ class BenchSettings:
         history: number of frames before them
         threads: number of CPU threads; default: the cores of this process
         device: cpu, cuda or cuda:N, for network and UfM*
-        streams: numbers of streams at once on which UfM* alone is timed as well
+        streams: numbers of simultaneous streams on which UfM* alone is also timed
         json: file for the report
     """
 
@@ -82,7 +82,7 @@ class BenchSettings:
 
 
 def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None) -> dict[str, Any]:
-    """Measure what the options ask for: "schema", "date", "options" and, for every size, ``measure``'s "results".
+    """Run the benchmark. Returns "schema", "date", "options" and, for every size, the "results" of ``measure``.
 
     Raises:
         ValueError: an option is out of range, or the sequence has too few frames.
@@ -101,8 +101,8 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
         name = f"{TOUR}?frames={options.history + options.frames}&size={height}x{width}"
         sequence = open_sequence(name if options.sequence == TOUR else options.sequence)
         rows = [Row(Method.parse(name), setting) for name, setting in _rows(network.base, options.backends)]
-        how: dict[str, Any] = {"device": device, "multiview_device": device, "plan": plan}
-        result = measure(rows, {network.base: network}, sequence, **how)
+        devices: dict[str, Any] = {"device": device, "multiview_device": device, "plan": plan}
+        result = measure(rows, {network.base: network}, sequence, **devices)
         result["streams"] = []
         if options.streams:
             result["streams"] = time_streams(network, sequence, options.streams, device=device, plan=plan)
@@ -112,18 +112,18 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
 
 
 def _rows(base: str, backends: tuple[str, ...]) -> list[tuple[str, Setting]]:
-    """Methods and settings: UfM, and for every backend UfM*, with corners, and the posterior with dense anchors."""
+    """Methods and settings: UfM; for every backend UfM*, UfM* with corners, and the posterior with dense anchors."""
     alone = BASES[base][1]
     rows = [(f"UfM-{alone}-100K", Setting())]
     for backend in backends:
-        of = {} if backend == "auto" else {"backend": backend}
+        overrides = {} if backend == "auto" else {"backend": backend}
         kinds: tuple[dict[str, Any], ...] = ({}, {"anchors": "corners"}, {"anchors": "dense", "posterior": True})
-        rows += [(f"UfM*-{alone}", Setting(overrides=of, **kind)) for kind in kinds]
+        rows += [(f"UfM*-{alone}", Setting(overrides=overrides, **kind)) for kind in kinds]
     return rows
 
 
 class _Random(TimedNetwork):
-    """An architecture with random weights, for its time; its depth is the sequence's with smooth errors of 3 %."""
+    """An architecture with random weights, to be timed. Its depth is the sequence's, with smooth errors of 3 %."""
 
     def prepare(self, frame: Frame, device: torch.device) -> tuple[Tensor, Tensor]:
         """See :class:`TimedNetwork`. Raises FrameError: no depth at the image's pixels."""
@@ -142,7 +142,7 @@ class _Random(TimedNetwork):
 
 
 def _random(options: BenchSettings, side: int, device: torch.device) -> TimedNetwork:
-    """One of the paper's architectures with random weights, as it runs fastest in torch."""
+    """One of the paper's architectures with random weights, in its fastest form in torch."""
     size = (side, side)
     network: DepthNetwork = MonodepthResNet(size=size)
     if options.model == ARCHITECTURES[0]:
@@ -152,7 +152,7 @@ def _random(options: BenchSettings, side: int, device: torch.device) -> TimedNet
 
 
 def _loaded(options: BenchSettings, threads: int, device: torch.device) -> TimedNetwork:
-    """The network of the options, as ``ufmstar run`` runs it."""
+    """The network of the options, loaded as by ``ufmstar run``."""
     inference = Inference(runtime=options.runtime, threads=threads)
     choice = NetworkChoice(
         "", options.model, (str(options.weights),), None if options.spec is None else str(options.spec)
@@ -169,20 +169,20 @@ def format_report(report: Mapping[str, Any]) -> str:
 def _lines(result: Mapping[str, Any]) -> list[str]:
     machine, ((base, network),) = result["machine"], result["networks"].items()
     hardware, load = machine["hardware"], machine["load"]
-    where = hardware["cpu"] if machine["gpu"] is None else machine["gpu"]
+    processor = hardware["cpu"] if machine["gpu"] is None else machine["gpu"]
     versions = ", ".join(f"{name} {value}" for name, value in machine["versions"].items() if value)
     lines = [
-        f"{where}, {hardware['cores']} cores, {result['plan']['threads']} threads; {versions}",
+        f"{processor}, {hardware['cores']} cores, {result['plan']['threads']} threads; {versions}",
         f"{result['sequence']['name']}, {result['plan']['frames']} frames of {result['map']}"
         + (f"; load average {load:.1f}" if load else ""),
         f"{'[ms]':52}{'median':>9}{'IQR':>8}{'minimum':>9}{'x network':>11}{'state':>11}",
     ]
     rows = [(f"{network['label']} ({base})", network["latency"][ONCE], None, None)]
     for row in result["rows"]:
-        ratio, kept = row["ratios_to_depth"][MULTIVIEW]["median"], row["memory"]["multiview"]["bytes_end"]
-        rows.append((row["row"], row["latency"][MULTIVIEW], ratio, kept))
-    for name, times, ratio, kept in rows:
-        tail = "" if ratio is None else f"{ratio:11.3f}{kept / 1e3:8.1f} kB"
+        ratio, state_bytes = row["ratios_to_depth"][MULTIVIEW]["median"], row["memory"]["multiview"]["bytes_end"]
+        rows.append((row["row"], row["latency"][MULTIVIEW], ratio, state_bytes))
+    for name, times, ratio, state_bytes in rows:
+        tail = "" if ratio is None else f"{ratio:11.3f}{state_bytes / 1e3:8.1f} kB"
         lines.append(f"{name:52}{times['median_ms']:9.2f}{times['iqr_ms']:8.2f}{times['min_ms']:9.2f}{tail}")
     for row in result["rows"]:
         if row["stages"] is not None:

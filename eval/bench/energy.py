@@ -1,7 +1,7 @@
-"""Energy per frame as zeus measures it, or the reason why it cannot; nothing is estimated.
+"""Measures energy per frame with zeus, or gives the reason why it cannot be measured. Nothing is estimated.
 
-Counters are refreshed tens of times a second at best, so that a single call cannot be measured. A window repeats one
-part until it is long enough; several windows per part, in alternating order, show how much they differ.
+Counters are refreshed tens of times a second at best, so a single call cannot be measured. A window repeats one part
+until it is long enough. Several windows per part, in alternating order, show the spread.
 """
 
 from __future__ import annotations
@@ -24,16 +24,22 @@ _NO_METER = {
 }
 # Fields of zeus's measurement of a system on a chip (Jetson, Apple) [mJ].
 _CHIP = {GPU: ("gpu_energy_mj", "gpu_mj"), CPU: ("cpu_energy_mj", "cpu_total_mj")}
-_TRIAL = 0.2  # [s] A window that only shows which meters there are.
+_TRIAL = 0.2  # [s] length of the window that detects the meters
 Key = TypeVar("Key")
-# [N, 2] energy [J] of a part on its unit's meter and time [s], per window and frame; or why there is none.
+# [N, 2] energy [J] of a part on its unit's meter and time [s], one row per window, per frame; or why it is missing.
 Energy = NDArray[np.float64] | str
 
 
 class EnergyMeter:
-    """The energy of the GPU (its index as torch counts; None = none is used) and of the processor, by zeus's
-    ``monitor`` (None = one for this machine, where zeus is installed). ``missing`` has by unit, "gpu" or "cpu", why it
-    has none."""
+    """Measures the energy of GPU and processor with zeus.
+
+    Args:
+        gpu: torch's index of the GPU; None = no GPU is used.
+        monitor: zeus's monitor; None = one for this machine, if zeus is installed.
+
+    Attributes:
+        missing: by unit, "gpu" or "cpu", the reason why its energy cannot be measured.
+    """
 
     def __init__(self, gpu: int | None = None, monitor: Any = None) -> None:
         self._monitor = _open(gpu) if monitor is None else monitor
@@ -45,22 +51,22 @@ class EnergyMeter:
             self.missing[GPU] = NO_GPU
 
     def measure(self, work: Callable[[], object]) -> tuple[float, dict[str, float]]:
-        """Seconds, and joules by unit, of ``work()``; it must have finished on every device when it returns."""
+        """Seconds, and joules by unit, of ``work()``, which must finish on every device before it returns."""
         self._monitor.begin_window("ufmstar", restart=True)
         work()
         window = self._monitor.end_window("ufmstar")
         joules: dict[str, float] = {}
-        for unit, own in ((GPU, window.gpu_energy), (CPU, window.cpu_energy)):
+        for unit, by_device in ((GPU, window.gpu_energy), (CPU, window.cpu_energy)):
             chip = [getattr(window.soc_energy, name, None) for name in _CHIP[unit]]
-            if own:
-                joules[unit] = float(sum(own.values()))
-            elif known := [value for value in chip if value is not None]:
-                joules[unit] = 1e-3 * known[0]
+            if by_device:
+                joules[unit] = float(sum(by_device.values()))
+            elif readings := [value for value in chip if value is not None]:
+                joules[unit] = 1e-3 * readings[0]
         return window.time, joules
 
 
 def _open(gpu: int | None) -> Any:
-    """zeus's monitor of this machine; None where zeus is not installed."""
+    """zeus's monitor of this machine; None if zeus is not installed."""
     if find_spec("zeus") is None:
         return None
     from zeus.device import get_gpus
@@ -75,12 +81,12 @@ def _open(gpu: int | None) -> Any:
 
 
 def difference(part: Energy, other: Energy) -> Energy:
-    """Subtract one part's energy from another's, window by window; a reason for a missing value is passed on."""
+    """``part`` minus ``other``, window by window; the reason if one of them is missing."""
     return part if isinstance(part, str) else other if isinstance(other, str) else part - other
 
 
 def summary(energy: Energy) -> dict[str, Any]:
-    """For JSON: median and quartiles per frame [mJ], and the time that goes with them [s]; or the reason."""
+    """For JSON: median and quartiles per frame [mJ], and the median time per frame [s]; or why it is missing."""
     if isinstance(energy, str):
         return {"not_measurable": energy}
     low, middle, high = np.percentile(energy, (25, 50, 75), axis=0).tolist()
@@ -95,9 +101,15 @@ def measure_energy(
     seconds: float,
     windows: int,
 ) -> dict[Key, Energy]:
-    """Measure every part: the unit whose meter counts ("gpu" or "cpu"), and a call for each frame, which returns when
-    its device has finished. A window, of at least ``seconds``, makes them over and over; there are ``windows`` per
-    part."""
+    """Measure the energy of every part.
+
+    Args:
+        meter: reads the counters.
+        work: by part, the unit whose meter counts ("gpu" or "cpu"), and one call per frame, which returns when its
+            device has finished.
+        seconds: shortest window [s]; a window repeats the calls.
+        windows: number of windows per part.
+    """
     results: dict[Key, list[list[float]]] = {key: [] for key in work}
     reasons = {key: meter.missing[unit] for key, (unit, _) in work.items() if unit in meter.missing}
     for turn in range(windows):
@@ -112,7 +124,7 @@ def measure_energy(
 
 
 def _window(meter: EnergyMeter, calls: Sequence[Callable[[], object]], seconds: float) -> tuple[int, Any]:
-    """Frames, and what ``measure`` returns, of one window."""
+    """The number of frames of one window, and the result of ``meter.measure``."""
     frames = 0
 
     def work() -> None:

@@ -1,9 +1,8 @@
 """The measurement behind the paper's table 2 (latency, power, energy, memory) and its figure of the stages' shares.
 
-Per row: what the network spends on depth alone, what uncertainty adds to the network (a head, further members or
-samples), and the multiview step. Times come from the frames of one sequence (``parts``), energies from zeus
-(``energy``), memory from the tensors that are kept. A megabyte is 10^6 bytes, as in the paper: 100,000 points of 40
-bytes are its 4.0 MB.
+Each row has three costs: the network's depth alone, the network's uncertainty (a head, further members or samples),
+and the multiview step. Times come from the frames of one sequence (``parts``), energies from zeus (``energy``), memory
+from the stored tensors. A megabyte is 10^6 bytes, as in the paper: 100,000 points of 40 bytes are its 4.0 MB.
 """
 
 from __future__ import annotations
@@ -37,11 +36,11 @@ Energies = Mapping[Part, Energy]
 class Plan:
     """The amount of measurements."""
 
-    frames: int = 40  # of the sequence that are timed, after ``warm_up``
-    warm_up: int = 5  # frames before them, which are run but not counted
+    frames: int = 40  # number of timed frames, after ``warm_up``
+    warm_up: int = 5  # number of frames before them, which are run but not counted
     threads: int | None = None  # of torch and numba on the CPU; None = all cores that this process may use
-    seconds: float = 3.0  # shortest window of energy [s]
-    windows: int = 3  # of energy per part
+    seconds: float = 3.0  # shortest energy window [s]
+    windows: int = 3  # energy windows per part
 
 
 def measure(
@@ -58,11 +57,13 @@ def measure(
     network, or has one member where it needs several, is left out and named in the result.
 
     Args:
-        rows, networks, sequence: different ones; by base.
-        device: of the networks, on which they lie.
+        rows: without duplicates.
+        networks: by base.
+        sequence: with images.
+        device: on which the networks are.
         multiview_device: of UfM and UfM*; the paper runs them on the CPU.
-        plan: how much; None = the defaults.
-        meter: of energy; None = what this machine has.
+        plan: amount of measurements; None = the defaults.
+        meter: of energy; None = this machine's meters.
 
     Raises:
         ValueError: no row can be measured, or too few frames can be read.
@@ -101,12 +102,12 @@ def measure(
 
 
 def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
-    """Measure the rows on the sequences of an evaluation, and write their means to OUT/efficiency.json, those of the
-    job's further architectures under "further". UfM and UfM* run on the CPU, as the paper's do. Sequences may have
-    fewer frames than the plan; its windows of energy are divided among them.
+    """Measure the rows on the sequences of an evaluation, and write their means to OUT/efficiency.json; the means of
+    the job's further architectures are under "further". UfM and UfM* run on the CPU, as in the paper. Sequences may
+    have fewer frames than the plan. The energy windows are divided among the sequences.
 
     Raises:
-        ValueError: no sequence can be opened, none has frames enough, or no row can be measured.
+        ValueError: no sequence can be opened, none has enough frames, or no row can be measured.
         OSError: the file cannot be written.
     """
     plan = plan or Plan()
@@ -124,8 +125,8 @@ def _over_items(job: EvalJob, plan: Plan, choices: Mapping[str, NetworkChoice]) 
     for item in job.items:
         try:
             sequence = item.open()
-            of_item = replace(plan, frames=max(1, min(plan.frames, len(sequence) - plan.warm_up)))
-            result = measure(job.suite.rows, networks, sequence, device=device, plan=of_item)
+            item_plan = replace(plan, frames=max(1, min(plan.frames, len(sequence) - plan.warm_up)))
+            result = measure(job.suite.rows, networks, sequence, device=device, plan=item_plan)
             measured[item.dataset, item.sequence] = result
         except (OSError, ValueError) as error:
             failed.append(f"{item.label}: {error}")
@@ -135,16 +136,16 @@ def _over_items(job: EvalJob, plan: Plan, choices: Mapping[str, NetworkChoice]) 
 
 
 def over_sequences(measured: Mapping[tuple[str, str], Mapping[str, Any]]) -> dict[str, Any]:
-    """Average the results of :func:`measure` over sequences, by (data set, sequence): every number is the mean, and
-    "sequences" has the energy, gross, of uncertainty on each of them [mJ], None where a part was not measured."""
+    """Average every number of the results of :func:`measure` over sequences, by (data set, sequence). "sequences" has
+    each sequence's gross energy of uncertainty [mJ], None if a part was not measured."""
     runs = list(measured.values())
     single = []
     for (dataset, name), run in measured.items():
         energy = {}
         for row in run["rows"]:
             parts = [part for key, part in row["energy"].items() if key != DEPTH and "none" not in part]
-            known = all("gross" in part for part in parts)
-            energy[row["row"]] = sum(max(0.0, p["gross"]["millijoules"]) for p in parts) if known else None
+            complete = all("gross" in part for part in parts)
+            energy[row["row"]] = sum(max(0.0, p["gross"]["millijoules"]) for p in parts) if complete else None
         single.append({"dataset": dataset, "sequence": name, "energy_mj": energy})
     mean: dict[str, Any] = _mean(runs)
     if len(runs) > 1:
@@ -153,7 +154,7 @@ def over_sequences(measured: Mapping[tuple[str, str], Mapping[str, Any]]) -> dic
 
 
 def _mean(values: Sequence[Any]) -> Any:
-    """The mean of equal structures of plain values; where they differ, or are no numbers, the first."""
+    """The mean of plain values of equal structure; the first where structures differ or values are not numbers."""
     first = values[0]
     if isinstance(first, Mapping) and all(isinstance(v, Mapping) and v.keys() == first.keys() for v in values):
         return {name: _mean([value[name] for value in values]) for name in first}
@@ -162,15 +163,15 @@ def _mean(values: Sequence[Any]) -> Any:
 
 
 def _obstacle(row: Row, networks: Mapping[str, TimedNetwork]) -> str | None:
-    """The reason for which a row cannot be measured."""
+    """The reason why a row cannot be measured, or None."""
     base, setting = row.method.base, row.setting
     if base not in networks:
         return f"no network for {base}"
     if row.method.every_member and networks[base].passes == 1:
         return f"it runs several members, {networks[base].label} has one"
     if setting.skip or setting.pose_noise:
-        return "left out frames and noise on poses are no matter of efficiency"
-    return None if setting.anchors in ANCHORS else f"anchors of {setting.anchors!r} have no cost of their own"
+        return "skipped frames and noise on poses do not affect efficiency"
+    return None if setting.anchors in ANCHORS else f"anchors of {setting.anchors!r} have no cost to measure"
 
 
 def _unit(device: torch.device) -> str:
@@ -181,7 +182,7 @@ def _unit(device: torch.device) -> str:
 
 
 def _network_line(network: TimedNetwork, parts: TimedParts, energy: Energies) -> dict[str, Any]:
-    """A base's networks: what they are, and what depth alone and each form of inference take."""
+    """A base's networks: label and members, and the cost of depth alone and of each form of inference."""
     forms = [form for form in (DEPTH, ONCE, EVERY) if parts.ms(network.base, form)]
     return {
         "label": network.label,
@@ -197,7 +198,7 @@ def _network_line(network: TimedNetwork, parts: TimedParts, energy: Energies) ->
 def _row_line(row: Row, network: TimedNetwork, parts: TimedParts, energy: Energies) -> dict[str, Any]:
     """One line of the table."""
     base, form, name = row.method.base, inference_of(row), row.label
-    unknown: dict[str, str] | None = None  # why the network's share for uncertainty is nothing or unknown
+    unknown: dict[str, str] | None = None  # why the network's cost of uncertainty is zero or unknown
     if base == "depth_only":
         unknown = {"none": "the method needs only depth of the network"}
     elif network.why_whole is not None and not row.method.every_member:
@@ -232,7 +233,7 @@ def overhead_percent(uncertainty: float, depth: float) -> float:
 
 
 def _energy_overhead(energies: Mapping[str, Energy]) -> dict[str, float] | None:
-    """Share of uncertainty in all energy [%], negative differences as nothing; None unless all was measured."""
+    """Share of uncertainty in all energy [%], negative differences as 0; None unless every part was measured."""
     joules = {key: max(0.0, float(np.median(e[:, 0]))) for key, e in energies.items() if not isinstance(e, str)}
     depth = joules.pop(DEPTH, 0.0)
     measured = depth and len(joules) + 1 == len(energies)
@@ -240,7 +241,7 @@ def _energy_overhead(energies: Mapping[str, Energy]) -> dict[str, float] | None:
 
 
 def _memory(memory: Mapping[str, int] | None, state: Mapping[str, float] | None) -> dict[str, Any]:
-    """Bytes of the network for depth, of what uncertainty adds to it, and of the multiview state; the share."""
+    """Bytes of the network for depth, of its uncertainty, and of the multiview state; the share of uncertainty."""
     if memory is None:
         return {"multiview": state, "not_measurable": "the weights are not torch's tensors"}
     uncertainty = memory["uncertainty"] + (0 if state is None else state["bytes_end"])

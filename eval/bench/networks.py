@@ -31,14 +31,14 @@ class TimedNetwork:
     """The loaded network(s) of a base (a key of ``methods.method.BASES``), on one device and in eval mode.
 
     Args:
-        base: see above.
-        members: in the order of their turns; for "mc_dropout" one network that samples by itself.
-        label: the architecture as shown, "FastDepth". Bases of one label share a part of the table.
+        base: key of ``BASES``.
+        members: in the order in which they alternate; for "mc_dropout" one network, which samples.
+        label: displayed name of the architecture, "FastDepth". Bases with the same label share a section of the table.
         samples: of "mc_dropout", passes per image of the multi-inference baseline.
 
     Attributes:
-        passes: inferences that all members, or all samples, take.
-        depth: the network without anything that uncertainty adds: of the first member, a copy.
+        passes: number of inferences of all members, or of all samples.
+        depth: a copy of the first member without its uncertainty (``depth_alone``).
         why_whole: None, or why ``depth`` is the whole network instead.
     """
 
@@ -52,9 +52,8 @@ class TimedNetwork:
         self.why_whole = None if alone else f"a {type(opened[0]).__name__} predicts all that it predicts in one"
 
     def predict(self, part: str, x: Tensor, intrinsics: Tensor, *, turn: int = 0) -> DepthPrediction:
-        """A ``part`` for the networks' input x [1, 3, H, W] with intrinsics [1, 3, 3] [px]: depth without uncertainty
-        ("depth"), with it by the member whose turn it is at image ``turn`` ("once"), or by "every" member (or sample)
-        one after the other, combined."""
+        """Predict with one ``part`` from the networks' input x [1, 3, H, W] with intrinsics [1, 3, 3] [px]: "depth"
+        without uncertainty, "once" by the member of image ``turn``, or "every" member (or sample), combined."""
         with torch.inference_mode():
             if part == DEPTH:
                 prediction: DepthPrediction = infer(self.depth, x, intrinsics)
@@ -69,8 +68,8 @@ class TimedNetwork:
         return self.preprocess(image_tensor(frame).to(device), K)
 
     def memory(self) -> dict[str, int] | None:
-        """Bytes of the weights and buffers of "depth" alone, and of all else as "uncertainty"; None where weights are
-        not known (a wrapped function's)."""
+        """Bytes of the weights and buffers of "depth" alone, and of the rest as "uncertainty"; None if the weights are
+        unknown (those of a wrapped function)."""
         everything, alone = weight_bytes(*self.members), weight_bytes(self.depth)
         if not everything:
             return None
@@ -78,7 +77,7 @@ class TimedNetwork:
 
 
 def weight_bytes(*modules: nn.Module) -> int:
-    """Bytes of the parameters and buffers of modules, and of files that ONNX Runtime runs; shared ones count once."""
+    """Bytes of the parameters and buffers of modules, and of ONNX Runtime's files. Shared tensors count once."""
     graphs = {m.path for module in modules for m in module.modules() if isinstance(m, OnnxNetwork)}
     tensors = (t for module in modules for t in (*module.parameters(), *module.buffers()) if t.numel())
     return sum({(t.data_ptr(), t.nbytes): t.nbytes for t in tensors}.values()) + sum(
@@ -87,8 +86,8 @@ def weight_bytes(*modules: nn.Module) -> int:
 
 
 def timed_networks(sources: Mapping[str, DepthSource], rows: Sequence[Row] = ()) -> dict[str, TimedNetwork]:
-    """The networks of an evaluation by base, without ground truth, for which no network runs. Images are prepared as
-    the first of the ``rows`` of a base has it."""
+    """The networks of an evaluation by base; the base "ground truth" has none. Images are prepared as in the first of
+    the ``rows`` of a base."""
     how = {row.method.base: row.setting.preprocess for row in reversed(rows)}
     timed = {b: TimedNetwork(b, one.networks, one.label, one.passes) for b, one in sources.items() if one.networks}
     for base, network in timed.items():
@@ -97,8 +96,8 @@ def timed_networks(sources: Mapping[str, DepthSource], rows: Sequence[Row] = ())
 
 
 def depth_alone(network: DepthNetwork) -> DepthNetwork | None:
-    """A copy of a network without what uncertainty adds: heads, sampling, factors of a BatchEnsemble. A graph of ONNX
-    Runtime that declares nothing but depth is returned as it is; None where its kind has no known division."""
+    """A copy of a network without heads, sampling or factors of a BatchEnsemble. An ONNX graph that declares only depth
+    is returned unchanged. None if depth cannot be separated from uncertainty."""
     if isinstance(network, MonteCarloDropout):
         return depth_alone(network.network)
     if isinstance(network, BatchEnsembleMember):

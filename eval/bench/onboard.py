@@ -1,7 +1,6 @@
-"""The paper's last demonstration: a quantised FastDepth with an aleatoric head, live, among things of varying scale.
+"""The paper's "System demonstration": a quantised FastDepth with an aleatoric head, live, among objects of many sizes.
 
-Section "System demonstration": UfM* in real time on two cores, and disagreement that is high where the aleatoric
-variance is low.
+UfM* runs in real time on two cores, and its disagreement is high where the aleatoric variance is low.
 """
 
 from __future__ import annotations
@@ -37,9 +36,9 @@ from ufmstar_torch.pipeline import UncertainDepth
 
 FPS = 30.0
 GRAPH, PICTURE = "onboard_int8.onnx", "onboard.png"
-_PATH, _WALKED = 900, 300  # frames of the whole way, at a walking pace; and of the part that is gone to and fro
+_PATH, _WALKED = 900, 300  # frames of the whole path at walking pace, and of the part that is walked back and forth
 _CALIBRATION = 24  # images of another tour, for the ranges of the activations
-_SIZES = {(160, 224): (160, 224)}  # of the images, by that of the network's input; else a VGA camera's half
+_SIZES = {(160, 224): (160, 224)}  # size of the images by that of the network's input; default: half of VGA
 _HALF_VGA = (240, 320)
 _ROWS, _MARKED = 4, np.array([0, 213, 255])
 Report = Callable[[Progress], None]
@@ -47,7 +46,7 @@ Report = Callable[[Progress], None]
 
 @dataclass(frozen=True, eq=False)
 class Contrast:
-    """The maps [h, w] of a frame: the network's sigma, sqrt(M) and |error| [m], and the pixels that can be judged."""
+    """The maps [h, w] of a frame: the network's sigma, sqrt(M) and |error| [m], and the pixels with ground truth."""
 
     image: NDArray[np.uint8]
     aleatoric_sigma: NDArray[np.float32]
@@ -57,7 +56,7 @@ class Contrast:
 
     @property
     def confident(self) -> NDArray[np.bool_]:
-        """True where the network's own variance is in the lower half of the frame's."""
+        """True where the network's variance is in the lower half of the frame's."""
         limit = np.quantile(self.aleatoric_sigma[self.usable], 0.5) if self.usable.any() else -math.inf
         return self.usable & (self.aleatoric_sigma <= limit)
 
@@ -69,11 +68,19 @@ class Contrast:
 
 
 def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: Report) -> dict[str, Any]:
-    """Run live for some seconds of 30 images each in the rooms of a seed, then judge the frames, and draw the picture.
-    ``out`` gets the quantised graph and the picture; ``weights`` are networks of ``ufmstar train``, of which the first
-    is quantised, or a FastDepth (.onnx, .tflite) as it is. Raises FileNotFoundError, ValueError, ModuleNotFoundError:
-    the network cannot be loaded or quantised."""
-    network, about = _network(weights, out, seed)
+    """Run live at 30 images/s in the rendered rooms of a seed, then evaluate the frames and draw the picture.
+
+    Args:
+        out: folder for the quantised graph and the picture.
+        weights: file of ``ufmstar train``, whose first network is quantised; or a FastDepth (.onnx, .tflite).
+        seconds: duration of the live run [s].
+        seed: of the rooms.
+        progress: receives the progress.
+
+    Raises:
+        FileNotFoundError, ValueError, ModuleNotFoundError: the network cannot be loaded or quantised.
+    """
+    network, description = _network(weights, out, seed)
     h, w = network.preprocess.size or _HALF_VGA
     way = tour_sequence(seed, frames=_PATH, size=_SIZES.get((h, w), _HALF_VGA), style="scales")
     part = replace(way, entries=way.entries[:_WALKED])
@@ -81,7 +88,11 @@ def run_onboard(out: Path, weights: Path, seconds: float, seed: int, progress: R
     config = UfMStarConfig(on_bad_frame="skip")
     warm_up_command(config, progress)
     model = UncertainDepth(network, config)
-    summary = {"network": about, "realtime": _live(model, sequence, seconds, progress), "load_average": load_average()}
+    summary = {
+        "network": description,
+        "realtime": _live(model, sequence, seconds, progress),
+        "load_average": load_average(),
+    }
     contrasts = _contrasts(UncertainDepth(network, config), sequence)
     if contrasts:
         summary["contrast"] = contrast_figures(contrasts)
@@ -103,8 +114,8 @@ def _network(weights: Path, out: Path, seed: int) -> tuple[DepthNetwork, dict[st
         pairs = [(network(x).depth, graph(x).depth) for x in inputs[1::2]]
     shift = torch.cat([((b - a).abs() / a).flatten() for a, b in pairs])
     levels = torch.tensor([0.5, 0.99])
-    about = dict(zip(("median", "p99"), shift.quantile(levels).tolist(), strict=True))
-    return graph, {"file": weights.name, "quantised": "int8, ONNX Runtime", "threads": threads, "depth_shift": about}
+    shifts = dict(zip(("median", "p99"), shift.quantile(levels).tolist(), strict=True))
+    return graph, {"file": weights.name, "quantised": "int8, ONNX Runtime", "threads": threads, "depth_shift": shifts}
 
 
 def _input(network: DepthNetwork, frame: Frame) -> torch.Tensor:
@@ -151,8 +162,8 @@ def _contrasts(model: UncertainDepth, sequence: FrameSequence) -> list[Contrast]
 
 
 def contrast_figures(contrasts: list[Contrast]) -> dict[str, float]:
-    """RMSE [m] where the network is confident, at high disagreement and elsewhere; its sigma and sqrt(M) [m] at high
-    disagreement; and the share of these pixels."""
+    """RMSE [m] where the network is confident, at high disagreement and elsewhere; the network's sigma and sqrt(M) [m]
+    at high disagreement; and the share of pixels with high disagreement."""
     high = [c.contradicted for c in contrasts]
     low = [c.confident & ~c.contradicted for c in contrasts]
 

@@ -1,7 +1,7 @@
-"""The parts of every row on every frame, in turn, so that a busy machine slows all of them alike.
+"""Times the parts of every row on every frame, alternately, so that other load slows all parts equally.
 
-A frame's networks run first, then the multiview steps on their predictions; odd frames in the reverse order. What
-uncertainty adds to a network is the difference of two calls on one frame.
+A frame's networks run first, then the multiview steps on their predictions; odd frames use the reverse order. The cost
+of a network's uncertainty is the difference of two calls on one frame.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class MultiviewStep:
     def __call__(
         self, image: Tensor | None, frame: Frame, prediction: DepthPrediction, *, first: bool = False
     ) -> Answer:
-        """Move a frame's maps to the device, track landmarks in its ``image`` [1, 3, H, W], and run the step; the
-        ``first`` one begins with an empty state."""
+        """Move a frame's maps to the device, track landmarks in its ``image`` [1, 3, H, W], and run the step.
+        ``first`` resets the state before."""
         if first:
             assert isinstance(self.estimator, Pointwise | Gaussians)
             self.estimator.ufm.reset()
@@ -60,7 +60,7 @@ class MultiviewStep:
         return self.estimator.update(prediction.to(self._device), T, anchors)
 
     def memory(self) -> dict[str, float]:
-        """Bytes and number of the points or components, with what anchors add; bytes of the map for smoothing."""
+        """Bytes of the state, that of anchors included; number of points or components; bytes of the smoothing map."""
         memory = self.estimator.memory()
         landmarks = {} if self._landmarks is None else self._landmarks.state()
         state_bytes = memory["bytes"] + sum(value.nbytes for value in landmarks.values())
@@ -68,15 +68,15 @@ class MultiviewStep:
 
 
 class TimedParts:
-    """The parts that were run on the frames, and their times. On odd frames the parts run in the reverse order: no part
-    always follows the same neighbour, and a busy machine slows all parts of a frame alike.
+    """The parts that were run on the frames, and their times. On odd frames the parts run in the reverse order, so that
+    no part always follows the same one.
 
     Attributes:
         warm_up: frames at the beginning that are not counted.
         calls: the parts that were run, one call per frame, which can be repeated in this order; each returns when its
             device has finished.
         staged: by row's label, the stages of UfM*.
-        memory: by row's label, what the multiview step keeps after the last frame.
+        memory: by row's label, the memory of the multiview step after the last frame.
         size: of the depth maps, "224 x 224" [px].
     """
 
@@ -88,11 +88,11 @@ class TimedParts:
         self._ms: dict[Part, list[float]] = {}
 
     def ms(self, owner: str, part: str) -> list[float]:
-        """Times of a part [ms], one per frame after the warm-up; none if it was not run."""
+        """Times of a part [ms], one per frame after the warm-up; empty if it was not run."""
         return self._ms.get((owner, part), [])[self.warm_up :]
 
     def run(self, number: int, calls: Mapping[Part, Callable[[], Any]], device: torch.device) -> dict[Part, Any]:
-        """Time the parts of frame ``number`` on a device; what they return."""
+        """Time the parts of frame ``number`` on a device. Returns the parts' results."""
         results = {}
         for part in list(calls)[:: -1 if number % 2 else 1]:
             call = partial(_finish, calls[part], device)
@@ -112,7 +112,7 @@ def _finish(call: Callable[[], Any], device: torch.device) -> Any:
 
 
 def inference_of(row: Row) -> str:
-    """The form of inference that a row gets its prediction from."""
+    """The form of inference of a row's prediction."""
     return EVERY if row.method.every_member else ONCE
 
 

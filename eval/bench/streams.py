@@ -1,4 +1,4 @@
-"""The time of UfM* on many streams at once."""
+"""Times UfM* on batches of streams."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from ufmstar_torch.eval.engine.clock import synchronize
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.ufmstar import UfMStar
 
-_SLOTS = 1024  # a graph needs room that does not grow
-Given = tuple[Tensor, Tensor, Tensor]
+_SLOTS = 1024  # a CUDA graph needs a fixed capacity
+StepInputs = tuple[Tensor, Tensor, Tensor]
 
 
 def time_streams(
@@ -33,17 +33,17 @@ def time_streams(
         sequence: with images.
         counts: numbers of streams.
         device: of the network and of UfM*.
-        plan: of ``measure.measure``, with threads.
+        plan: as for ``measure.measure``, with threads.
 
     Returns:
-        For every count "streams", "step" and, on CUDA, "graph" (:class:`~ufmstar_torch.capture.Captured`), times [ms]
-        of a frame of all streams.
+        For every count "streams", "step" and, on CUDA, "graph" (:class:`~ufmstar_torch.capture.Captured`): times [ms]
+        of one frame of all streams.
     """
     config = UfMStarConfig(on_bad_frame="skip", initial_capacity=_SLOTS, max_components=_SLOTS)
     lines = []
     with pinned_threads(plan.threads or 1):
         frames = [
-            _given(network, frame, device)
+            _step_inputs(network, frame, device)
             for frame in islice(sequence.readable(lambda error: None), plan.warm_up + plan.frames)
         ]
         for count in counts:
@@ -63,11 +63,11 @@ def time_streams(
     return lines
 
 
-def _given(network: TimedNetwork, frame: Frame, device: torch.device) -> Given:
+def _step_inputs(network: TimedNetwork, frame: Frame, device: torch.device) -> StepInputs:
     """Depth [1, H, W], pose [1, 4, 4] and intrinsics [1, 3, 3] of a frame; the camera stays on the CPU."""
     x, K = network.prepare(frame, device)
     return network.predict(DEPTH, x, K).depth.clone(), torch.from_numpy(frame.T_world_cam)[None], K.cpu().double()
 
 
-def _copies(given: Given, count: int) -> list[Tensor]:
-    return [value.expand(count, *value.shape[1:]).contiguous() for value in given]
+def _copies(inputs: StepInputs, count: int) -> list[Tensor]:
+    return [value.expand(count, *value.shape[1:]).contiguous() for value in inputs]

@@ -1,7 +1,7 @@
 """Statistics of times, the stages of a step, and a fixed number of threads.
 
-Wall-clock times on a machine with other load have a long upper tail: the median and the quartiles, which the tail
-hardly moves, and the minimum are reported.
+Wall-clock times on a machine with other load have a long upper tail, so the median, the quartiles and the minimum are
+reported.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.engine.clock import synchronize
 from ufmstar_torch.eval.run.machine import available_cores
 
-# Every moment of a step belongs to one of these; see ``ufmstar_torch.step_parts.StepObserver``.
+# The stages of a step, without gaps between them; see ``ufmstar_torch.step_parts.StepObserver``.
 STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
 _CPU = torch.device("cpu")
 
 
 def most_threads() -> int:
-    """The cores of this process, or as many threads as numba may start (``NUMBA_NUM_THREADS``)."""
+    """The number of cores of this process, at most ``NUMBA_NUM_THREADS``."""
     numba: Any = import_module("numba")
     return min(available_cores(), int(numba.config.NUMBA_NUM_THREADS))
 
@@ -34,7 +34,7 @@ def most_threads() -> int:
 @contextmanager
 def pinned_threads(count: int) -> Iterator[None]:
     """Set the number of threads of torch, numba and OpenCV; restore the previous numbers afterwards. Raises ValueError:
-    ``count`` is not positive or more than numba has started."""
+    ``count`` is not positive, or larger than numba's number of threads."""
     numba: Any = import_module("numba")
     if not 1 <= count <= numba.config.NUMBA_NUM_THREADS:
         raise ValueError(f"threads must be 1 to {numba.config.NUMBA_NUM_THREADS} (numba's), got {count}")
@@ -61,15 +61,15 @@ def spread(milliseconds: Sequence[float]) -> dict[str, float | int]:
 
 
 def paired_ratio(numerator: Sequence[float], denominator: Sequence[float]) -> dict[str, float | int]:
-    """Median and quartiles of the ratios of measurements taken one right after the other. Another program that slows
-    both down for a while then cancels, as it does not in a ratio of medians."""
+    """Median and quartiles of the ratios of consecutive measurements. A load that slows both down cancels, which it
+    does not in a ratio of medians."""
     low, middle, high = np.percentile(np.divide(numerator, denominator), (25, 50, 75)).tolist()
     return {"median": middle, "q1": low, "q3": high, "count": len(numerator)}
 
 
 class StagedStep:
-    """Times the stages of UfM*'s steps: the observer (``ufmstar_torch.step_parts.StepObserver``) of a module on a
-    device, which ``step`` runs once. The output's assembly after the last stage belongs to none."""
+    """Times the stages of UfM*'s steps, as the observer (``ufmstar_torch.step_parts.StepObserver``) of a module on a
+    device. ``step`` runs the module once. The assembly of the output, after the last stage, is not timed."""
 
     def __init__(self, module: UfMStar, step: Callable[..., Any], device: torch.device = _CPU) -> None:
         self.module, self._step, self._device = module, step, device
@@ -82,14 +82,14 @@ class StagedStep:
         return self._step(*args)
 
     def stage(self, name: str) -> None:
-        """A stage has ended."""
+        """Record the time of the stage that has ended."""
         synchronize(self._device)
-        now = time.perf_counter()
-        self.stages[name].append(1000 * (now - self._before))
-        self._before = now
+        end = time.perf_counter()
+        self.stages[name].append(1000 * (end - self._before))
+        self._before = end
 
     def summary(self, *, warm_up: int) -> dict[str, Any]:
-        """Spread of every stage and of the steps' sums; the first ``warm_up`` steps do not count."""
+        """Spread of every stage's times and of their sums per step, without the first ``warm_up`` steps."""
         return {
             "stages": {name: spread(times[warm_up:]) for name, times in self.stages.items()},
             "stages_total": spread(np.sum(list(self.stages.values()), axis=0)[warm_up:]),

@@ -1,10 +1,10 @@
 """Checks a sequence's depth, poses and images against each other, by warping depth between its frames and by corners
 tracked in its images.
 
-Wrong conventions are silent: inverted poses or millimetres read as metres give a variance map that is
-merely wrong. Depth of one frame, moved into a later one, must agree with that frame's depth, and corners must move as
-poses and intrinsics say; the check also tries what people get wrong (inverse poses, other axes, another depth scale,
-intrinsics of another size, a late trajectory) and names what fits.
+Wrong conventions raise no error: inverted poses or millimetres read as metres give a variance map that is merely
+wrong. Depth of one frame, warped into a later one, must agree with that frame's depth, and tracked corners must agree
+with poses and intrinsics. The check also tries common mistakes (inverse poses, other axes, another depth scale,
+intrinsics of another size, a late trajectory) and reports the one that fits.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from typing import NamedTuple
 import numpy as np
 
 from ufmstar_torch.eval.check.depth_image_fit import DepthImageFit, depth_image_fit
-from ufmstar_torch.eval.check.image_fit import GIVEN, ImageFit, image_fit, track_corners
+from ufmstar_torch.eval.check.image_fit import UNCHANGED, ImageFit, image_fit, track_corners
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 from ufmstar_torch.frame import doubtful_centre
 
 _SCALES = 10.0 ** np.arange(-4, 4.01, 0.125)
 _POINTS = 2000
-# Share of a frame's points that must land on valid depth, of those that would if all fell into the image, or a pair
-# means nothing; a laser's map has values at few pixels only.
+# A pair is compared if at least this share of its points lands on valid depth. The share is relative to the filled
+# part of the map, because a laser's map has values at few pixels only.
 _MIN_OVERLAP = 0.3
 _GAPS = (5, 3, 2, 1)
-# A reading is no better than another within this factor and this relative error (depth's own noise).
+# Two readings are equally good within this factor and this relative error (the noise of depth).
 _SAME_FACTOR, _SAME_ERROR = 1.5, 0.003
 _MAX_ERROR = 0.05  # above it no reading explains the data; registered sequences are at .001 to .02
-# Nearer to 1 a scale is noise (1.15 was estimated from four pairs of fr1/xyz) or calibration, no mistake.
+# A scale within this factor of 1 is noise (1.15 was estimated from four pairs of fr1/xyz) or calibration.
 _SCALE_TOLERANCE = 1.25
 # See depth_image_fit(): with 10 frames, registered recordings have at least .5, displaced ones at most .2.
 _ALIGNED, _NOT_ALIGNED, _REGISTRATION_FRAMES = 0.4, 0.25, 12
@@ -41,16 +41,16 @@ _READING, _DISAGREE, _APART = "the poses look", "depth and poses disagree", "no 
 class SequenceCheck:
     """Outcome of :func:`check_sequence`."""
 
-    pairs: int  # compared, of frames ``gap`` apart
-    gap: int
-    error: float  # median relative error of warped depth, as the sequence is given; inf without overlap
-    poses: str  # the reading of the poses that fits best, by the name that ``open_sequence`` takes,
-    scale: float  # by what depth must be multiplied then,
-    best_error: float  # and the error with both
-    registration: DepthImageFit | None  # how depth lies on the image, None where it was not checked
-    images: ImageFit | None  # how poses and intrinsics fit the images, None where no corner could be followed
+    pairs: int  # number of compared pairs of frames
+    gap: int  # frames between the two of a pair
+    error: float  # median relative error of warped depth without correction; inf without overlap
+    poses: str  # convention of the poses that fits best, as ``open_sequence`` names it
+    scale: float  # factor of depth that fits best with ``poses``
+    best_error: float  # median relative error with ``poses`` and ``scale``
+    registration: DepthImageFit | None  # alignment of depth and image edges, None if it was not checked
+    images: ImageFit | None  # fit of poses and intrinsics to the images, None if no corner could be tracked
     problems: tuple[str, ...]
-    undecided: tuple[str, ...]  # what this sequence leaves open
+    undecided: tuple[str, ...]  # questions that this sequence's data cannot answer
 
     @property
     def ok(self) -> bool:
@@ -59,7 +59,7 @@ class SequenceCheck:
 
 
 class _Pair(NamedTuple):
-    """Points of one frame [3, N] and the frame in which they are looked up."""
+    """Points [3, N] of frame a, and frame b, in which their depth is compared."""
 
     points: np.ndarray
     T_world_a: np.ndarray
@@ -81,8 +81,8 @@ def check_sequence(sequence: FrameSequence, pairs: int = 8) -> SequenceCheck:
 
 
 def warp_error(pair: _Pair, poses: str, scale: float) -> float:
-    """Median |log(z warped / depth there)| of a pair; inf where too few points land on valid depth. Depth times
-    ``scale`` is the same as positions divided by ``scale``, which leaves the comparison in the unit of the files."""
+    """Median |log(warped z / depth)| of a pair; inf if too few points land on valid depth. Positions are divided by
+    ``scale``, which is equivalent to depth times ``scale`` and keeps the unit of the files."""
     convert = CONVENTIONS[poses].convert
     T_b_a = np.linalg.inv(convert(pair.T_world_b)) @ convert(pair.T_world_a)
     x, y, z = T_b_a[:3, :3] @ pair.points + T_b_a[:3, 3:] / scale
@@ -109,7 +109,7 @@ class _Check:
         self.undecided: list[str] = []
 
     def geometry(self, count: int) -> tuple[int, int, float, str, float, float]:
-        """Check poses and depth scale; the first six fields of the outcome."""
+        """Check poses and depth scale. Returns the first six fields of :class:`SequenceCheck`."""
         if not self.sequence.posed:
             self.undecided.append("there are no poses: methods that compare views cannot be run")
             return 0, 0, float("nan"), OURS, 1.0, float("nan")
@@ -127,32 +127,32 @@ class _Check:
             self.undecided.append("no two readable frames have depth, whose scale and poses could be compared")
             return 0, 0, float("nan"), OURS, 1.0, float("nan")
         poses = min(errors, key=lambda name: float(errors[name].min()))
-        around = _SCALES[int(np.argmin(errors[poses]))]
-        fine = around * 10.0 ** np.linspace(-0.125, 0.125, 21)
+        coarse = _SCALES[int(np.argmin(errors[poses]))]
+        fine = coarse * 10.0 ** np.linspace(-0.125, 0.125, 21)
         fine_errors = _errors(pairs, poses, fine)
         scale, best = float(fine[int(np.argmin(fine_errors))]), float(fine_errors.min())
-        given = float(_errors(pairs, OURS, np.ones(1))[0])
-        if _as_good(given, best):
+        error = float(_errors(pairs, OURS, np.ones(1))[0])
+        if _as_good(error, best):
             poses = OURS
         if _as_good(float(_errors(pairs, poses, np.ones(1))[0]), best):
             scale = 1.0
-        self._judge_geometry(errors, given, best, poses, scale)
-        return len(pairs), gap, given, poses, scale, best
+        self._judge_geometry(errors, error, best, poses, scale)
+        return len(pairs), gap, error, poses, scale, best
 
     def images(self) -> ImageFit | None:
-        """Check poses and intrinsics with tracked corners; what they name explains why no depth fits."""
+        """Check poses and intrinsics with tracked corners. Their problem replaces those that it explains."""
         fit = image_fit(self.sequence, track_corners(self.sequence))
         size = self.sequence.image_size
         if size is not None and (centre := doubtful_centre(self.sequence.intrinsics.tolist(), size)):
             self.problems.append(centre)
         if fit is not None and fit.problem and not any(_READING in problem for problem in self.problems):
-            if fit.reading != GIVEN:
+            if fit.reading != UNCHANGED:
                 self.problems = [p for p in self.problems if _DISAGREE not in p and _APART not in p]
             self.problems.append(fit.problem)
         return fit
 
     def registration(self) -> DepthImageFit | None:
-        """Check how depth lies on the image, where the depth maps claim to lie there."""
+        """Check the registration of depth to the images, unless the depth maps have their own intrinsics."""
         if self.sequence.depth_intrinsics is not None:
             return None
         indices = np.unique(np.linspace(0, len(self.sequence) - 1, _REGISTRATION_FRAMES).astype(int))
@@ -171,7 +171,7 @@ class _Check:
         return fit
 
     def _read(self, index: int) -> tuple[Frame, np.ndarray] | None:
-        """A frame and its depth, if it has any and can be decoded."""
+        """A frame and its depth, or None if it has no depth or cannot be decoded."""
         try:
             frame = self.sequence[index]
         except FrameError:  # counted by ``data_check``
@@ -179,13 +179,13 @@ class _Check:
         return None if frame.depth is None or not (frame.depth > 0).any() else (frame, frame.depth)
 
     def _judge_geometry(
-        self, errors: dict[str, np.ndarray], given: float, best: float, poses: str, scale: float
+        self, errors: dict[str, np.ndarray], error: float, best: float, poses: str, scale: float
     ) -> None:
-        """Note problems and undecided questions of poses and depth scale."""
+        """Add problems and undecided questions of poses and depth scale."""
         if not np.isfinite(best):
             self.problems.append(f"{_APART} under any reading of the poses")
             return
-        as_given = f"by {given:.1%} as given" if np.isfinite(given) else "as given frames do not overlap"
+        as_given = f"by {error:.1%} as given" if np.isfinite(error) else "as given frames do not overlap"
         measured = f"warped depth is off by {best:.1%} then, {as_given}"
         if best > _MAX_ERROR:
             self.problems.append(f"{_DISAGREE} under every reading tried ({measured})")
@@ -195,13 +195,13 @@ class _Check:
         if not 1 / _SCALE_TOLERANCE < scale < _SCALE_TOLERANCE:
             size = "small" if scale > 1 else "large"
             self.problems.append(f"depth looks too {size}: times {scale:.3g} fits ({measured})")
-        alike = [name for name in errors if name != poses and _as_good(float(errors[name].min()), best)]
-        if alike:
-            others = ", or ".join(CONVENTIONS[name].description for name in alike)
+        equivalent = [name for name in errors if name != poses and _as_good(float(errors[name].min()), best)]
+        if equivalent:
+            others = ", or ".join(CONVENTIONS[name].description for name in equivalent)
             self.undecided.append(f"the motion does not tell the poses from {others}")
-        fitting = _SCALES[[_as_good(float(error), best) for error in errors[poses]]]
+        fitting = _SCALES[[_as_good(float(value), best) for value in errors[poses]]]
         if fitting.size and fitting.max() / fitting.min() > 4:
-            self.undecided.append("the motion is too small, beside the depth, to tell the depth's scale")
+            self.undecided.append("the motion is too small, relative to the depth, to tell the depth's scale")
 
 
 def _pair(first: Frame, first_depth: np.ndarray, second: Frame, second_depth: np.ndarray) -> _Pair:

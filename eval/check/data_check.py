@@ -12,21 +12,21 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.eval.check.check import SequenceCheck, check_sequence
-from ufmstar_torch.eval.check.image_fit import GIVEN
+from ufmstar_torch.eval.check.image_fit import UNCHANGED
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.eval.sequences.poses import OURS
 
-# Frames that are read to see that they can be; of more, as many evenly spaced ones: seconds.
+# Largest number of frames that are decoded (evenly spaced, to take seconds), and of rendered ones.
 _DECODED, _RENDERED = 500, 12
-_SAMPLED = 4096  # pixels of each of them, for the range of depth
+_SAMPLED = 4096  # pixels sampled in each frame for the range of depth
 _QUANTILES = (0.01, 0.99)
-# Scales that are customary [m per unit]; one within the check's own tolerance of the measured one is meant.
+# Customary scales [m per unit], and the factor within which the measured scale is rounded to one.
 _CUSTOMARY = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5, 1 / 5000, 1 / 256, 1 / 4000, 1 / 1024)
 _CUSTOMARY_WITHIN = 1.1
-_REGISTERED = "depth is registered"  # in what check_sequence leaves open of the registration
-_FEW = 0.5  # share of the frames on disk that must be usable, or the trajectory is another recording's
+_REGISTERED = "depth is registered"  # part of check_sequence's undecided questions about registration
+_FEW = 0.5  # smallest share of the frames on disk that must be usable; below, the trajectory is another recording's
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class DataReport:
     """Outcome of a check; lengths in metres, sizes (H, W)."""
 
     name: str
-    path: str  # as given
-    layout: str = ""  # "" where it could not be opened
-    frames: int = 0  # usable ones
-    on_disk: int = 0
+    path: str  # as passed to ``check_data``
+    layout: str = ""  # "" if the sequence could not be opened
+    frames: int = 0  # number of usable frames
+    on_disk: int = 0  # number of frames on disk
     skipped: Mapping[str, int] = field(default_factory=dict)  # number of frames left out, by reason
-    without_depth: int = 0  # usable frames
+    without_depth: int = 0  # number of usable frames without depth
     posed: bool = True
     walked: float = 0.0  # length of the path [m]
     image_size: tuple[int, int] | None = None
@@ -48,10 +48,10 @@ class DataReport:
     depth_intrinsics: tuple[float, ...] | None = None  # of the depth maps, None if they are the images'
     depth_range: tuple[float, ...] | None = None  # 1 % and 99 % quantiles of the sampled depth [m]
     filled: float = 0.0  # share of valid pixels
-    checked: Mapping[str, Any] = field(default_factory=dict)  # what check_sequence measured; {} where it could not
+    checked: Mapping[str, Any] = field(default_factory=dict)  # measurements of check_sequence; {} if not opened
     problems: tuple[str, ...] = ()
-    remedies: tuple[str, ...] = ()  # options are named as on the command line
-    undecided: tuple[str, ...] = ()  # what the data leave open
+    remedies: tuple[str, ...] = ()  # with options as on the command line
+    undecided: tuple[str, ...] = ()  # questions that the data cannot answer
 
     @property
     def ok(self) -> bool:
@@ -66,8 +66,8 @@ class DataReport:
 
 
 def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **options: Any) -> DataReport:
-    """Open a sequence (``options`` as ``open_sequence`` takes them) and check all that needs no network on ``pairs`` of
-    frames; one that cannot be opened is a report with that problem.
+    """Open a sequence and check it, without a network, on ``pairs`` of frames. ``options`` are those of
+    ``open_sequence``. If the sequence cannot be opened, the report has that problem.
 
     Raises:
         FileNotFoundError: no such path.
@@ -121,14 +121,14 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
 
 def _remedies(check: SequenceCheck, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
     remedies = []
-    seen = GIVEN if check.images is None else check.images.reading
-    if (poses := seen.poses if check.poses == OURS else check.poses) != OURS:
-        given = options.get("poses", OURS)
-        remedies.append(f"--poses {poses}" if given == OURS else f"leave --poses {given} out")
-    elif seen.late:
-        remedies.append(_time_remedy(seen.late, sequence, options))
-    elif seen.factor != 1:
-        remedies.append(f"--intrinsics: those of images of this size, about {seen.factor:.2g} times what is given")
+    reading = UNCHANGED if check.images is None else check.images.reading
+    if (poses := reading.poses if check.poses == OURS else check.poses) != OURS:
+        convention = options.get("poses", OURS)
+        remedies.append(f"--poses {poses}" if convention == OURS else f"leave --poses {convention} out")
+    elif reading.late:
+        remedies.append(_time_remedy(reading.late, sequence, options))
+    elif reading.factor != 1:
+        remedies.append(f"--intrinsics: those of images of this size, about {reading.factor:.2g} times what is given")
     elif any("disagree" in problem or "no two frames overlap" in problem for problem in check.problems):
         remedies.append(
             "the trajectory may be another recording's, or shifted in time: --trajectory, --time-offset; or the "
@@ -145,17 +145,17 @@ def _remedies(check: SequenceCheck, sequence: FrameSequence, path: str | Path, o
 
 
 def _time_remedy(late: int, sequence: FrameSequence, options: Mapping[str, Any]) -> str:
-    """The change that gives images the poses of so many frames later."""
+    """The change that assigns to each image the pose of ``late`` frames later."""
     times = [entry.timestamp for entry in sequence.entries]
-    known = [time for time in times if time is not None]
+    stamps = [time for time in times if time is not None]
     by_line = f"give each image the pose {_count(abs(late), 'line')} {'further down' if late > 0 else 'further up'}"
-    if len(known) < len(times) or (options.get("trajectory") is None and sequence.layout != "tum"):
+    if len(stamps) < len(times) or (options.get("trajectory") is None and sequence.layout != "tum"):
         return by_line
-    return f"--time-offset {options.get('time_offset', 0.0) + late * float(np.median(np.diff(known))):.3g}"
+    return f"--time-offset {options.get('time_offset', 0.0) + late * float(np.median(np.diff(stamps))):.3g}"
 
 
 def _scale_remedy(factor: float, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> str:
-    """The change that brings depth and positions to one scale: depth times ``factor``."""
+    """The change that multiplies depth by ``factor``, or divides positions by it."""
     positions = f"divide the positions of the poses by {factor:.4g}"
     if options.get("trajectory") is not None:
         return f"a single camera's trajectory has no scale: {positions}"
@@ -172,7 +172,7 @@ def _scale_remedy(factor: float, sequence: FrameSequence, path: str | Path, opti
 
 
 def _metres_per_unit(sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> float | None:
-    """The scale with which depth files are read now; None where it has no say (a laser, a rendered tour)."""
+    """The present scale of the depth files; None where no scale applies (a laser, a rendered tour)."""
     if sequence.layout == "tour" or (sequence.layout == "kitti360" and options.get("truth") is None):
         return None
     raw = open_sequence(path, **{**options, "truth_scale": 1.0})
@@ -190,8 +190,8 @@ def _metres_per_unit(sequence: FrameSequence, path: str | Path, options: Mapping
 
 
 def _read_frames(sequence: FrameSequence) -> tuple[int, list[str], np.ndarray]:
-    """The number of frames read, the errors of those that cannot be decoded, and evenly spaced depths [m] of the others
-    (0 = invalid). Rendered frames do not count."""
+    """The number of decoded frames (rendered ones do not count), the decoding errors, and depths [m] sampled from the
+    other frames (0 = invalid)."""
     rendered = sequence.layout == "tour"
     most = min(_RENDERED if rendered else _DECODED, len(sequence))
     broken, depths = [], [np.zeros(0, np.float32)]
@@ -206,11 +206,11 @@ def _read_frames(sequence: FrameSequence) -> tuple[int, list[str], np.ndarray]:
     return 0 if rendered else len(chosen), broken, np.concatenate(depths)
 
 
-# ---- in words: a page for one sequence, a line each for several ----
+# ---- text: a page for one sequence, one line each for several ----
 
 
 def page(report: DataReport) -> str:
-    """Everything about one sequence, several lines."""
+    """The report of one sequence as several lines."""
     if not report.layout:
         return "\n".join([f"{report.name}: {report.path}", *_problems(report), _end(report)])
     lines = [
@@ -226,14 +226,16 @@ def page(report: DataReport) -> str:
         lines.append(f"  geometry      depth warped {_count(gap, 'frame')} on {fit} ({_count(pairs, 'pair')})")
     if (images := report.checked.get("images")) is not None:
         lines.append(f"  corners       {images['words']}, {_count(images['pairs'], 'pair')}")
-    if (lies := report.checked.get("registration")) is not None:
-        lines.append(f"  registration  {lies['quality']:.2f} of 1: how well depth edges meet image edges as they are")
+    if (registration := report.checked.get("registration")) is not None:
+        lines.append(
+            f"  registration  {registration['quality']:.2f} of 1: how well depth edges meet image edges as they are"
+        )
     lines += [f"  undecided     {text}" for text in report.undecided]
     return "\n".join([*lines, *_problems(report), _end(report)])
 
 
 def lines(reports: Sequence[DataReport]) -> str:
-    """Several sequences, a line each, and how many are fine."""
+    """One line per sequence, and the number of sequences without problems."""
     fine = sum(report.ok and report.compared for report in reports)
     return "\n".join([*map(_line, reports), f"{fine} of {len(reports)} sequences are fine"])
 

@@ -1,4 +1,4 @@
-"""Checks that depth maps lie on their images: compares depth edges with image edges, as they are and displaced."""
+"""Checks that depth maps are registered to their images: compares depth edges, also displaced, with image edges."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-# A pixel is a depth edge if it is nearer, in inverse depth, than its neighbours on both sides predict by
-# this share: planes are linear in inverse depth, so that slanted ones give no edge at any slope.
+# A pixel is a depth edge if its inverse depth exceeds the mean of its neighbours on both sides by this share. Planes
+# are linear in inverse depth, so a slanted plane has no edge.
 _EDGE_JUMP = 0.05
 _EDGE_REACH = 3  # [px] Kinect-type depth blurs an edge over that many pixels
 _IMAGE_SIGMA = 1.5  # [px]
 _POINTS_PER_FRAME = 1000
-# Displacements tried: zoom about the image's centre (7-Scenes' depth needs 0.9), and shifts as a share of
-# the width (19 px of 640 to either side, 2.5 cm at 0.7 m; half of it up and down).
+# Displacements: zoom about the image's centre (7-Scenes' depth needs 0.9), and shifts as a share of the width (19 px of
+# 640 to the left and right, 2.5 cm at 0.7 m; half of it up and down).
 _ZOOMS = np.arange(0.86, 1.141, 0.02)
 _SHIFT, _SHIFT_STEP = 0.0375, 0.0047
 
@@ -24,20 +24,20 @@ _SHIFT, _SHIFT_STEP = 0.0375, 0.0047
 class DepthImageFit:
     """The agreement of depth edges with image edges, and the best displacement of the depth map."""
 
-    quality: float  # 1 where no displacement is better than none, 0 where none is as bad as a random one, NaN: no edges
-    # Mean gradient rank (0 to 1) at the best displacement less that at a random one; small where image edges are
-    # everywhere, so that the fit is undetermined.
+    quality: float  # (undisplaced - median) / (best - median) of the mean gradient ranks; NaN without edges
+    # Mean gradient rank (0 to 1) at the best displacement minus the median; small if image edges are everywhere, so
+    # that the fit is undetermined.
     contrast: float
-    zoom: float  # about the centre
-    shift_x: float  # after it [px]
+    zoom: float  # best zoom about the centre
+    shift_x: float  # best shift after the zoom [px]
     shift_y: float
-    edges: int  # pixels compared
+    edges: int  # number of edge pixels
 
 
 def depth_image_fit(frames: Iterable[tuple[np.ndarray, np.ndarray]]) -> DepthImageFit:
-    """The fit over pairs of an image [H, W, 3] uint8 and a depth map [H, W] [m] (0 = invalid). Each edge pixel scores
-    the rank of the image gradient there (a lamp's gradient would outweigh all others), for each displacement. Observed
-    quality: at least 0.5 on registered recordings, at most 0.2 with 7-Scenes' unregistered geometry."""
+    """The fit over pairs of an image [H, W, 3] uint8 and a depth map [H, W] [m] (0 = invalid). Each depth edge scores
+    the rank of the image gradient at its pixel, for each displacement; the gradient itself would be dominated by lamps.
+    Observed quality: at least 0.5 on registered recordings, at most 0.2 with 7-Scenes' unregistered geometry."""
     sums: list[np.ndarray] = []
     edges, width = 0, 1
     for image, depth in frames:
@@ -52,18 +52,18 @@ def depth_image_fit(frames: Iterable[tuple[np.ndarray, np.ndarray]]) -> DepthIma
     total, count = np.sum(sums, axis=0).swapaxes(0, 1)
     mean = total / np.maximum(count, 1)
     dx, dy = _shifts(width)
-    at = np.unravel_index(np.argmax(mean), mean.shape)
-    here = mean[np.argmin(np.abs(_ZOOMS - 1)), len(dy) // 2, len(dx) // 2]
+    best = np.unravel_index(np.argmax(mean), mean.shape)
+    unshifted = mean[np.argmin(np.abs(_ZOOMS - 1)), len(dy) // 2, len(dx) // 2]
     typical = np.median(mean)
     contrast = mean.max() - typical
-    quality = (here - typical) / max(contrast, 1e-12)
+    quality = (unshifted - typical) / max(contrast, 1e-12)
     return DepthImageFit(
-        float(quality), float(contrast), float(_ZOOMS[at[0]]), float(dx[at[2]]), float(dy[at[1]]), edges
+        float(quality), float(contrast), float(_ZOOMS[best[0]]), float(dx[best[2]]), float(dy[best[1]]), edges
     )
 
 
 def depth_edges(depth: np.ndarray) -> np.ndarray:
-    """[H, W] bool: pixels on the near side of a depth discontinuity, of depth [H, W] [m], 0 = invalid."""
+    """[H, W] bool: pixels on the near side of a discontinuity of depth [H, W] [m] (0 = invalid)."""
     inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), np.nan)
     edge = np.zeros(depth.shape, dtype=bool)
     r = _EDGE_REACH

@@ -1,8 +1,8 @@
-"""Checks poses, intrinsics and depth against the images: corners are tracked over a few frames and compared with them.
+"""Checks poses, intrinsics and depth against corners tracked over a few frames.
 
-A corner x of one image lies, in another one, on the half line from its point at infinity, K R K^-1 x, towards the
-epipole: every positive depth is there. Its distance from where the corner was tracked to is noise, or a mistake in
-poses or intrinsics; where it lies on the line is its depth in the unit of the poses.
+In a second image, a corner x lies on the half line from its point at infinity, K R K^-1 x, towards the epipole; each
+point of the half line is one positive depth. The tracked corner's distance from the half line is noise, or a mistake in
+poses or intrinsics. Its position along the half line gives its depth in the unit of the poses.
 """
 
 from __future__ import annotations
@@ -19,27 +19,28 @@ from ufmstar_torch.anchors.landmarks import checked
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
-# Places of the sequence, frames over which corners are followed there at most, and their median motions as shares of
-# the image's width at which they are compared: near, where recordings are within a pixel, and far, where a trajectory
-# that is late by a frame of a smooth motion shows.
+# Number of start frames; largest number of frames of a track; and two median motions, as shares of the image's width,
+# at which corners are compared: near, where errors of good recordings are below a pixel, and far, where a smooth
+# trajectory that is late by a frame has a visible error.
 _PLACES, _FRAMES, _NEAR, _FAR = 6, 12, 0.02, 0.08
-_CORNERS, _SPACING, _BACK = 200, 14 / 640, 0.5  # as the tracker of anchors has them
-_FEWEST, _STILL = 20, 2.0  # corners of a pair, and their median motion [px], without which it shows nothing
-# Other readings: frames by which the trajectory is late, and factors of the intrinsics. Nearer to 1 is calibration.
+_CORNERS, _SPACING, _BACK = 200, 14 / 640, 0.5  # as in the tracker of anchors
+_FEWEST, _STILL = 20, 2.0  # smallest number of corners of a pair, and their smallest median motion [px]
+# Other readings: frames by which the trajectory is late, and factors of the intrinsics. Those near 1 are calibration.
 _LATE, _FACTORS = (-3, -2, -1, 1, 2, 3), 2.0 ** np.arange(-2, 2.01, 0.125)
 _FACTORS = _FACTORS[np.abs(np.log2(_FACTORS)) > 0.3]
-# Another reading is better that halves the distance, by so many pixels at least. On eight rendered tours right input is
-# at .2 to .4 px and no reading halves it; one frame late is at 1.1 px or more and four times as far as the right one.
+# Another reading is better if it halves the distance and reduces it by at least _APART [px]. On eight rendered tours,
+# correct input is at .2 to .4 px and no reading halves it; a trajectory one frame late is at 1.1 px or more, four times
+# the correct one's distance.
 _HALVES, _APART = 2.0, 0.2
-_FINE = 1.0  # [px] as messages state it
-_LARGEST = 0.005  # share of the width: a distance that contradicts the poses under whatever reading
-# Depth against that of the corners: pairs and corners of each, their least shift along the line [px], the factor from
-# which units differ (networks err by less than 2 on average), and the rank correlation of depth that is inverse.
+_FINE = 1.0  # [px] upper limit of good poses in messages
+_LARGEST = 0.005  # largest distance under the best reading, as a share of the width
+# Depth compared with that of corners: smallest number of pairs, and of corners of each; smallest shift along the line
+# [px]; factor from which units differ (networks err by less than 2 on average); rank correlation of inverse depth.
 _PAIRS, _POINTS, _SHIFT, _UNITS, _INVERSE = 2, 10, 2.0, 4.0, -0.3
 
 
 class FollowedCorners(NamedTuple):
-    """Corners [N, 2] (u, v) [px] of frame ``first``, and where they are in frame ``last``."""
+    """Corners [N, 2] (u, v) [px] in frame ``first`` (``start``) and in frame ``last`` (``end``)."""
 
     first: int
     last: int
@@ -69,39 +70,39 @@ class Reading:
         return f"the intrinsics look as if given for images {1 / self.factor:.2g} times as large"
 
 
-GIVEN = Reading()
+UNCHANGED = Reading()
 
 
 @dataclass(frozen=True)
 class ImageFit:
     """The distance of tracked corners from where poses and intrinsics allow them to be."""
 
-    pairs: int  # of frames
-    motion: float  # median motion of a corner between them [px]
+    pairs: int  # number of pairs of frames
+    motion: float  # median motion of a corner between the frames of a pair [px]
     error: float  # median distance from the half lines [px]
-    reading: Reading  # the one that fits best; as given where no other is much better
-    best_error: float  # with it
+    reading: Reading  # the best one; ``UNCHANGED`` unless another one is much better
+    best_error: float  # median distance under ``reading`` [px]
     problem: str  # "" = none
 
     @property
     def words(self) -> str:
-        """The outcome in a line."""
+        """The outcome as one line."""
         return f"poses disagree with the images by {self.error:.1f} px (good poses: below {_FINE:.0f})"
 
 
 @dataclass(frozen=True)
 class DepthFit:
-    """Depth maps beside the depths of tracked corners."""
+    """Comparison of depth maps with the depths of tracked corners."""
 
-    pairs: int  # compared
+    pairs: int  # number of compared pairs of frames
     ratio: float  # median of the maps' depth over the corners'
     order: float  # median rank correlation of the two
     problem: str  # "" = none
 
 
 def track_corners(sequence: FrameSequence, indices: range | None = None) -> list[FollowedCorners]:
-    """Corners over some frames at evenly spaced places of a sequence, or of its part between the first and the last of
-    ``indices``. Frames without an image or that cannot be read end a track; corners that hardly move are left out."""
+    """Track corners from evenly spaced frames of a sequence, or of its part between the first and the last of
+    ``indices``. A frame whose image is missing or cannot be read ends a track. Pairs with little motion are dropped."""
     first, last = (0, len(sequence) - 1) if not indices else (min(indices), max(indices))
     starts = np.unique(np.linspace(first, max(first, last - _FRAMES // 2), _PLACES).astype(int)).tolist()
     tracked = (one for start in starts for one in _followed(sequence, start, min(start + _FRAMES, last)))
@@ -109,8 +110,8 @@ def track_corners(sequence: FrameSequence, indices: range | None = None) -> list
 
 
 def _followed(sequence: FrameSequence, first: int, last: int) -> list[FollowedCorners]:
-    """The first frame with the first one at which corners moved near, and with that at which they moved far or were
-    followed last."""
+    """Two pairs of frame ``first``: with the first frame at which the corners' motion reaches ``_NEAR``, and with the
+    one at which it reaches ``_FAR`` or the track ends."""
     image = _gray(sequence, first)
     if image is None:
         return []
@@ -144,8 +145,7 @@ def _gray(sequence: FrameSequence, index: int) -> np.ndarray | None:
 
 
 def image_fit(sequence: FrameSequence, corners: Sequence[FollowedCorners]) -> ImageFit | None:
-    """The fit of a sequence's poses and intrinsics to corners in its images; None where no corner moves, or without
-    poses."""
+    """The fit of a sequence's poses and intrinsics to tracked corners; None without corners or poses."""
     if not corners or not sequence.posed:
         return None
     others = [Reading(poses=name) for name in CONVENTIONS if name != OURS] + [Reading(late=n) for n in _LATE]
@@ -154,17 +154,17 @@ def image_fit(sequence: FrameSequence, corners: Sequence[FollowedCorners]) -> Im
     limit = max(_FINE, _LARGEST * width)
     near = list({one.first: one for one in reversed(corners)}.values())
     far = list({one.first: one for one in corners}.values())
-    reading = GIVEN
-    best = error = _error(sequence, near, GIVEN)
+    reading = UNCHANGED
+    best = error = _error(sequence, near, UNCHANGED)
     for pairs in (near, far):
-        given = _error(sequence, pairs, GIVEN)
+        baseline = _error(sequence, pairs, UNCHANGED)
         errors = [_error(sequence, pairs, other) for other in others]
         least = min(errors)
-        if reading == GIVEN and given > _HALVES * least and given - least > _APART and least <= limit:
-            reading, error, best = others[errors.index(least)], given, least
+        if reading == UNCHANGED and baseline > _HALVES * least and baseline - least > _APART and least <= limit:
+            reading, error, best = others[errors.index(least)], baseline, least
     motion = float(np.median([one.motion for one in near]))
     fit = ImageFit(len(near), motion, error, reading, best, "")
-    if reading != GIVEN:
+    if reading != UNCHANGED:
         return replace(fit, problem=f"{fit.words}: {reading}: corners fit to {best:.1f} px then")
     if error > limit:
         text = "poses, intrinsics and images belong together under no reading tried"
@@ -173,16 +173,18 @@ def image_fit(sequence: FrameSequence, corners: Sequence[FollowedCorners]) -> Im
 
 
 def _error(sequence: FrameSequence, corners: Iterable[FollowedCorners], reading: Reading) -> float:
-    """Median over pairs of the median distance [px]; inf where no pair has poses."""
+    """Median over pairs of the median distance [px]; inf if no pair has poses under ``reading``."""
     last = len(sequence) - 1
     inside = (one for one in corners if one.first + reading.late >= 0 and one.last + reading.late <= last)
-    distances = [np.median(_beside(sequence, one, reading)[0]) for one in inside]
+    distances = [np.median(_epipolar_offsets(sequence, one, reading)[0]) for one in inside]
     return float(np.median(distances)) if distances else float("inf")
 
 
-def _beside(sequence: FrameSequence, corners: FollowedCorners, reading: Reading = GIVEN) -> tuple[np.ndarray, ...]:
-    """[N] distance of corners from their half lines [px], how far along these they lie [px], and the inverse depth
-    [1/unit of the poses] in the first image that this means."""
+def _epipolar_offsets(
+    sequence: FrameSequence, corners: FollowedCorners, reading: Reading = UNCHANGED
+) -> tuple[np.ndarray, ...]:
+    """[N] each: distance of the tracked corners from their half lines [px], position along them [px], and inverse depth
+    in the first image [1/unit of the poses]."""
     convert, entries, late = CONVENTIONS[reading.poses].convert, sequence.entries, reading.late
     T_a, T_b = (convert(entries[at + late].T_world_cam) for at in (corners.first, corners.last))
     K_a, K_b = (
@@ -211,11 +213,11 @@ def depth_fit(
     corners: Iterable[FollowedCorners],
     depth_at: Callable[[int, np.ndarray], np.ndarray | None],
 ) -> DepthFit | None:
-    """Compares depth with that of corners by parallax, in the unit of the poses; None with too little of either.
-    ``depth_at`` has the depth [N] at pixels [N, 2] of the image of a frame's index, not positive = none."""
+    """Compare depth with the depth of corners by parallax, in the unit of the poses; None with too few of either.
+    ``depth_at`` returns the depth [N] at pixels [N, 2] of a frame's image (not positive = none), or None."""
     ratios, orders = [], []
     for one in corners:
-        distance, along, rho = _beside(sequence, one)
+        distance, along, rho = _epipolar_offsets(sequence, one)
         depth = depth_at(one.first, one.start)
         if depth is None:
             continue

@@ -13,7 +13,7 @@ from ufmstar_torch.eval.run.files import to_json
 from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of, require_layout
 from ufmstar_torch.eval.sequences.options import Options
 
-# With one of these the user means one sequence, whatever lies below its folder.
+# With one of these options the path is one sequence, whatever is below its folder.
 _OF_ONE = ("trajectory", "images", "drive")
 
 
@@ -26,7 +26,7 @@ class CheckOptions:
     usage.
 
     Attributes:
-        command: there is one
+        command: check
         path: a sequence, or a folder below which there are sequences
         pairs: number of pairs of frames that are compared
         json: print JSON instead of text
@@ -45,7 +45,7 @@ read = reader(CheckOptions, "ufmstar data")
 
 
 def main(options: CheckOptions) -> int:
-    """Check, and print what was found; the exit code."""
+    """Check, and print the reports. Returns the exit code."""
     with usage_errors(OSError, ValueError):
         reports, several = _check(options)
     if options.json:
@@ -66,13 +66,13 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
     path, opening = options.path, options.opening.changed()
     require_layout(options.opening.layout, options.opening.plugin)
     one = path.startswith("tour:") or any(name in opening for name in _OF_ONE)
-    if not one:  # a folder that fits several layouts is one too, whose layout must be named
+    if not one:  # a folder that fits several layouts is one sequence, and check_data asks for its layout
         fitting = layouts_of(Path(path), options.opening.plugin)
         one = len(fitting) > 1 or (len(fitting) == 1 and len(parts_of(Path(path), fitting[0])) == 1)
     result = [] if one else find_sequences(path, layout=options.opening.layout, plugin=options.opening.plugin)
     if not one and not result and options.opening.layout == "auto":
         raise ValueError(f"{path} has no known layout, and nothing below it has; see docs/data.md, or --layout")
-    if one or not result:  # check_data names what a layout looks for
+    if one or not result:  # check_data's error names the files of the layout
         return [check_data(path, pairs=options.pairs, **opening)], False
     return [
         check_data(item.path, item.name, options.pairs, **{**opening, "layout": item.layout}) for item in result

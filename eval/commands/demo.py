@@ -1,7 +1,7 @@
-"""``ufmstar demo``: the suite ``demo`` on rendered rooms, with nothing but the installed package.
+"""``ufmstar demo``: the suite ``demo`` on rendered rooms, with the installed package alone.
 
-It is ``ufmstar eval`` with small networks that come with the package, on two kinds of rooms: homes like those on which
-the networks were trained, and a larger hall with other textures.
+It is ``ufmstar eval`` with the package's small networks, on two kinds of rooms: homes like those on which the networks
+were trained, and a larger hall with other textures.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
 from ufmstar_torch.eval.run.machine import hardware, share_threads, versions
 
 _WEIGHTS = ("weights", "demo.safetensors")
-_WALK = 150  # frames of a whole walk, of which the first are used: neighbours overlap
+_WALK = 150  # frames of a whole walk; the first --frames of them are used, so that consecutive frames overlap
 _ROOMS = {"familiar": "home", "unfamiliar": "hall"}  # style by data set
 
 
@@ -75,7 +75,7 @@ def main(options: DemoOptions) -> int:
 
 
 def _words(options: DemoOptions, weights: Path) -> list[str]:
-    """The evaluation, as words of ``ufmstar eval``."""
+    """The arguments of ``ufmstar eval``."""
     threads = [] if options.threads is None else ["--threads", str(options.threads)]
     roots = [f"{name}=tour:{options.seed}?style={style}&frames={_WALK}" for name, style in _ROOMS.items()]
     networks = [f"aleatoric=trained:{weights}#0", f"ensemble=trained:{weights}"]
@@ -87,7 +87,7 @@ def _words(options: DemoOptions, weights: Path) -> list[str]:
 
 
 def _onboard(options: DemoOptions, weights: Path) -> int:
-    """Run ``--onboard`` into the folder, and print its table; the exit code."""
+    """Run ``--onboard``, write its folder, and print its table. Returns the exit code."""
     from ufmstar_torch.eval.report.text import onboard_table
 
     if options.threads is None:

@@ -1,4 +1,4 @@
-"""The options of depth and of UfM*, which ``run``, ``rank`` and ``live`` share, and what they load."""
+"""The options of depth and of UfM* that ``run``, ``rank`` and ``live`` share, and the loading of what they name."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ufmstar_torch.eval.methods.setting import DEFAULTS, PAPER, started
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.recalibrate import Recalibration, beside
+from ufmstar_torch.recalibrate import Recalibration, stored_next_to
 from ufmstar_torch.stateful import flat
 
 PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
 OWN_DEPTH = ("self", "ground-truth")
-# Of UfM*'s settings, those that are off by default.
+# Sections of UfM*'s settings that are off by default.
 SECTIONS = ("anchors", "confidence", "posterior", "merge")
 
 
@@ -66,7 +66,7 @@ class NetworkOptions:
             raise ValueError("--samples goes with --mode full only")
 
     def load(self, machine: MachineOptions) -> DepthSource:
-        """The networks on a device; errors as ``NetworkChoice.load``."""
+        """Load the networks onto a device; errors as ``NetworkChoice.load``."""
         choice = NetworkChoice("", str(self.model), self.weights, self.spec)
         inference = Inference(self.runtime, self.precision, machine.threads)
         how: dict[str, Any] = {"mode": self.mode, "samples": self.samples, "offload": self.offload}
@@ -103,7 +103,7 @@ class MapOptions:
         parse_intrinsics(self.map_intrinsics, "--map-intrinsics")
 
     def source(self, sequence: FrameSequence, indices: range) -> MapSource:
-        """The maps of the frames ``indices``. Raises NotADirectoryError, ValueError: there is no such folder, or maps
+        """The maps of the frames ``indices``. Raises NotADirectoryError, ValueError: the folder does not exist, or maps
         are missing or do not fit."""
         size = parse_size(self.size)
         if self.depth in OWN_DEPTH:
@@ -145,8 +145,8 @@ class UfMOptions:
         self.config()  # checks the settings
 
     def config(self, **first: Any) -> UfMStarConfig:
-        """The configuration; ``first`` are values instead of the presets'. Raises ValueError: an impossible value, or
-        settings of anchors or posterior without them."""
+        """The configuration; ``first`` replaces values of the presets. Raises ValueError: an impossible value, or
+        settings of anchors or posterior while these are off."""
         used = {"anchors": bool(self.anchors or self.posterior), "posterior": self.posterior}
         for name in used:
             if name in self.ufm and not used[name]:
@@ -158,16 +158,16 @@ class UfMOptions:
     def load_recalibration(
         self, config: UfMStarConfig, weights: tuple[str, ...], source: DepthSource
     ) -> Recalibration | None:
-        """Read the recalibration that the option names, or else the one beside the weights, if there is one.
+        """Read the recalibration of the option; by default that next to the weights, if it exists.
 
         Raises:
             FileNotFoundError: the named file does not exist.
-            ValueError: it is no recalibration, or was fitted under other settings or to another network.
+            ValueError: the file is no recalibration, or was fitted with other settings or to another network.
         """
         name = self.recalibration
-        if name == "none" or (name is None and not (weights and beside(weights[0]).is_file())):
+        if name == "none" or (name is None and not (weights and stored_next_to(weights[0]).is_file())):
             return None
-        file = beside(weights[0]) if name is None else Path(name)
+        file = stored_next_to(weights[0]) if name is None else Path(name)
         try:
             recalibration = Recalibration.from_json(file)
             recalibration.require(config, ", ".join(one["name"] for one in source.identity.get("files", ())))

@@ -1,4 +1,4 @@
-"""``ufmstar eval``: its options, and what is printed."""
+"""``ufmstar eval``: its options and printed output."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ufmstar_torch.eval.suite.record import ResultsError
 from ufmstar_torch.eval.suite.shards import EvalOutcome, evaluate_suite
 from ufmstar_torch.eval.suite.work_items import ALL, Shard, find_work, read_names
 
-# Options that a job has under their names.
+# Options that are fields of a job with the same name.
 _OF_JOB = ("device", "bins", "examples", "samples", "runtime", "precision")
 
 
@@ -63,7 +63,7 @@ class SuiteOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class DataOptions:
-    """On which sequences.
+    """The sequences.
 
     Attributes:
         root: [DATASET=]DIR with sequences at or below it, or tour:SEED; without DATASET, the layout's name; repeatable
@@ -163,21 +163,21 @@ def main(options: EvalOptions) -> int:
 
 
 def job_from(options: EvalOptions) -> EvalJob:
-    """The job that the options describe; nothing is opened but folders. Raises FileNotFoundError, ValueError: something
-    does not exist, options do not go together, a base is given twice, no row has a network, or there is no sequence."""
+    """The job of the options. Opens no sequence. Raises FileNotFoundError, ValueError: a file does not exist, options
+    contradict each other, a base is named twice, no row has a network, or there is no sequence."""
     what, data, output, values = options.what, options.data, options.output, as_dict(options)
     suite = with_recalibrations(suite_named(str(what.suite), what.base, what.ufm_preset), what.recalibration)
     require_methods(suite, options.opening.plugin)
     architectures: list[dict[str, NetworkChoice]] = [{}]
     for text in what.network:  # a base's n-th network belongs to the n-th architecture
         choice = NetworkChoice.parse(text).with_spec(what.spec)
-        number = sum(choice.base in known for known in architectures)
+        number = sum(choice.base in architecture for architecture in architectures)
         architectures += [{}] if number == len(architectures) else []
         architectures[number][choice.base] = choice
     networks, *further = architectures
     if further and not suite.efficiency:
-        given = ", ".join(text.partition("=")[0] for text in what.network)
-        raise ValueError(f"--network: every base once, but in a suite that measures time and energy, got {given}")
+        bases = ", ".join(text.partition("=")[0] for text in what.network)
+        raise ValueError(f"--network: every base once, but in a suite that measures time and energy, got {bases}")
     only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
     items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only, opening=options.opening)
     return EvalJob(
@@ -213,7 +213,7 @@ def _evaluate(options: EvalOptions) -> int:
 
 
 def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
-    """Print the table, measure, draw the report, name what failed; the exit code."""
+    """Print the table, measure, draw the report, print the failures. Returns the exit code."""
     from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
@@ -246,7 +246,7 @@ def _report(job: EvalJob, outcome: EvalOutcome, options: EvalOptions) -> int:
 
 
 def _measure(job: EvalJob, threads: int | None) -> None:
-    """Measure time, energy and memory, unless that was done; print why where it is not possible."""
+    """Measure time, energy and memory, unless their file exists. If that fails, print the reason."""
     if (job.out / EFFICIENCY).exists():
         return
     print("ufmstar eval: measuring time, energy and memory ...", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""``ufmstar export``: its options, and what is printed."""
+"""``ufmstar export``: its options and printed output."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def main(options: ExportOptions) -> int:
 
 
 def _sequence(out: Path) -> FrameSequence:
-    """The recording of a run. Raises FileNotFoundError, ValueError: it is there no more, or the summary is damaged."""
+    """The recording of a run. Raises FileNotFoundError, ValueError: it no longer exists, or the summary is damaged."""
     settings = export.run_settings(out)
     values = {f.name: settings[f.name] for f in fields(Options) if settings.get(f.name) not in (None, [])}
     return open_sequence(settings["sequence"], **values)

@@ -1,4 +1,4 @@
-"""``ufmstar live``: its options, its sources, and what it prints; ``LiveDepth`` does the work."""
+"""``ufmstar live``: its options, sources and printed output; ``LiveDepth`` does the work."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.pipeline import UncertainDepth
 
 _STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
-# Options for opening that also go with a source that is no recording.
+# Options for opening that are also valid for a source that is no recording.
 _OF_LIVE = ("intrinsics", "trajectory", "poses", "pose_scale", "max_pose_gap")
 
 
@@ -114,17 +114,17 @@ def main(options: LiveOptions) -> int:
     if options.threads is None:
         share_threads()
     kind = FolderKind("ufmstar live", "live run", _SUMMARY, ("*.npz",), lock=".lock")
-    started = {"state": "started"}  # and not finished, which would allow the next run to replace it
-    with ExitStack() as held:
+    started = {"state": "started"}  # a later run may replace finished results only
+    with ExitStack() as stack:
         with usage_errors(ImportError, OSError, ValueError):
             if options.out is not None:
                 kind.earlier(options.out, resume=False, overwrite=options.overwrite)
-            K = None if (given := options.opening.intrinsics) is None else read_intrinsics(given)
+            K = None if (intrinsics := options.opening.intrinsics) is None else read_intrinsics(intrinsics)
             events = _events(options)
             model = _model(options)
             view = RerunLog(open_viewer()[0]) if options.view else None
             if options.out is not None:
-                held.enter_context(output_folder(options.out, kind, started, overwrite=options.overwrite))
+                stack.enter_context(output_folder(options.out, kind, started, overwrite=options.overwrite))
         times = RealTime(model)
         statistics, failure = _run(options, model, K, events, times, view)
         summary = times.summary(statistics)
@@ -146,26 +146,26 @@ def _run(
     times: RealTime,
     view: RerunLog | None,
 ) -> tuple[LiveStatistics, Exception | None]:
-    """Push the events until they end, the time is over, or a signal comes. Returns the counts, and what failed."""
-    ends = monotonic() + options.seconds
+    """Push the events until they end, the time is over, or a signal comes. Returns the counts, and the error if any."""
+    deadline = monotonic() + options.seconds
 
     def on_result(result: LiveResult) -> None:
         times.take(result)
         if options.out is not None:
             _write(options.out, result)
-        about = _figures(result, live)
+        figures = _figures(result, live)
         if view is not None:
-            view.add(_shown(result, len(times.latency), about))
+            view.add(_shown(result, len(times.latency), figures))
         if options.json:
-            print(json.dumps(about), flush=True)
+            print(json.dumps(figures), flush=True)
         elif len(times.latency) % 30 == 1:
-            print("  ".join(f"{name} {value}" for name, value in about.items()), file=sys.stderr, flush=True)
+            print("  ".join(f"{name} {value}" for name, value in figures.items()), file=sys.stderr, flush=True)
 
     how: dict[str, Any] = {"max_wait": options.max_wait, "max_gap": options.opening.max_pose_gap}
     live = LiveDepth(model, on_result, K, state=options.state, save_every=options.save_every, **how)
     try:
         with _interrupted_by_sigterm(), live, suppress(KeyboardInterrupt):
-            for event in takewhile(lambda _: monotonic() < ends, events):
+            for event in takewhile(lambda _: monotonic() < deadline, events):
                 if event.T_world_cam is not None:
                     live.push_pose(event.stamp, event.T_world_cam)
                 if event.image is not None:
@@ -194,7 +194,7 @@ def _events(options: LiveOptions) -> Iterator[LiveEvent]:
 
 
 def _model(options: LiveOptions) -> UncertainDepth:
-    """The networks with UfM*, compiled, in the state of ``--state``; errors as ``NetworkChoice.load``."""
+    """The networks with UfM*, warmed up, with the state of ``--state``; errors as ``NetworkChoice.load``."""
     chosen, source = options.network, options.network.load(options)
     config, anchors = options.uncertainty.config(), options.uncertainty.anchors
     model = UncertainDepth(
@@ -221,7 +221,7 @@ def _model(options: LiveOptions) -> UncertainDepth:
 
 
 def _write(out: Path, result: LiveResult) -> None:
-    """The maps of an image, as OUT/STAMP.npz."""
+    """Write the maps of an image to OUT/STAMP.npz."""
     maps = {"depth": result.out.depth, "variance": result.out.variance, "disagreement": result.out.disagreement}
     arrays = {name: value[0].cpu().numpy() for name, value in maps.items()}
     camera = {"T_world_cam": result.T_world_cam, "intrinsics": result.out.intrinsics[0].cpu().numpy()}
@@ -229,7 +229,7 @@ def _write(out: Path, result: LiveResult) -> None:
 
 
 def _shown(result: LiveResult, number: int, figures: dict[str, float]) -> RunFrame:
-    """The result as the viewer takes it."""
+    """The result in the viewer's form."""
     out, valid = result.out, result.out.ufm.valid[0]
     depth, sigma = (torch.where(valid, values[0], torch.nan).cpu().float().numpy() for values in (out.depth, out.std))
     about = (f"{result.stamp:.6f}", number, result.stamp, result.T_world_cam)
@@ -254,8 +254,8 @@ def _figures(result: LiveResult, live: LiveDepth) -> dict[str, float]:
 @contextmanager
 def _interrupted_by_sigterm() -> Iterator[None]:
     """SIGTERM raises KeyboardInterrupt, as Ctrl-C does."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, previous)

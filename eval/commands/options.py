@@ -2,14 +2,14 @@
 
 The form of an option follows from its field:
 
-- ``positional()``: an argument without a name; a field without a default is an option that must be given;
+- ``positional()``: an argument without a name; a field without a default is a required option;
 - ``bool``: a flag, ``--name`` where the default is False, ``--no-name`` where it is True;
 - ``tuple[str, ...]``: one or several words;
 - a field whose type is a dataclass: a group of options, titled by the first line of that class's docstring;
 - ``fields_of(Config, prefix)``: an option for every field of a settings class; its value is a dict.
 
-Every command also takes ``--config FILE`` (YAML or JSON, keys as the fields are named). Unknown names and impossible
-values are refused.
+Every command also takes ``--config FILE`` (YAML or JSON, keys are the fields' names). Unknown names and impossible
+values raise errors.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ T = TypeVar("T", bound="DataclassInstance")
 
 
 class UsageError(Exception):
-    """A request of the user that cannot be carried out; the message is one line with the reason."""
+    """A mistake of the user; the message is one line with the reason."""
 
 
 @contextmanager
 def usage_errors(*kinds: type[Exception]) -> Iterator[None]:
-    """Errors of these kinds are the user's."""
+    """Convert errors of these kinds to :class:`UsageError`."""
     try:
         yield
     except kinds as error:
@@ -51,7 +51,7 @@ def usage_errors(*kinds: type[Exception]) -> Iterator[None]:
 
 @dataclass(frozen=True, kw_only=True)
 class MachineOptions:
-    """Options that many commands have, at the end of their own.
+    """Options of many commands, listed after the command's own options.
 
     Attributes:
         device: of the networks, cpu, cuda or cuda:N; UfM* runs on the CPU
@@ -63,15 +63,15 @@ class MachineOptions:
 
 
 def positional() -> Any:
-    """A field that is an argument without a name."""
+    """A field that is a positional argument."""
     return field(metadata={"positional": True})
 
 
 def option(default: Any = MISSING, **how: Any) -> Any:
-    """A field whose form is not clear from its type; without a default, the option must be given. ``how`` has
-    ``choices``: the values that are allowed; ``least``: the smallest one; ``positive``: True for numbers above 0;
-    ``const``: the value of the option without a word behind it; ``repeat``: whether words of further occurrences are
-    added (else they replace the earlier ones)."""
+    """A field whose option needs more than its type; without a default, the option is required. ``how`` has
+    ``choices``: the allowed values; ``least``: the smallest one; ``positive``: True for numbers above 0; ``const``: the
+    value of the option without a word after it; ``repeat``: True if repeated options add words instead of replacing
+    the earlier ones."""
     return field(default=default, metadata=how)
 
 
@@ -87,24 +87,31 @@ class _Fields:
 
 
 def fields_of(config: type, prefix: str = "", **how: Any) -> Any:
-    """A field of type ``dict[str, Any]``: an option for every field of a settings class, nested ones included, but
-    those ``without``. With a dot in the ``prefix`` (``ufm.``) their names keep their underscores, and a configuration
-    file has the values below that key. ``unset`` leaves out what is not given, instead of the class's own default,
-    which the help has where it is ``shown``. The value of a bool is written out: ``--ufm.add_aleatoric false``.
-    ``choices``, ``symbol``, ``unit`` and ``range`` in the fields' metadata are used."""
+    """A field of type ``dict[str, Any]`` with an option for every field of a settings class, also of nested ones.
+
+    A bool needs its value: ``--ufm.add_aleatoric false``. The fields' metadata ``choices``, ``symbol``, ``unit`` and
+    ``range`` are used.
+
+    Args:
+        config: the settings class.
+        prefix: of the options' names. With a dot (``ufm.``) names keep their underscores, and a configuration file has
+            the values below that key.
+        how: ``without``: names of fields without an option; ``unset``: True to omit options that are not set, instead
+            of using the class's defaults; ``shown``: True to show these defaults in the help.
+    """
     return field(default_factory=dict, metadata={"fields_of": _Fields(config, prefix, **how)})
 
 
 def parse(options: type[T], words: Sequence[str], prog: str) -> T:
-    """The options that a command line means.
+    """Parse a command line.
 
     Args:
-        options: a dataclass. ``USAGE``, if it has that attribute, replaces the generated usage line.
-        words: without the program's name.
+        options: a dataclass. Its attribute ``USAGE``, if any, replaces the generated usage line.
+        words: arguments without the program's name.
         prog: name of the command, for messages.
 
     Raises:
-        ValueError: an unknown option, a value of the wrong kind, or what ``options`` itself refuses; one line.
+        ValueError: an unknown option, a value of the wrong type, or an error of ``options`` itself; one line.
     """
     from jsonargparse import ArgumentError
 
@@ -122,13 +129,13 @@ def parse(options: type[T], words: Sequence[str], prog: str) -> T:
 
 
 def reader(options: type[T], prog: str) -> Callable[[Sequence[str]], T]:
-    """The function ``read`` of a command: :func:`parse` of its words."""
+    """The function ``read`` of a command, which parses its arguments with :func:`parse`."""
     return lambda words: parse(options, words, prog)
 
 
 def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser:
     """The parser for a dataclass of options; it raises ``ArgumentError`` instead of ending the program. Options with a
-    dot in their name (``--ufm.eta``) have help only if it is ``full``."""
+    dot in their name (``--ufm.eta``) are in the help only if ``full``."""
     from jsonargparse import ActionConfigFile, ArgumentParser, DefaultHelpFormatter
 
     class BoundedConfigFile(ActionConfigFile):
@@ -139,7 +146,7 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
             super().__call__(parser, cfg, values, option_string)
 
     class Formatter(DefaultHelpFormatter):
-        """Leaves out the default of a flag, which would be the field's (--no-video: True), and None."""
+        """Omits the default of a flag, which is the field's value (--no-video: True), and the default None."""
 
         def _get_help_string(self, action: Action) -> str:
             text: str = action.help or "" if isinstance(action.const, bool) else super()._get_help_string(action)
@@ -159,7 +166,7 @@ def parser_of(options: type, prog: str, *, full: bool = False) -> ArgumentParser
 
 
 def _require_bounded(config: str) -> None:
-    """Check a configuration, a file's name or the text itself, by YAML's events, which neither recurse nor expand.
+    """Check a configuration (a file's name or the text) by YAML's events, which neither recurse nor expand aliases.
     Raises ValueError: too large, nested too deeply, or too many values with its aliases expanded."""
     import yaml
 
@@ -241,27 +248,27 @@ def _form(f: Field[Any], hint: Any) -> tuple[list[str], dict[str, Any]]:
     return [name], how | ({"required": True} if default is MISSING else {})
 
 
-def _add_fields(group: Any, wanted: _Fields, full: bool) -> None:
+def _add_fields(group: Any, spec: _Fields, full: bool) -> None:
     """An option for every field of a settings class, and of the settings classes in it."""
-    hints, (_, help_) = get_type_hints(wanted.config), _documentation(wanted.config)
-    for f in fields(wanted.config):
-        if f.name in wanted.without:
+    hints, (_, help_) = get_type_hints(spec.config), _documentation(spec.config)
+    for f in fields(spec.config):
+        if f.name in spec.without:
             continue
         if (section := _section(hints[f.name])) is not None:
-            nested = replace(wanted, config=section, prefix=f"{wanted.prefix}{f.name}.", without=())
+            nested = replace(spec, config=section, prefix=f"{spec.prefix}{f.name}.", without=())
             _add_fields(group, nested, full)
             continue
         parts = get_args(hints[f.name]) if get_origin(hints[f.name]) in (Union, types.UnionType) else (hints[f.name],)
         # Every word is a valid text, so that text is tried last.
         kind = reduce(or_, sorted(dict.fromkeys(parts), key=lambda part: part is str))
         how = {"choices": f.metadata["choices"]} if "choices" in f.metadata else {"type": kind}
-        name = wanted.prefix + f.name
+        name = spec.prefix + f.name
         default = _default(f)
-        shown = f"(default: {default})" if wanted.shown and default is not None else ""
+        shown = f"(default: {default})" if spec.shown and default is not None else ""
         text = " ".join(text for text in (help_.get(f.name), _range(f), shown) if text)
         group.add_argument(
             f"--{name if '.' in name else name.replace('_', '-')}",
-            default=None if wanted.unset else default,
+            default=None if spec.unset else default,
             help=text if full or "." not in name else SUPPRESS,
             **how,
         )
@@ -273,7 +280,7 @@ def _section(hint: Any) -> type | None:
 
 
 def _range(f: Field[Any]) -> str:
-    """The paper's symbol, the unit and the range of a field, where its metadata has them."""
+    """The paper's symbol, the unit and the range of a field, or "" if its metadata has none."""
     if "range" not in f.metadata:
         return ""
     low, high, open_low = f.metadata["range"]
@@ -308,22 +315,22 @@ def _build(options: type[T], values: Mapping[str, Any]) -> T:
     return options(**built)
 
 
-def _settings(wanted: _Fields, values: Mapping[str, Any]) -> dict[str, Any]:
+def _settings(spec: _Fields, values: Mapping[str, Any]) -> dict[str, Any]:
     """The values of :func:`fields_of`."""
-    *path, _ = wanted.prefix.split(".")
+    *path, _ = spec.prefix.split(".")
     for key in path:
         values = values[key]
-    settings = {f.name: values.get(f.name) for f in fields(wanted.config) if f.name not in wanted.without}
-    for f in fields(wanted.config):
+    settings = {f.name: values.get(f.name) for f in fields(spec.config) if f.name not in spec.without}
+    for f in fields(spec.config):
         section = settings.get(f.name)
-        if wanted.unset and isinstance(section, Mapping):
+        if spec.unset and isinstance(section, Mapping):
             settings[f.name] = {name: value for name, value in section.items() if value is not None} or None
-    return {name: value for name, value in settings.items() if not (wanted.unset and value is None)}
+    return {name: value for name, value in settings.items() if not (spec.unset and value is None)}
 
 
 @cache
 def _documentation(options: type) -> tuple[str | None, dict[str, str]]:
-    """The description in a class's docstring, and the texts of its attributes and of those that it inherits."""
+    """The description in a class's docstring, and the texts of its attributes, inherited ones included."""
     from docstring_parser.google import parse as parse_docstring
 
     texts: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""``ufmstar poses``: its options, the files, and what is printed."""
+"""``ufmstar poses``: its options, output files and printed output."""
 
 from __future__ import annotations
 
@@ -103,18 +103,18 @@ read = reader(PosesOptions, "ufmstar poses")
 
 
 def main(options: PosesOptions) -> int:
-    """Reconstruct, write the folder, and print what was found; the exit code."""
+    """Reconstruct, write the folder, and print the result. Returns the exit code."""
     require_pycolmap()
     with usage_errors(FolderError, FileNotFoundError, ValueError):
         images, size = _images(options)
         with output_folder(options.out, POSES, {}, overwrite=options.overwrite):
-            found = _reconstruct(options, images, size)
-    _report(found, options.out)
+            result = _reconstruct(options, images, size)
+    _report(result, options.out)
     return 0
 
 
 def _images(options: PosesOptions) -> tuple[list[Any], tuple[int, int]]:
-    """The entries of the images with their times, and their (H, W). Raises ValueError: there is none."""
+    """The entries of the images with their times, and their (H, W). Raises ValueError: there are no images."""
     path = Path(options.source)
     if not path.exists():
         raise FileNotFoundError(f"no such file or folder: {path}")
@@ -136,7 +136,7 @@ def _plain(name: str) -> str:
 def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]) -> dict[str, Any]:
     root = Path(options.source) if Path(options.source).is_dir() else Path(options.source).parent
     lens = _lens(options, root, size)
-    if lens is not None:  # COLMAP's mapper fails on some lenses, and `run` has less to do
+    if lens is not None:  # COLMAP's mapper fails on some lenses; `run` need not undistort again
         images = [lens.see(entry) for entry in images]
     trajectory = None if options.trajectory is None else read_trajectory(resolve(root, options.trajectory))
     named = {_plain(word.partition(":")[0]) for word in options.length[:2]}
@@ -162,7 +162,7 @@ def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]
         model.write(out / "sparse" / str(number))
     points, sigma = landmarks(models[0])
     write_atomic(out / "landmarks.npz", lambda file: np.savez(file, points=points, sigma=sigma))
-    found = {
+    result = {
         "program": POSES.program,
         "state": "finished",
         **scale,
@@ -174,12 +174,12 @@ def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]
         "landmarks": len(points),
         "reprojection_error": models[0].compute_mean_reprojection_error(),
     }
-    write_json_atomic(out / POSES.manifest, found)
-    return found
+    write_json_atomic(out / POSES.manifest, result)
+    return result
 
 
 def _lens(options: PosesOptions, root: Path, size: tuple[int, int]) -> Any:
-    """The camera, or None where it is to be estimated. Raises ValueError: intrinsics that do not fit the images."""
+    """The camera; None = estimate it. Raises ValueError: the intrinsics do not fit the images."""
     source = parse_intrinsics(options.intrinsics, "--intrinsics")
     if source is None:
         source = next((str(root / name) for name in INTRINSICS if (root / name).is_file()), None)
@@ -188,22 +188,22 @@ def _lens(options: PosesOptions, root: Path, size: tuple[int, int]) -> Any:
     return Lens.of(read_intrinsics(source), size, *parse_distortion(options.distortion))
 
 
-def _report(found: dict[str, Any], out: Path) -> None:
-    largest, *others = found["models"]
-    print(f"{largest} of {found['keyframes']} keyframes (of {found['images']} images) have a pose, error "
-          f"{found['reprojection_error']:.2f} px; {found['landmarks']} landmarks")  # fmt: skip
-    for first, last in found["gaps"]:
+def _report(result: dict[str, Any], out: Path) -> None:
+    largest, *others = result["models"]
+    print(f"{largest} of {result['keyframes']} keyframes (of {result['images']} images) have a pose, error "
+          f"{result['reprojection_error']:.2f} px; {result['landmarks']} landmarks")  # fmt: skip
+    for first, last in result["gaps"]:
         print(f"  no pose: {first} to {last}")
     if others:
         print(f"  further models, which do not connect to the first: {', '.join(map(str, others))} keyframes")
-    match found["scale_from"]:
+    match result["scale_from"]:
         case None:
             print("scale unknown: pass --length A B METRES or --trajectory FILE, or to `ufmstar run` --pose-scale M or "
                   "--scale-from network")  # fmt: skip
         case "length":
-            print(f"scale from the length: {found['metres_per_unit']:.4g} m per unit")
+            print(f"scale from the length: {result['metres_per_unit']:.4g} m per unit")
         case _:
             print(
-                f"scale from the trajectory: {found['metres_per_unit']:.4g} m per unit, {found['residual']:.3f} m off"
+                f"scale from the trajectory: {result['metres_per_unit']:.4g} m per unit, {result['residual']:.3f} m off"
             )
     print(f"{out}: ufmstar run {out} --anchors landmarks.npz ...")

@@ -65,7 +65,7 @@ class RankOptions(StreamOptions):
 
     @property
     def config(self) -> UfMStarConfig:
-        """The configuration of UfM*, by default of M of the frame alone at measured pixels."""
+        """The configuration of UfM*; by default M is the frame's alone, at measured pixels."""
         return self.uncertainty.config(unmeasured="nan", ema_alpha=1.0)
 
 
@@ -127,7 +127,7 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     shown = [["rank", "sequence", "frame", f"{options.by} [m²]", "measured"]]
     mean, names = f"{options.by}_mean_m2", [Path(path).name for path in options.sequences]
     for line in lines[: min(len(chosen), _SHOWN)]:
-        name = Path(line["sequence"]).name  # a path where two are called alike
+        name = Path(line["sequence"]).name  # the whole path if two sequences have the same name
         name = name if names.count(name) == 1 else line["sequence"]
         shown.append([str(line["rank"]), name, line["frame"], *(f"{line[k]:.3g}" for k in (mean, "measured"))])
     print("\n".join(aligned(shown)))

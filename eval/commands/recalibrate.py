@@ -1,4 +1,4 @@
-"""``ufmstar recalibrate``: its options, the fit, and what is printed."""
+"""``ufmstar recalibrate``: its options, the fit and its printed output."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class RecalibrateOptions:
         out: folder of `ufmstar eval`
         row: the row, as the table names it: UfM*-DepthOnly, say
         to: file of the map; WEIGHTS.recalibration.json beside the weights is used without being named
-        covariate: what it is a map of: the variance, or a factor of it by the network's confidence
+        covariate: input of the map: the variance, or the network's confidence, from which it gives a factor of it
     """
 
     out: Path = positional()
@@ -43,7 +43,7 @@ read = reader(RecalibrateOptions, "ufmstar recalibrate")
 
 
 def main(options: RecalibrateOptions) -> int:
-    """Fit, write the file, and print how well it fits sequences that it was not fitted to; the exit code."""
+    """Fit, write the file, and print the figures on held-out sequences. Returns the exit code."""
     from ufmstar_torch.eval.report.text import aligned
 
     with usage_errors(ValueError):
@@ -70,8 +70,8 @@ def _fit(counts: Sequence[NDArray[Any]], covariate: str) -> Recalibration:
 
 
 def _counts(results: Results, row: Row, covariate: str) -> dict[str, NDArray[Any]]:
-    """[V, e] pixels of every sequence by variance and squared error, by "DATASET/SEQUENCE"; for the confidence samples
-    [n, 3]. Raises ValueError: the network states none."""
+    """By "DATASET/SEQUENCE", the histogram [V, e] of pixels over variance and squared error; for the covariate
+    confidence, samples [n, 3]. Raises ValueError: the network states no confidence."""
     counts = {}
     for record in results.of(row):
         sums = record.sums()
@@ -83,7 +83,7 @@ def _counts(results: Results, row: Row, covariate: str) -> dict[str, NDArray[Any
 
 
 def _table(counts: Mapping[str, NDArray[Any]], covariate: str) -> list[list[str]]:
-    """Figures of every sequence as it is, and under the map that was fitted to the others."""
+    """Figures of every sequence without a map, and with the map fitted to the other sequences."""
     from ufmstar_torch.eval.metrics.recalibration import figures, figures_of_samples
     from ufmstar_torch.eval.report.text import number
 
@@ -98,7 +98,7 @@ def _table(counts: Mapping[str, NDArray[Any]], covariate: str) -> list[list[str]
 
 
 def _about(fitted: Recalibration, results: Results, row: Row) -> Recalibration:
-    """The map with what it was fitted to."""
+    """The map with the row, settings, network and sequences of its fit."""
     records = results.of(row)
     network: Mapping[str, object] = results.about["networks"][row.method.base]
     files = network.get("files")

@@ -1,4 +1,4 @@
-"""``ufmstar report``: its options, and what is printed."""
+"""``ufmstar report``: its options and printed output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``ufmstar run``: its options, and the printed results."""
+"""``ufmstar run``: its options and printed output."""
 
 from __future__ import annotations
 
@@ -110,10 +110,10 @@ def main(options: RunOptions) -> int:
 
 
 def job_from(options: StreamOptions, path: str, networks: DepthSource | None = None) -> RunJob:
-    """Open a sequence, load the networks (or take those of an earlier job) or maps, and make the job.
+    """Open a sequence, load the networks (unless ``networks`` of an earlier job are passed) or maps, and make the job.
 
     Raises:
-        ValueError: files that do not fit, no poses, no frame selected; others as ``open_sequence``.
+        ValueError: files do not fit, there are no poses, or no frame is selected; others as ``open_sequence``.
         FileNotFoundError, NotADirectoryError: no such file or folder.
         ModuleNotFoundError: an optional package is missing.
     """
@@ -149,7 +149,7 @@ def job_from(options: StreamOptions, path: str, networks: DepthSource | None = N
 
 
 def _landmarks(value: str | bool, sequence: FrameSequence) -> str | LandmarkSource:
-    """The source of anchors of ``--anchors``. Raises ValueError: images to track in are missing; others as
+    """The source of anchors of ``--anchors``. Raises ValueError: the images to track are missing; others as
     ``landmarks_of``."""
     source = landmarks_of(value, sequence.folder, sequence.pose_scale)
     if not source.needs_image:

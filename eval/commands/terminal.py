@@ -12,9 +12,9 @@ from ufmstar_torch.eval.engine.progress import Progress
 
 
 class Bars:
-    """A progress bar of the present stage of a run, or of the present sequence of an evaluation.
+    """A progress bar of the current stage of a run, or of the current sequence of an evaluation.
 
-    Where standard error is no terminal, it is a line at the start and the end of each stage instead.
+    If standard error is no terminal, it prints a line at the start and the end of each stage instead.
     """
 
     def __init__(self) -> None:
@@ -22,7 +22,7 @@ class Bars:
         self._bar: Any = None
 
     def show(self, progress: Progress) -> None:
-        """Bring the bar of the stage up to date; the bar of an earlier stage goes."""
+        """Update the bar of the stage; close that of an earlier stage."""
         from tqdm import tqdm
 
         stage = progress.stage
@@ -65,9 +65,9 @@ class Bars:
 
 @contextmanager
 def stop_signals(say: Callable[[str], None], what: str = "frame") -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and SIGTERM end the run after the current frame (or step); a second one ends it at once.
+    """Ctrl-C or SIGTERM ends the run after the current frame (or step); a second one ends it at once.
 
-    The value is whether one has come."""
+    Yields a function that returns True after the first signal."""
     received: list[int] = []
 
     def handle(number: int, _: object) -> None:
@@ -76,9 +76,9 @@ def stop_signals(say: Callable[[str], None], what: str = "frame") -> Iterator[Ca
             raise KeyboardInterrupt
         say(f"stopping after this {what}; once more stops at once")
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: bool(received)
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)

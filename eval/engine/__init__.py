@@ -1,1 +1,1 @@
-"""The loop over frames and what runs in it: networks in turn, estimators, anchors, the clock."""
+"""The loop over frames and its parts: alternating networks, estimators, anchors, the clock."""

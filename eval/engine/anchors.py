@@ -1,6 +1,4 @@
-"""Anchors of a row: corners tracked in the sequence's own images, landmarks of a file, or ground truth as the upper
-bound.
-"""
+"""Anchors of a row: corners tracked in images, landmarks of a file, or ground truth as the upper bound."""
 
 from __future__ import annotations
 
@@ -27,16 +25,16 @@ from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.sequences.options import resolve
 from ufmstar_torch.prediction import DepthPrediction
 
-# Anchors of ground truth in a frame, about as many as a tracker finds, and their standard deviation as a share of the
-# depth: a range sensor's. Their depths are exact.
+# Number of anchors of ground truth in a frame, about that of a tracker, and their standard deviation as a share of the
+# depth, a range sensor's. Their depths are exact.
 TRUTH_COUNT, TRUTH_SIGMA = 100, 0.01
-# Third number of the seeds for the choice of anchors and for noise. Poses have a seed of two numbers.
-_TAKEN, _NOISE = 1, 2
+# Third number of the seeds for the choice of anchors and for noise. The seed of poses has two numbers.
+_CHOICE, _NOISE = 1, 2
 _NO_IMAGE = Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked=0, none="no image")
 
 
 class Tracks:
-    """Landmarks of rows that see the same images at the same poses: each image is processed once. ``source`` is in its
+    """Landmarks shared by rows with the same images and poses; each image is processed once. ``source`` is in its
     initial state; None = a tracker of corners."""
 
     def __init__(self, source: LandmarkSource | None = None) -> None:
@@ -44,8 +42,8 @@ class Tracks:
         self._last: tuple[Frame, Landmarks, float] | None = None
 
     def of(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:
-        """Landmarks of the next frame, at the pose [4, 4] with its noise [m], and the time that they took [ms]; None
-        without an image that the source needs. Errors as ``StreamLandmarks.update``."""
+        """Landmarks of the next frame at the noisy pose [4, 4] [m], and the time to compute them [ms]; None if the
+        source needs an image and the frame has none. Errors as ``StreamLandmarks.update``."""
         if self._last is not None and self._last[0] is frame:
             return self._last[1:]
         if frame.image is None and self._streams.needs_image:
@@ -53,12 +51,12 @@ class Tracks:
         image = None if frame.image is None else image_tensor(frame)
         started = perf_counter()
         pose, K = torch.from_numpy(T_world_cam), torch.from_numpy(frame.intrinsics)
-        self._streams.update(image, pose, K, UfMStarConfig.rotation_tolerance)  # rows skip what has a fault
+        self._streams.update(image, pose, K, UfMStarConfig.rotation_tolerance)  # rows skip frames with faults
         self._last = frame, self._streams.last[0], 1000 * (perf_counter() - started)
         return self._last[1:]
 
     def undo(self) -> None:
-        """Forget the last frame, which UfM* skipped."""
+        """Remove the last frame, which UfM* skipped."""
         self._streams.undo()
 
     def state(self) -> dict[str, Tensor]:
@@ -66,7 +64,7 @@ class Tracks:
         return self._streams.state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken. Raises ValueError: it is of another source."""
+        """Continue from ``state``. Raises ValueError: it belongs to another source."""
         self._streams.load_state(state)
         self._last = None
 
@@ -74,10 +72,9 @@ class Tracks:
 class AnchorSource:
     """The anchors of a row, from ``tracks``; None = ground truth at random pixels.
 
-    Noise on tracked positions acts where it would in the end: an anchor is moved in the image by it, and its depth
-    errs by as much as one of that many pixels in every view makes it, to first order (``track_noise`` times the
-    standard deviation that the tracker states for ``pixel_noise``). The variance is left as the tracker states it.
-    Frames are disturbed independently of each other.
+    Noise on tracked positions is applied to the anchors: it moves an anchor in the image, and gives its depth the
+    first-order error of that noise in every view (``track_noise`` times the tracker's standard deviation per
+    ``pixel_noise``). The variance stays the tracker's. Noise is independent between frames.
     """
 
     def __init__(self, setting: Setting, tracks: Tracks | None) -> None:
@@ -90,14 +87,17 @@ class AnchorSource:
         prediction: DepthPrediction,
         truth: NDArray[np.float32] | None,
     ) -> tuple[Landmarks, Anchors | None, float | None]:
-        """The landmarks of the next frame, in the pixels of the image (of ground truth: of the depth map); the same as
-        anchors [1, N] in the pixels of the depth map, None without an image; and the time that they took [ms].
+        """The anchors of the next frame.
 
         Args:
-            frame: its image is tracked in.
-            T_world_cam: [4, 4] the pose that the row sees [m].
-            prediction: has the camera of the anchors' pixels.
-            truth: [h, w] ground truth at its pixels [m], 0 = none, or None.
+            frame: with the image to track.
+            T_world_cam: [4, 4] the row's pose, with noise [m].
+            prediction: defines the camera of the anchors' pixels.
+            truth: [h, w] ground truth at the prediction's pixels [m], 0 = none, or None.
+
+        Returns:
+            landmarks in the pixels of the image (for ground truth: of the depth map); the same as anchors [1, N] in the
+            pixels of the depth map, None without an image; and the time to compute them [ms].
         """
         device, K = prediction.depth.device, prediction.K[0]
         if self.tracks is None:
@@ -114,52 +114,56 @@ class AnchorSource:
     def _sampled(self, truth: NDArray[np.float32], index: int) -> Landmarks:
         v, u = np.nonzero(truth > 0)
         depth, pixel = truth[v, u].astype(np.float64), np.stack([u, v], axis=-1).astype(np.float64)
-        every = Landmarks(pixel, depth, np.square(TRUTH_SIGMA * depth), tracked=0, none="no ground truth")
-        return self._thinned(every, index, TRUTH_COUNT)
+        landmarks = Landmarks(pixel, depth, np.square(TRUTH_SIGMA * depth), tracked=0, none="no ground truth")
+        return self._thinned(landmarks, index, TRUTH_COUNT)
 
     def _disturbed(self, landmarks: Landmarks, index: int) -> Landmarks:
         size = self._setting.track_noise
         if not size:
             return landmarks
-        drawn = size * self._drawn(index, _NOISE).standard_normal((len(landmarks.depth), 3))
-        of_one_pixel = np.sqrt(landmarks.variance) / TrackerConfig.pixel_noise
+        noise = size * self._drawn(index, _NOISE).standard_normal((len(landmarks.depth), 3))
+        depth_per_pixel = np.sqrt(landmarks.variance) / TrackerConfig.pixel_noise
         return replace(
-            landmarks, pixel=landmarks.pixel + drawn[:, :2], depth=landmarks.depth + of_one_pixel * drawn[:, 2]
+            landmarks, pixel=landmarks.pixel + noise[:, :2], depth=landmarks.depth + depth_per_pixel * noise[:, 2]
         )
 
     def _thinned(self, landmarks: Landmarks, index: int, most: int | None = None) -> Landmarks:
         count = most if self._setting.anchor_count is None else self._setting.anchor_count
         if count is None or len(landmarks.depth) <= count:
             return landmarks
-        chosen = self._drawn(index, _TAKEN).permutation(len(landmarks.depth))[:count]
+        chosen = self._drawn(index, _CHOICE).permutation(len(landmarks.depth))[:count]
         parts = {name: getattr(landmarks, name)[chosen] for name in ("pixel", "depth", "variance")}
         return replace(landmarks, **parts)
 
-    def _drawn(self, index: int, what: int) -> np.random.Generator:
-        return np.random.default_rng([self._setting.seed, index, what])
+    def _drawn(self, index: int, purpose: int) -> np.random.Generator:
+        return np.random.default_rng([self._setting.seed, index, purpose])
 
 
 def landmarks_of(value: str | bool, folder: Path | None, scale: float = 1.0) -> LandmarkSource:
-    """The source of landmarks of a sequence; True means corners, other values are as ``landmark_source`` takes them. A
-    file lies in the sequence's folder or the working folder; its lengths are in the unit of the poses, of ``scale``
-    metres. Raises FileNotFoundError, ValueError, as ``landmark_source``."""
-    word = CORNERS if value is True else str(value)
-    is_file = Path(word).suffix.lower() in FILE_TYPES
-    source = landmark_source(resolve(folder or Path(), word) if is_file else word)
+    """The source of landmarks of a sequence. Errors as ``landmark_source``.
+
+    Args:
+        value: True = corners; else as for ``landmark_source``, with files in the sequence's or the working folder.
+        folder: of the sequence.
+        scale: metres per unit of the poses, which is the unit of the file.
+    """
+    name = CORNERS if value is True else str(value)
+    is_file = Path(name).suffix.lower() in FILE_TYPES
+    source = landmark_source(resolve(folder or Path(), name) if is_file else name)
     if isinstance(source, LandmarkMap) and scale != 1:
         return LandmarkMap(scale * source.points_world, scale * source.sigma)
     return source
 
 
 def landmark_digests(rows: Iterable[Row], folder: Path | None, scale: float = 1.0) -> dict[str, str]:
-    """Digests of the landmarks of rows that have them from a file, by slug. Errors as :func:`landmarks_of`."""
+    """By slug, the digests of the landmarks of rows that read them from a file. Errors as :func:`landmarks_of`."""
     files = {row.slug: row.setting.anchors for row in rows if row.setting.anchors not in ("", CORNERS, DENSE, TRUTH)}
     identities = {file: landmarks_of(file, folder, scale).identity for file in set(files.values())}
     return {slug: identities[file]["landmarks"] for slug, file in files.items() if "landmarks" in identities[file]}
 
 
 def anchor_sources(rows: Iterable[Row], folder: Path | None = None, scale: float = 1.0) -> dict[Row, AnchorSource]:
-    """The source of every row with anchors; rows of the same images and poses share a tracker. Errors as
+    """The source of every row with anchors. Rows with the same images and poses share a tracker. Errors as
     :func:`landmarks_of`."""
     tracks: dict[tuple[object, ...], Tracks] = {}
     sources = {}

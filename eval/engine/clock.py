@@ -11,8 +11,7 @@ import torch
 
 @contextmanager
 def timed(ms: dict[str, float], stage: str, device: torch.device) -> Iterator[None]:
-    """Note the time of a block as that of a stage [ms], with the work that it queues on a device; a block that raises
-    has none."""
+    """Record the time of a block, with the work that it queues on a device, as ``ms[stage]`` [ms], unless it raises."""
     synchronize(device)
     started = time.perf_counter()
     yield

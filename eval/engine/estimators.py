@@ -24,7 +24,7 @@ from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar
 
-# The maps of an answer [1, h, w] on the estimator's device, by the names of ``RowResult``; "statistics" of UfM*.
+# Maps [1, h, w] on the estimator's device, by their names in ``RowResult``; UfM* adds "statistics".
 Answer = dict[str, Any]
 _OF_OUTPUT = (
     "depth", "variance", "valid", "aleatoric", "epistemic", "disagreement", "measured", "anchored", "bias",
@@ -33,10 +33,10 @@ _OF_OUTPUT = (
 
 
 class Estimator(ABC):
-    """Turns the predictions of a sequence, one after the other, into variances.
+    """Computes variances from the predictions of a sequence, frame by frame.
 
     Attributes:
-        module: its buffers are the state; none by default.
+        module: its buffers are the state; without buffers by default.
     """
 
     module: nn.Module = nn.Identity()
@@ -61,8 +61,8 @@ class Estimator(ABC):
         """
 
     def memory(self) -> dict[str, float]:
-        """Size of the state: "bytes" and "count" of points or components, "smoothing_bytes" of the map kept for
-        smoothing [B]; {} without a state. With anchors also "anchors", the number used in the frame."""
+        """Size of the state: "bytes", "count" of points or components, "smoothing_bytes" of the smoothing map [B]; with
+        anchors also "anchors", the number used in the frame. {} without a state."""
         return {}
 
     def state(self) -> dict[str, Tensor]:
@@ -70,18 +70,22 @@ class Estimator(ABC):
         return dict(self.module.state_dict())
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken. Raises RuntimeError: it is that of another kind of estimator."""
+        """Continue from ``state``. Raises RuntimeError: it belongs to another kind of estimator."""
         self.module.load_state_dict(dict(state))
 
 
 def make_estimator(
-    row: Row, device: torch.device, source: DepthSource | None = None, own: Mapping[str, Any] = MappingProxyType({})
+    row: Row, device: torch.device, source: DepthSource | None = None, plugins: Mapping[str, Any] = MappingProxyType({})
 ) -> Estimator:
-    """The estimator of a row on a device, in its initial state. ``source`` states a largest depth and a confidence;
-    ``own`` are methods of one's own (``sequences.plugins``), by name.
+    """The estimator of a row on a device, in its initial state.
+
+    Args:
+        row, device: of the estimator.
+        source: of depth, with its largest depth and whether it has a confidence; None = unknown.
+        plugins: the user's methods (``sequences.plugins``), by name.
 
     Raises:
-        ValueError: a recalibration that was fitted under other settings.
+        ValueError: a recalibration was fitted with other settings.
         FileNotFoundError: the setting's recalibration does not exist.
     """
     method, setting, uses = row.method, row.setting, row.method.uses_aleatoric
@@ -90,27 +94,27 @@ def make_estimator(
     if method.fusion == UFM:
         return Pointwise(method.max_points, uses_variances=uses)
     if method.fusion != UFM_STAR:
-        estimator: Estimator = own[method.fusion](row, device)
+        estimator: Estimator = plugins[method.fusion](row, device)
         return estimator
-    fitted = Recalibration.from_json(setting.recalibration) if setting.recalibration else None
+    recalibration = Recalibration.from_json(setting.recalibration) if setting.recalibration else None
     config = ufm_star_config(row)
     config = config if source is None else config.within(source.max_depth, source.states_confidence)
-    return Gaussians(config, device, posterior=setting.posterior, uses_variances=uses, recalibration=fitted)
+    return Gaussians(config, device, posterior=setting.posterior, uses_variances=uses, recalibration=recalibration)
 
 
 def ufm_star_config(row: Row) -> UfMStarConfig:
     """The settings of a row's UfM*.
 
-    "fixed-param" is the paper's run on 518 x 518 images with "the same hyperparameters used for 224 x 224 inputs". Ours
-    follow the image (``SPGFConfig.scaled_to``), so it takes them literally: areas, lengths and rows in pixels are not
-    scaled, and the threshold a z^2 / f has the image's own focal length. Segments are then smaller and more.
+    "fixed-param" is the paper's run on 518 x 518 images with "the same hyperparameters used for 224 x 224 inputs". It
+    turns off ``SPGFConfig.scaled_to``: areas, lengths and rows in pixels are not scaled, and the threshold a z^2 / f
+    uses the image's focal length. Segments are then smaller and more numerous.
     """
     config = configured(row.setting).replace(on_bad_frame="skip")
     return config.replace(segment=replace(config.segment, scale_with_image=False)) if row.method.fixed_param else config
 
 
 class Alone(Estimator):
-    """The network's own variance, A + E where it states them; without ``uses_variances`` none."""
+    """The network's variance, A + E as far as it predicts them; none without ``uses_variances``."""
 
     def update(self, prediction: DepthPrediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Answer:
         used = self.used(prediction)
@@ -123,7 +127,7 @@ class Alone(Estimator):
 
 
 class Pointwise(Estimator):
-    """UfM. Without ``uses_variances``, A and E are left aside."""
+    """UfM. Without ``uses_variances``, A and E are ignored."""
 
     def __init__(self, max_points: int | None, *, uses_variances: bool = True) -> None:
         super().__init__(uses_variances=uses_variances)
@@ -136,7 +140,7 @@ class Pointwise(Estimator):
         return {"depth": used.depth, "variance": out.variance, "valid": out.valid, "aleatoric": a, "epistemic": e}
 
     def state(self) -> dict[str, Tensor]:
-        """None that could be saved: raises TypeError."""
+        """Raises TypeError: the state of UfM cannot be saved."""
         raise TypeError("a row of UfM cannot be continued within a sequence: only UfM* has a state that can be saved")
 
     def memory(self) -> dict[str, float]:
@@ -179,7 +183,7 @@ class Gaussians(Estimator):
         return self.ufm.mixture.to(torch.float64).rigid(T[:, :3, :3], T[:, :3, 3])
 
     def memory(self) -> dict[str, float]:
-        """Bytes and number of the occupied components, with what anchors add to them; bytes of the moving average."""
+        """Bytes and number of the occupied components, anchor terms included; bytes of the moving average."""
         state, mixture = self.ufm.state, self.ufm.mixture
         count = int(mixture.components.sum())
         component = mixture.bytes_per_component() + sum(sums[:, :1].nbytes for sums in state.by_component.values())

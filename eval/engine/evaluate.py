@@ -1,7 +1,7 @@
-"""Evaluates many rows on a sequence in one stream: every network sees a frame once, every row the same frames.
+"""Evaluates many rows on a sequence in one stream: each network runs once per frame, all rows use the same frames.
 
-A frame that one row cannot use is left out for all rows; otherwise their tables could not be compared. Each row is
-judged on the pixels that have ground truth and a prediction of that row; ``left_out_share`` is the share of the rest.
+A frame that one row cannot use is skipped by all rows, so that their figures can be compared. Each row is evaluated on
+the pixels with ground truth and a prediction of that row; ``left_out_share`` is the share of the other pixels.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from ufmstar_torch.frame import FRAME_FAULTS, check_frame
 _TOLERANCE = UfMStarConfig().rotation_tolerance
 
 
-# Errors of a sequence that cannot be used. Any other error is a mistake in this program, and ends it.
+# Errors of a sequence that cannot be used. Any other error is a bug and ends the program.
 BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
 
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """The networks and metrics with which sequences are judged."""
+    """The networks and metrics that evaluate sequences."""
 
     networks: Mapping[str, DepthSource]  # by base
     device: torch.device  # where UfM and UfM* run
-    store: PredictionCache | None = None  # of predictions; None = all are computed
-    limit: slice = field(default_factory=lambda: slice(None))  # which frames, before a setting's skip
+    store: PredictionCache | None = None  # of predictions; None = compute all
+    limit: slice = field(default_factory=lambda: slice(None))  # selects frames, before a setting's skip
     bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
-    plugins: Plugins = field(default_factory=Plugins)  # methods and metrics of one's own
+    plugins: Plugins = field(default_factory=Plugins)  # the user's methods and metrics
 
 
 def evaluate_sequence(
@@ -57,16 +57,19 @@ def evaluate_sequence(
     progress: Callable[[Progress], object] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> list[RowFigures]:
-    """Judge every row on the frames of a posed sequence with ground truth; a result for each row, in their order.
+    """Evaluate every row on the frames of a posed sequence with ground truth. Returns one result per row, in order.
 
     Args:
-        sequence, rows, judge: see above.
+        sequence: with poses and ground truth.
+        rows: to evaluate.
+        judge: networks and metrics.
         sinks: receive the frames after the metrics; a row's key is its slug.
-        progress, stop: called at the start and after every frame; called before every frame.
+        progress: called at the start and after every frame.
+        stop: called before every frame.
 
     Raises:
-        SequenceError: the sequence cannot be judged.
-        FrameError, RuntimeError, ValueError: rows that cannot be judged at all, or what readers and networks raise.
+        SequenceError: the sequence cannot be evaluated.
+        FrameError, RuntimeError, ValueError: rows cannot be evaluated, or errors of readers and networks.
         Stopped: ``stop`` returned True.
     """
     indices = range(len(sequence))[judge.limit]
@@ -92,26 +95,26 @@ def evaluate_sequence(
 
 
 def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) -> None:
-    """Raises FrameError unless all sources, UfM* and, where anchors are ``tracked``, a tracker can use a frame."""
+    """Raises FrameError unless all sources, UfM* and, if anchors are ``tracked``, a tracker can use the frame."""
     if frame.image is None and (tracked or any(source.needs_image for source in sources)):
         raise FrameError(frame.name, "no image")
     if frame.depth is None and not all(source.needs_image for source in sources):
         raise FrameError(frame.name, "no depth map")
-    pictured = frame.image if frame.image is not None else frame.depth
-    height, width = (1, 1) if pictured is None else pictured.shape[:2]
-    one = torch.ones(1, 1, 1).expand(1, height, width)
+    pixels = frame.image if frame.image is not None else frame.depth
+    height, width = (1, 1) if pixels is None else pixels.shape[:2]
+    depth = torch.ones(1, 1, 1).expand(1, height, width)
     pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
-    checked = check_frame(one, pose, K, None, None, None, None, feature_count=0, rotation_tolerance=_TOLERANCE)
+    checked = check_frame(depth, pose, K, None, None, None, None, feature_count=0, rotation_tolerance=_TOLERANCE)
     if int(checked.fault[0]):
         raise FrameError(frame.name, FRAME_FAULTS[int(checked.fault[0])])
 
 
 def _check(sequence: FrameSequence, rows: Sequence[Row], indices: range) -> None:
-    """Raises SequenceError for a sequence on which the rows cannot be judged."""
+    """Raises SequenceError if the rows cannot be evaluated on the sequence."""
     if not indices:
         raise SequenceError(f"no frame is selected of {len(sequence)}")
     if all(sequence.entries[index].load_depth is None for index in indices):
         raise SequenceError("no frame has ground truth")
-    comparing = [row.method.name for row in rows if row.method.fusion != ALONE]
-    if comparing and not sequence.posed:
-        raise SequenceError(f"single images without poses, on which {', '.join(comparing)} cannot compare views")
+    multiview = [row.method.name for row in rows if row.method.fusion != ALONE]
+    if multiview and not sequence.posed:
+        raise SequenceError(f"single images without poses, on which {', '.join(multiview)} cannot compare views")

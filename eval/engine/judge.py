@@ -1,8 +1,8 @@
-"""Figures against ground truth, as sinks of a stream: of a run, and of the rows of an evaluation.
+"""Sinks that compute figures against ground truth: of a run, and of the rows of an evaluation.
 
-For the figure of NLL by error, the paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is
-confident. It does not define them; here, the half of the reference's pixels with the smallest variance in every
-frame (``RowResult.confident``). All rows on the same frames are judged on the same pixels.
+The paper's figure of NLL by error uses the pixels where the ensemble (left panel) or UfM-Ensemble (right) is confident,
+without a definition. Here they are the half of the reference's pixels with the smallest variance in every frame
+(``RowResult.confident``). All rows on the same frames are evaluated on the same pixels.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.methods import method
 from ufmstar_torch.eval.methods.row import Row
 
-if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence without ground truth need not wait for
+if TYPE_CHECKING:  # torchmetrics takes seconds to import, and a sequence without ground truth does not need it
     from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 
-# Names of a run's figures: UfM*, beside it the network alone, and the posterior if there is one.
+# Names of a run's figures: of UfM*, of the network alone, and of the posterior if there is one.
 UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Names of a row's sums.
 METRICS, BY_ERROR, CONFIDENCE = "metrics", "nll_by_error", "confidence"
-EACH = 512  # pixels of a frame, evenly, for ``ufmstar recalibrate --covariate confidence``
-# Metrics of one's own by name (``sequences.plugins``).
-Own = Mapping[str, Any]
-NONE: Own = MappingProxyType({})
+EACH = 512  # evenly spaced pixels of a frame for ``ufmstar recalibrate --covariate confidence``
+# The user's metrics by name (``sequences.plugins``).
+PluginMetrics = Mapping[str, Any]
+NO_PLUGINS: PluginMetrics = MappingProxyType({})
 
 
 class SequenceError(Exception):
@@ -42,7 +42,7 @@ class SequenceError(Exception):
 
 
 def metrics_of(metrics: dict[str, SequenceMetrics], key: str, **how: Any) -> SequenceMetrics:
-    """The metrics of a key, made now (see ``SequenceMetrics``) if there are none."""
+    """The metrics of a key, created (see ``SequenceMetrics``) if there are none."""
     from ufmstar_torch.eval.metrics import SequenceMetrics
 
     if key not in metrics:
@@ -51,21 +51,21 @@ def metrics_of(metrics: dict[str, SequenceMetrics], key: str, **how: Any) -> Seq
 
 
 class RunMetrics(FrameSink):
-    """The figures of a run's row, ``UFM``, of its network ``ALONE``, and of its ``POSTERIOR``, on the pixels that the
-    row uses. ``sums`` are those of an earlier part of the run. Adds its time to ``FrameResult.ms`` as "metrics"."""
+    """The figures of a run's row, ``UFM``, of its network ``ALONE``, and of its ``POSTERIOR``, on the row's valid
+    pixels. ``sums`` are those of an earlier part of the run. ``FrameResult.ms`` gets "metrics", the time [ms]."""
 
-    def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]], own: Own = NONE) -> None:
-        self._key, self._own = key, own
+    def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]], plugins: PluginMetrics = NO_PLUGINS) -> None:
+        self._key, self._plugins = key, plugins
         self._metrics: dict[str, SequenceMetrics] = {}
         for name, state in sums.items():
-            metrics_of(self._metrics, name, own=own).load_state_dict(dict(state))
+            metrics_of(self._metrics, name, plugins=plugins).load_state_dict(dict(state))
 
     def sums(self) -> dict[str, dict[str, Tensor]]:
-        """The sums by name. Updates replace them and never change them in place."""
+        """The sums by name. Updates replace them instead of changing them in place."""
         return {name: metrics.sums() for name, metrics in self._metrics.items()}
 
     def figures(self) -> dict[str, dict[str, float]]:
-        """delta1, nll, ece_delta, ece_q, spearman, ... by name; without ground truth nothing."""
+        """delta1, nll, ece_delta, ece_q, spearman, ... by name; {} without ground truth."""
         return {name: metrics.compute() for name, metrics in self._metrics.items()}
 
     def take(self, result: FrameResult) -> None:
@@ -82,31 +82,33 @@ class RunMetrics(FrameSink):
             maps[POSTERIOR] = row.posterior_depth, row.posterior_variance
         for name, (depth, variance) in maps.items():
             mixture = row.mixture if name == POSTERIOR else None
-            metrics_of(self._metrics, name, own=self._own).update(depth, variance, target, row.valid, mixture)
+            metrics_of(self._metrics, name, plugins=self._plugins).update(depth, variance, target, row.valid, mixture)
 
 
 @dataclass(frozen=True)
 class RowFigures:
     """The figures of one row on one sequence."""
 
-    row: Row  # which
-    # frames, figures, curves, state, ms: as ``Record`` has them.
+    row: Row
+    # The following fields are those of ``Record``.
     frames: dict[str, Any]
     figures: dict[str, float]
     curves: dict[str, Any]
     state: dict[str, float]
     ms: dict[str, float]
-    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and "nll_by_error:REFERENCE"
-    # (``NLLByError``), to be added up over sequences; and "confidence", samples of pixels (``_samples``).
+    # States of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and "nll_by_error:REFERENCE"
+    # (``NLLByError``), to be added over sequences; and "confidence", samples of pixels (``_samples``).
     sums: dict[str, dict[str, Tensor]]
 
 
 class RowJudge(FrameSink):
-    """Collects counts, metrics, times and memory of one row over a sequence; ``named`` are the references by whose
-    confident pixels its NLL is binned by error: their names by key."""
+    """Collects counts, metrics, times and memory of one row over a sequence. ``reference_names`` has, by key, the names
+    of the rows on whose confident pixels the NLL by error is computed."""
 
-    def __init__(self, row: Row, named: Mapping[str, str], bins: str, own: Own = NONE) -> None:
-        self.row, self._named, self._bins, self._own = row, named, bins, own
+    def __init__(
+        self, row: Row, reference_names: Mapping[str, str], bins: str, plugins: PluginMetrics = NO_PLUGINS
+    ) -> None:
+        self.row, self._references, self._bins, self._plugins = row, reference_names, bins, plugins
         self._metrics: dict[str, SequenceMetrics] = {}
         self._by_error: dict[str, NLLByError] = {}
         self._samples: list[Tensor] = []
@@ -118,7 +120,7 @@ class RowJudge(FrameSink):
         self._runner = next(row for row in stream.rows if row.key == self.row.slug)
 
     def take(self, result: FrameResult) -> None:
-        """Add a frame. Pixels that the row leaves out are NaN, not masked, so that the metrics count them."""
+        """Add a frame. Invalid pixels are NaN, not masked, so that the metrics count them."""
         if self.row.slug in result.skipped:
             self._reasons[result.skipped[self.row.slug]] += 1
         if self.row.slug in result.rows:
@@ -127,7 +129,7 @@ class RowJudge(FrameSink):
     def _add(self, result: RowResult, rows: Mapping[str, RowResult]) -> None:
         if result.statistics is not None:
             segments, matched = (int(count[0]) for count in (result.statistics.segments, result.statistics.matched))
-            # The first frame has nothing to match.
+            # In the first frame there is no component to match.
             self._idle.update(without_segment=int(not segments), without_match=int(bool(self._ms) and not matched))
         self._ms.append(result.ms)
         self._memory.append(self._runner.memory())
@@ -139,19 +141,19 @@ class RowJudge(FrameSink):
         depth, variance, target = (
             torch.where(result.valid, result.depth, torch.nan), result.variance, torch.from_numpy(result.truth)
         )  # fmt: skip
-        how = {"with_variance": variance is not None, "bins": self._bins, "own": self._own}
+        how = {"with_variance": variance is not None, "bins": self._bins, "plugins": self._plugins}
         mixture = result.mixture if self.row.setting.posterior else None
         metrics_of(self._metrics, METRICS, **how).update(depth, variance, target, mixture=mixture)
         if variance is None:
             return
         if result.confidence is not None:
             self._samples.append(_samples(result.confidence, depth, variance, target))
-        for other, name in self._named.items():
+        for other, name in self._references.items():
             by_error = self._by_error.setdefault(f"{BY_ERROR}:{name}", NLLByError(sync_on_compute=False))
             by_error.update(depth, variance, target, rows[other].confident)
 
     def figures(self) -> RowFigures:
-        """The figures after the last frame. Raises SequenceError: no frame was judged."""
+        """The figures after the last frame. Raises SequenceError: no frame was evaluated."""
         reasons, done, skipped = dict(sorted(self._reasons.items())), len(self._ms), self._reasons.total()
         if not self._judged:
             worst = "; ".join(f"{count} x {reason}" for reason, count in list(reasons.items())[:3])
@@ -174,11 +176,11 @@ class RowJudge(FrameSink):
             curves=curves,
             state=self._state(),
             ms={stage: median(values) for stage, values in times.items() if values},
-            sums={name: {entry: value.cpu() for entry, value in own.items()} for name, own in sums.items()},
+            sums={name: {entry: value.cpu() for entry, value in state.items()} for name, state in sums.items()},
         )
 
     def _state(self) -> dict[str, float]:
-        """The size of the method's state over the sequence, as ``Record`` has it."""
+        """The size of the method's state over the sequence, for ``Record``."""
         state: dict[str, float] = {}
         for name, end in self._memory[-1].items():
             values = [memory[name] for memory in self._memory]
@@ -193,15 +195,15 @@ class RowJudge(FrameSink):
 def _samples(confidence: Tensor, depth: Tensor, variance: Tensor, target: Tensor) -> Tensor:
     """[n, 3] float64 confidence, variance [m^2] and squared error [m^2] at ``EACH`` of the pixels with all of them."""
     maps = torch.stack([confidence, variance, (target - depth).square()], -1).double()
-    known = maps[(target > 0) & maps.isfinite().all(-1) & (variance > 0)]
-    return known[:: max(1, -(-len(known) // EACH))]
+    usable = maps[(target > 0) & maps.isfinite().all(-1) & (variance > 0)]
+    return usable[:: max(1, -(-len(usable) // EACH))]
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:
-    """The rows by whose confidence a row is judged, among ``rows`` that see the same frames: its base alone, and behind
-    UfM with the fewest points. Of several settings, the row's own is preferred, then the default."""
+    """The references of a row for the NLL by error, among ``rows`` on the same frames: its base alone, and its base
+    with the UfM of the fewest points. The row's pose noise is preferred, then the default setting."""
 
-    def seen(other: Row) -> tuple[str, int, str]:  # from which frames, and which part of them
+    def seen(other: Row) -> tuple[str, int, str]:  # defines the frames and the part of them that the network sees
         return other.method.base, other.setting.skip, other.setting.preprocess
 
     def points(other: Row) -> float:

@@ -1,4 +1,4 @@
-"""Depth sources from files, as a user chooses them: for a base of a suite, or for ``ufmstar run``."""
+"""Depth sources from a user's files: for a base of a suite, or for ``ufmstar run``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ufmstar_torch.networks_in_turn import NetworksInTurn
 
 _FORM = "BASE=MODEL:FILE[,FILE...]"
 _AS_USERS = Inference()
-_VERSION = 4  # of the digests: raise it where predictions from the same files change
+_VERSION = 4  # of the digests: increase it when predictions from the same files change
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,15 @@ class NetworkChoice:
     """Networks in files, as chosen by a user.
 
     Raises:
-        ValueError: no such base or model, no files, or files that do not go together.
+        ValueError: no such base or model, no files, or files that do not fit together.
     """
 
-    base: str  # a key of ``method.BASES``; "" = whatever the files hold, as ``ufmstar run`` takes them
-    model: str  # a name that ``load_network`` accepts, or "ground-truth": of "depth_only", the sequence's own depth
-    # In the order of the members: "FILE#2" is member 2 of a file of "trained" alone, counted from 0 (without it, all of
-    # them), a directory a network of ``transformers``; for "ground-truth" nothing, or "HxW".
+    base: str  # a key of ``method.BASES``; "" = any network, for ``ufmstar run``
+    model: str  # a name that ``load_network`` accepts, or "ground-truth": for "depth_only", the sequence's depth
+    # In the order of the members. "FILE#2" is member 2, counted from 0, of a file of "trained" ("FILE": all members); a
+    # directory is a network of ``transformers``; for "ground-truth" empty, or "HxW".
     weights: tuple[str, ...] = ()
-    spec: str | None = None  # file that declares what an ONNX file or saved program does not say
+    spec: str | None = None  # file that declares what an ONNX file or saved program does not contain
 
     def __post_init__(self) -> None:
         if not self.base:
@@ -66,7 +66,7 @@ class NetworkChoice:
 
     @classmethod
     def parse(cls, text: str) -> NetworkChoice:
-        """Parse ``BASE=MODEL:FILE[,FILE...]``, of which one may be a spec (.json). Raises ValueError: another form."""
+        """Parse ``BASE=MODEL:FILE[,FILE...]``; one FILE may be a spec (.json). Raises ValueError: another form."""
         base, equals, rest = text.partition("=")
         model, _, files = rest.partition(":")
         if not (base and equals and model):
@@ -78,7 +78,7 @@ class NetworkChoice:
         return cls(base, model, tuple(file for file in listed if file not in specs), *specs)
 
     def with_spec(self, spec: str | None) -> NetworkChoice:
-        """The choice with that spec, unless it has one, or needs none as the sequence's own depth."""
+        """The choice with that spec, unless it has one or is the sequence's depth."""
         if spec is None or self.spec is not None or self.model == TRUTH:
             return self
         if not spec.endswith(".json"):
@@ -87,7 +87,7 @@ class NetworkChoice:
 
     @property
     def size(self) -> Size | None:
-        """(h, w) to which ground truth is brought; None = as it is."""
+        """(h, w) to which ground truth is resized; None = not resized."""
         return parse_size(self.weights[0]) if self.model == TRUTH and self.weights else None
 
     def load(
@@ -99,13 +99,19 @@ class NetworkChoice:
         offload: bool = False,
         inference: Inference = _AS_USERS,
     ) -> DepthSource:
-        """The depth source on a device: members in turn, of MC-Dropout one sample an image or all ``samples`` (None: as
-        many as the paper's baseline). Without a base, ``mode`` "full" is for all members on every image, or for samples
-        of a single network; with one, the row decides, and predictions may be stored.
+        """Load the depth source onto a device.
+
+        Args:
+            device: of the networks.
+            mode: without a base, "alternate" for one member per image, "full" for all members, or all samples of a
+                single network. With a base, the row decides, and predictions may be stored.
+            samples: of MC-Dropout; None = as many as in the paper's baseline.
+            offload: see :meth:`members`.
+            inference: runtime, precision and threads.
 
         Raises:
-            FileNotFoundError, ValueError: as :meth:`members` and ``check_members``; mode "full" of one network that
-                does not sample, or ``samples`` of any other.
+            FileNotFoundError, ValueError: as :meth:`members` and ``check_members``; mode "full" with one network that
+                does not sample, or ``samples`` without such sampling.
         """
         if self.model == TRUTH:
             return own_depth(self.size)
@@ -139,12 +145,12 @@ class NetworkChoice:
     def members(
         self, device: torch.device, *, offload: bool = False, inference: Inference = _AS_USERS
     ) -> list[DepthNetwork]:
-        """The networks in their order, in eval mode and on the CPU; ``device`` and ``inference`` are where and how they
-        will run. ``offload``, of "trained": weights stay in host memory and come to the device for their turn only.
+        """The networks in order, in eval mode and on the CPU, prepared to run on ``device`` with ``inference``.
+        ``offload``, for "trained": weights stay in host memory, only the active member is on the device.
 
         Raises:
             FileNotFoundError: a file is missing.
-            ValueError: unknown model, files that do not fit it, members that want different inputs.
+            ValueError: unknown model, files that do not fit it, or members with different inputs.
         """
         named = [(Path(path), member) for path, member in map(_path, self.weights)]
         directories = self.model in DIRECTORIES
@@ -191,7 +197,7 @@ class NetworkChoice:
 
 
 def sha256(file: Path) -> str:
-    """Hex digest of a file's content; of a directory's files and their names, but for hidden ones."""
+    """Hex digest of a file's content, or of the names and contents of a directory's files except hidden ones."""
     if file.is_dir():
         names = sorted(path.relative_to(file) for path in file.rglob("*") if path.is_file())
         shown = [name for name in names if not any(part.startswith(".") for part in name.parts)]
@@ -202,7 +208,7 @@ def sha256(file: Path) -> str:
 
 
 def _label(model: str, file: Path, network: DepthNetwork) -> str:
-    """As tables show it: the name of the architecture, or of the file with the (first) weights."""
+    """The label in tables: the name of the architecture, or of the file with the (first) weights."""
     if model == "trained":
         spec = read_info(file).spec
         if spec.module is not None:
@@ -216,7 +222,7 @@ def _label(model: str, file: Path, network: DepthNetwork) -> str:
 
 
 def _path(file: str) -> tuple[str, int | None]:
-    """A file and the member of it that is meant; None = all of them."""
+    """Split "FILE#2" into the file and the member's number; None = all members."""
     path, mark, number = file.rpartition("#")
     if mark and path and number.isdecimal() and not Path(file).exists():
         return path, int(number)

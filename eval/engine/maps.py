@@ -1,5 +1,4 @@
-"""Depth maps that exist already as a source: a folder of maps that another program predicted, or the sequence's own
-depth."""
+"""Depth sources from existing maps: a folder of another program's predictions, or the sequence's depth."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ Maps = tuple[np.ndarray, np.ndarray | None, np.ndarray]
 
 
 class MapSource(DepthSource):
-    """Depth maps that exist already, brought to ``size`` (h, w) unless it is None; the rest as ``DepthSource``."""
+    """Existing depth maps, resized to ``size`` (h, w) unless it is None; other arguments as for ``DepthSource``."""
 
     def __init__(
         self,
@@ -44,14 +43,13 @@ class MapSource(DepthSource):
         self._read, self._size, self.is_truth = read, size, is_truth
 
     def prepared(self, how: str) -> MapSource:
-        """Itself: maps show the whole frame; "crop" raises ValueError."""
+        """This source, because maps show the whole frame. Raises ValueError: ``how`` is "crop"."""
         if how == CROP:
             raise ValueError(f'preprocess = "{CROP}" goes with networks: maps exist already')
         return self
 
     def one(self, frame: Frame, n: int) -> DepthPrediction:
-        """The frame's map, resized by taking the nearest pixel; no network runs. Raises FrameError: it has none, or it
-        cannot be read."""
+        """The frame's map, resized by nearest neighbour. Raises FrameError: the map is missing or cannot be read."""
         depth, variance, K = self._read(frame)
         if self._size is not None and self._size != depth.shape:
             before, height, width = K, *depth.shape
@@ -75,13 +73,18 @@ def folder_source(
 ) -> MapSource:
     """Maps that another program predicted for the frames of a sequence (see :class:`DepthFolder`).
 
-    Without ``intrinsics`` [px], the maps must show the whole image; theirs are then the image's, scaled by the sizes'
-    ratio. The output folder of a run brings its own; a frame that the run skipped has no map. ``indices`` are the
-    frames whose maps are wanted (None = all).
+    Args:
+        sequence: of the maps.
+        folder: of the maps, or the output folder of a run, which includes intrinsics and skipped frames.
+        variance: folder of the variances; None = none.
+        scale: metres per unit of the maps.
+        intrinsics: of the maps [px]; None = the image's, scaled by the ratio of sizes: maps show the whole image.
+        size: (h, w) to which maps are resized; None = not resized.
+        indices: of the frames with maps; None = all.
 
     Raises:
         NotADirectoryError: no such folder.
-        ValueError: no maps, maps that fit no frame, or (the first one) of another aspect ratio than the images.
+        ValueError: no maps, maps that fit no frame, or a first map with another aspect ratio than the images.
     """
     run = own_output(Path(folder))
     chosen = range(len(sequence)) if indices is None else indices
@@ -117,7 +120,7 @@ def folder_source(
 
 
 def _check_first(sequence: FrameSequence, maps: DepthMaps) -> None:
-    """Raises ValueError where the first map has another aspect ratio than the images, as then all have."""
+    """Raises ValueError: the first map has another aspect ratio than the images; then all maps have."""
     try:
         depth, _ = maps[0]
     except FrameError:  # counted when its turn comes
@@ -129,8 +132,8 @@ def _check_first(sequence: FrameSequence, maps: DepthMaps) -> None:
 
 
 def _of_whole_image(file: Path, depth: np.ndarray, size: Size | None, K: np.ndarray) -> np.ndarray:
-    """[3, 3] the camera of a map that shows a whole image of ``size`` (H, W) with intrinsics K. Raises FrameError: it
-    does not."""
+    """[3, 3] intrinsics of a map that shows a whole image of ``size`` (H, W) with intrinsics K. Raises FrameError: the
+    aspect ratios differ."""
     try:
         return scale_intrinsics(K, size, depth.shape[:2])
     except ValueError as error:
@@ -140,7 +143,7 @@ def _of_whole_image(file: Path, depth: np.ndarray, size: Size | None, K: np.ndar
 
 
 def own_depth(size: Size | None = None) -> MapSource:
-    """The sequence's own depth as the prediction: UfM* on perfect depth, the method's floor. ``size``: see
+    """The sequence's depth as the prediction: UfM* on perfect depth, the lower bound of its error. ``size``: see
     :class:`MapSource`."""
 
     def read(frame: Frame) -> Maps:

@@ -1,4 +1,4 @@
-"""Checks that networks predict the variances that their base needs, before the first frame."""
+"""Checks, before the first frame, that networks predict the variances that their base needs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ufmstar_torch.models.dropout import DecoderDropout, MonteCarloDropout, set_
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.prediction import DepthPrediction, infer
 
-_PROBE = (480, 640)  # (h, w) [px] of the grey image that the networks are tried on
+_PROBE = (480, 640)  # (h, w) [px] of the grey test image
 _NEEDED = {
     "ensemble": "two networks or more (not batch_ensemble=), each with an aleatoric variance",
     "mc_dropout": "one network that samples, by its decoder's dropout",
@@ -24,7 +24,7 @@ _NEEDED = {
 
 
 def without_sampling(network: DepthNetwork) -> DepthNetwork:
-    """The network itself where it came as MC-Dropout, no longer sampling."""
+    """The network; for MC-Dropout the wrapped network with sampling off."""
     if not isinstance(network, MonteCarloDropout):
         return network
     set_sampling(network.network, False)
@@ -32,10 +32,12 @@ def without_sampling(network: DepthNetwork) -> DepthNetwork:
 
 
 def check_members(base: str, members: Sequence[DepthNetwork], device: torch.device) -> None:
-    """Try the networks of a base. Raises ValueError: they are not what it needs (``_NEEDED``); the message has both."""
+    """Run the networks of a base on a test image. Raises ValueError: they are not what the base needs (``_NEEDED``)."""
     ensembles = [member.ensemble for member in members if isinstance(member, BatchEnsembleMember)]
-    of_one = len(ensembles) == len(members) > 1 and len({id(ensemble) for ensemble in ensembles}) == 1
-    fitting = {"batch_ensemble": of_one, "ensemble": len(members) > 1 and not ensembles}.get(base, len(members) == 1)
+    single_ensemble = len(ensembles) == len(members) > 1 and len({id(ensemble) for ensemble in ensembles}) == 1
+    fitting = {"batch_ensemble": single_ensemble, "ensemble": len(members) > 1 and not ensembles}.get(
+        base, len(members) == 1
+    )
     kinds = ", ".join(sorted({type(member).__name__ for member in members}))
     got = f"{len(members)} of the kind {kinds}"
     if fitting and base == "mc_dropout":

@@ -1,4 +1,4 @@
-"""Networks as a depth source: members in turn, or samples of MC-Dropout, each inference timed."""
+"""Networks as a depth source: alternating members, or samples of MC-Dropout, with timed inferences."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.networks_in_turn import NetworksInTurn
 from ufmstar_torch.prediction import DepthPrediction
 
-# Sample n of frame i is seeded by i + 1,000,003 n: another seed for every pair as long as a sequence has fewer
-# frames than that, and below 2^32, the largest seed of torch's generator on the CPU.
+# Sample n of frame i has the seed i + 1,000,003 n. Seeds are unique in sequences with fewer frames than that, and stay
+# below 2^32, the limit of torch's generator on the CPU.
 _SAMPLE_STRIDE = 1_000_003
 
 
 class NetworkSource(DepthSource):
-    """Depth from networks, moved to ``device``; ``precision`` is as ``Inference.precision``, but predictions are of
-    single precision in any case.
+    """Depth from networks, moved to ``device``. ``precision`` is as ``Inference.precision``; predictions are always of
+    single precision.
 
-    Where a network samples (decoder dropout), sample n of frame i is seeded by i and n, so that it is the same whatever
-    ran before, on one process or many, in a run that continues or in one that does not.
+    Sample n of frame i (decoder dropout) is seeded by i and n, so it does not depend on earlier frames, the number of
+    processes or a resume.
     """
 
     needs_image = True
@@ -67,8 +67,8 @@ class NetworkSource(DepthSource):
         return runtime_of(self.networks[0], self._precision)
 
     def prepared(self, how: str) -> NetworkSource:
-        """The same networks, which draw from the same generator, on images that are prepared otherwise. Raises
-        ValueError: the networks do not declare their input by a ``Preprocess``."""
+        """The same networks and generator with another preprocessing of images. Raises ValueError: the networks do not
+        declare their input by a ``Preprocess``."""
         declared = self._turns.preprocess
         if how == OF_NETWORK:
             return self
@@ -97,8 +97,8 @@ class NetworkSource(DepthSource):
             autocast = torch.autocast(self._device.type, torch.bfloat16, enabled=reduced)
             with timed(ms, "network", self._device), autocast:
                 maps = self._turns.member(x, K, n)
-        made = replace(maps, intrinsics=K.cpu().double(), ms=ms["network"])
-        return made.to(torch.float32) if reduced else made
+        prediction = replace(maps, intrinsics=K.cpu().double(), ms=ms["network"])
+        return prediction.to(torch.float32) if reduced else prediction
 
     def prepare(self, frame: Frame) -> None:
         """See ``DepthSource``; on the processor."""
@@ -106,7 +106,7 @@ class NetworkSource(DepthSource):
             self._input(frame)
 
     def _input(self, frame: Frame) -> tuple[Tensor, Tensor]:
-        """The networks' input [1, 3, h, w] and its intrinsics [1, 3, 3], computed once as long as the frame is used."""
+        """The networks' input [1, 3, h, w] and its intrinsics [1, 3, 3], computed once per frame."""
         if frame not in self._inputs:
             image, K = image_tensor(frame).to(self._device), torch.from_numpy(frame.intrinsics)[None]
             with torch.no_grad():
@@ -120,6 +120,6 @@ def prepared_as(declared: Preprocess, how: str) -> Preprocess:
 
 
 def stochastic(networks: Iterable[nn.Module]) -> list[MonteCarloDropout]:
-    """Those of the networks that sample."""
+    """The networks that sample."""
     opened = [network.network() if isinstance(network, LazyMember) else network for network in networks]
     return [network for network in opened if isinstance(network, MonteCarloDropout)]

@@ -1,5 +1,5 @@
-"""Predictions of depth sources for one frame; each inference runs once and may be cached on disk: in one npz for each
-network, frame and member, ``NETWORK/SEQUENCE/FRAME@MEMBER.npz``, with the maps in float32.
+"""Predictions of depth sources for one frame. Each inference runs once and may be cached on disk: one npz per network,
+frame and member, ``NETWORK/SEQUENCE/FRAME@MEMBER.npz``, with the maps in float32.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ _FIELDS = {
 
 
 class DepthSource(ABC):
-    """A source of depth: networks, or maps that exist already.
+    """A source of depth: networks, or existing maps.
 
     Attributes:
-        identity: plain values that distinguish this source from another one.
-        label: as tables show it.
-        digest: of the identity, in hex, the source's name in a store; "" where nothing is stored.
-        networks: that it runs; () of maps.
-        passes: inferences that all members (or samples) take.
-        max_depth: [m] the largest depth that its networks can predict; None where it is not known.
-        states_confidence: whether its networks do.
-        needs_image: whether it predicts from the image; from the depth map otherwise.
-        is_truth: whether it is the sequence's own depth, which has no error.
+        identity: plain values that distinguish this source from others.
+        label: for tables.
+        digest: hex digest of the identity, the source's name in a store; "" = predictions are not stored.
+        networks: () for maps.
+        passes: number of inferences of all members (or samples).
+        max_depth: [m] the largest depth that its networks can predict; None = unknown.
+        states_confidence: True if its networks predict a confidence.
+        needs_image: True if it predicts from the image, False if it reads a depth map.
+        is_truth: True if it is the sequence's depth, which has no error.
     """
 
     needs_image = is_truth = states_confidence = False
@@ -56,7 +56,7 @@ class DepthSource(ABC):
 
     @property
     def cacheable(self) -> bool:
-        """True if a store may keep its predictions, which are then of single precision, read or computed."""
+        """True if a store may keep its predictions, which then always are of single precision."""
         return self.needs_image and bool(self.digest)
 
     @property
@@ -66,19 +66,19 @@ class DepthSource(ABC):
 
     @abstractmethod
     def prepared(self, how: str) -> DepthSource:
-        """The same source with its images prepared by ``Setting.preprocess``. Raises ValueError: it has no images."""
+        """The same source with images preprocessed by ``Setting.preprocess``. Raises ValueError: it has no images."""
 
     def turn(self, position: int) -> int:
-        """The member for the image that a row uses after ``position`` others; 0 for maps."""
+        """The member for a row's image number ``position``, from 0; 0 for maps."""
         return 0
 
     def prepare(self, frame: Frame) -> None:
-        """In another thread, what can be done before a network runs."""
+        """Compute the networks' input; called in another thread."""
 
     @abstractmethod
     def one(self, frame: Frame, n: int) -> DepthPrediction:
-        """One timed inference, of member (or sample) n: maps [1, h, w], and their intrinsics [1, 3, 3] in float64 on
-        the CPU. Raises FrameError: the frame has nothing to predict from."""
+        """One timed inference of member (or sample) n: maps [1, h, w], and their intrinsics [1, 3, 3] in float64 on the
+        CPU. Raises FrameError: the frame has no image or depth map to predict from."""
 
 
 class CacheError(Exception):
@@ -87,7 +87,7 @@ class CacheError(Exception):
 
 class PredictionCache:
     """Predictions by a ``path`` of networks, sequence, frame and member, and a digest of the frame's ``content``.
-    Several processes may use one folder: a file is whole or absent, and all write the same into it.
+    Several processes may use one folder: a file is complete or absent, and all processes write the same content.
 
     Raises:
         CacheError: the folder cannot be made or written.
@@ -95,12 +95,12 @@ class PredictionCache:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        # Tried by writing: permissions say nothing about file systems that are mounted read-only.
+        # A test file, because permissions do not show that a file system is mounted read-only.
         self._write(Path(".writable"), lambda opened: opened.write(b""))
 
     def load(self, path: Path, content: str, device: torch.device) -> DepthPrediction | None:
-        """The prediction bit for bit as it was stored, or None where it has to be made: there is no file, it belongs to
-        another image of that name, was cut off or changed, or cannot be read."""
+        """The prediction as it was stored, bit for bit. None if the file does not exist, belongs to another image of
+        that name, is incomplete or changed, or cannot be read."""
         try:
             arrays = read_npz_whole(self.folder / path)
         except (OSError, ValueError):
@@ -111,7 +111,7 @@ class PredictionCache:
         return DepthPrediction(**tensors).to(device)
 
     def store(self, path: Path, content: str, prediction: DepthPrediction) -> None:
-        """Keep a prediction. Raises CacheError: it cannot be written."""
+        """Store a prediction. Raises CacheError: it cannot be written."""
         named = {name: getattr(prediction, field) for name, field in _FIELDS.items()}
         arrays = {name: value[0].cpu().numpy() for name, value in named.items() if value is not None}
         arrays["content"] = np.frombuffer(content.encode(), np.uint8)
@@ -130,8 +130,8 @@ class PredictionCache:
 
 
 class FramePredictions:
-    """The predictions for one frame, on a device: from memory, else from the store (None = there is none), else
-    computed. ``sequence`` is the digest of the sequence."""
+    """The predictions for one frame, on a device: from memory, else from the store if any, else computed. ``sequence``
+    is the digest of the sequence."""
 
     def __init__(self, frame: Frame, device: torch.device, store: PredictionCache | None, sequence: str) -> None:
         self.frame, self._device, self._store, self._sequence = frame, device, store, sequence
@@ -141,8 +141,8 @@ class FramePredictions:
         self._inferences: dict[tuple[object, int], DepthPrediction] = {}
 
     def of(self, source: DepthSource, position: int, every: bool) -> DepthPrediction:
-        """The prediction for a row that has used ``position`` images before: of all members, or of the one in turn.
-        Raises FrameError: the frame has nothing to predict from."""
+        """The prediction for a row's image number ``position``, of ``every`` member or of the next one. Raises
+        FrameError: the frame has no image or depth map to predict from."""
         combined = every and source.passes > 1
         member = "all" if combined else str(source.turn(position))
         key = source.digest or source, member
@@ -150,22 +150,22 @@ class FramePredictions:
             return self._cached[key]
         store = self._store if source.cacheable else None
         path = Path(source.digest[:_SHOWN], self._sequence[:_SHOWN], f"{self.frame.name}@{member}.npz")
-        found = None if store is None else store.load(path, self._content, self._device)
-        if found is None:
+        prediction = None if store is None else store.load(path, self._content, self._device)
+        if prediction is None:
             members = range(source.passes) if combined else [int(member)]
-            made = [self._inference(source, n) for n in members]
-            found = combine(made) if combined else made[0]
+            parts = [self._inference(source, n) for n in members]
+            prediction = combine(parts) if combined else parts[0]
             if store is not None:
-                store.store(path, self._content, found)
-        self._cached[key] = found
-        return found
+                store.store(path, self._content, prediction)
+        self._cached[key] = prediction
+        return prediction
 
     def _inference(self, source: DepthSource, n: int) -> DepthPrediction:
         """Member (or sample) n, computed once for all rows."""
         key = (source.digest or source, n)
         if key not in self._inferences:
-            made = source.one(self.frame, n).to(self._device)
-            self._inferences[key] = made.to(torch.float32) if source.cacheable else made
+            prediction = source.one(self.frame, n).to(self._device)
+            self._inferences[key] = prediction.to(torch.float32) if source.cacheable else prediction
         return self._inferences[key]
 
 
@@ -176,7 +176,7 @@ def sequence_digest(sequence: FrameSequence) -> str:
 
 
 def content_digest(sequence: FrameSequence) -> str:
-    """Hex digest of what is known of a sequence before it is decoded: frames, cameras and poses."""
+    """Hex digest of a sequence without its decoded content: frames, cameras and poses."""
     K = sequence.depth_intrinsics
     digest = hashlib.sha256(sequence_digest(sequence).encode())
     digest.update(repr((None if K is None else K.tolist(), sequence.depth_size)).encode())
@@ -187,7 +187,7 @@ def content_digest(sequence: FrameSequence) -> str:
 
 
 def frame_digest(frame: Frame) -> str:
-    """Hex digest of what a network sees of a frame: pixels and intrinsics (and the index, which seeds samples)."""
+    """Hex digest of a frame's inputs to a network: pixels, intrinsics, and the index, which seeds samples."""
     digest = hashlib.sha256(repr((frame.index, None if frame.image is None else frame.image.shape)).encode())
     digest.update(np.ascontiguousarray(frame.intrinsics).tobytes())
     if frame.image is not None:

@@ -13,14 +13,14 @@ class Progress:
     """The progress of a command."""
 
     stage: str  # "kernels" (compiled on a machine's first run), "rooms", "frames" or "pictures"
-    done: int  # of this stage, skipped frames included
-    total: int  # of this stage
-    components: int | None = None  # of the first UfM* after this frame; None: it was skipped, or nothing is done yet
-    skipped: int = 0  # frames so far
+    done: int  # number of finished steps of this stage, skipped frames included
+    total: int  # number of steps of this stage
+    components: int | None = None  # of the first row with UfM*; None if it skipped the frame, and before the first one
+    skipped: int = 0  # number of frames skipped so far
 
 
 class ProgressSink(FrameSink):
-    """Calls ``progress`` at the start and after every frame; ``skipped`` frames came before."""
+    """Calls ``progress`` at the start and after every frame; ``skipped`` is the initial count of skipped frames."""
 
     def __init__(self, progress: Callable[[Progress], object], skipped: int = 0) -> None:
         self._progress, self._skipped = progress, skipped

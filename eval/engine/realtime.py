@@ -12,17 +12,17 @@ import numpy as np
 from ufmstar_torch.live import LiveResult, LiveStatistics
 from ufmstar_torch.pipeline import UncertainDepth
 
-_SETTLED = 60  # results after which the memory is first read: buffers and threads are there then
+_SETTLED = 60  # results before the memory is first read, when all buffers and threads exist
 _STATM = Path("/proc/self/statm")
 
 
 class RealTime:
-    """Times of the results of one ``LiveDepth``: the time after the last inference of its ``model`` on an image counts
+    """Times of the results of one ``LiveDepth``. The time after the last inference of its ``model`` on an image counts
     as UfM*'s."""
 
     def __init__(self, model: UncertainDepth) -> None:
         self.latency, self.compute, self.network = array("d"), array("d"), array("d")  # [s]
-        self.processor = array("d")  # [s] of the worker's thread between two results: without the waits for a core
+        self.processor = array("d")  # [s] CPU time of the worker's thread between two results
         self._predicted = 0.0
         self._thread: float | None = None
         self._memory: int | None = None
@@ -46,10 +46,10 @@ class RealTime:
             self._memory = resident_bytes()
 
     def summary(self, statistics: LiveStatistics) -> dict[str, Any]:
-        """Plain values: counts, results per second, latencies and times [ms], and memory [bytes]; None where there is
-        no measurement."""
+        """Plain values: counts, results per second, latencies and times [ms], and memory [bytes]; None where nothing
+        was measured."""
         compute, network = np.array(self.compute), np.array(self.network)
-        now, seconds = resident_bytes(), self._last - self._first
+        memory, seconds = resident_bytes(), self._last - self._first
         lost = sum(statistics.dropped.values()) + sum(statistics.skipped.values())
         return {
             "images": statistics.images,
@@ -65,13 +65,13 @@ class RealTime:
             "ours_ms": _quantiles(compute - network),
             "processor_ms": _quantiles(np.array(self.processor)),
             "ours_share": float(1 - network.sum() / compute.sum()) if len(compute) else None,
-            "memory_bytes": now,
-            "memory_growth_bytes": None if self._memory is None or now is None else now - self._memory,
+            "memory_bytes": memory,
+            "memory_growth_bytes": None if self._memory is None or memory is None else memory - self._memory,
         }
 
 
 def _quantiles(seconds: np.ndarray) -> dict[str, float] | None:
-    """The median, the 99th percentile and the maximum [ms]; None without a time."""
+    """The median, the 99th percentile and the maximum [ms]; None without values."""
     if not seconds.size:
         return None
     values = np.quantile(1000 * seconds, [0.5, 0.99, 1])

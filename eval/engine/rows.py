@@ -1,4 +1,4 @@
-"""One row in the middle of a sequence: its poses, its anchors, its estimator, and the result for each frame."""
+"""One row on a sequence: its poses, its anchors, its estimator, and the result for each frame."""
 
 from __future__ import annotations
 
@@ -31,33 +31,33 @@ _IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drif
 class RowResult:
     """One row's result for a frame: its maps [h, w] on the CPU, its prediction and its anchors."""
 
-    depth: Tensor  # as predicted, or corrected by the anchors where the row does so [m]
-    variance: Tensor | None  # total [m^2], NaN where not valid; None of a network that predicts depth alone
-    valid: Tensor  # bool, True where depth is positive and finite, and so is every variance used
+    depth: Tensor  # predicted, or the posterior's if the row has one [m]
+    variance: Tensor | None  # total [m^2], NaN where not valid; None if the network predicts depth alone
+    valid: Tensor  # bool, True where the depth is positive and finite and every variance that is used is valid
     # A and E as far as the row uses them [m^2], or None.
     aleatoric: Tensor | None = None
     epistemic: Tensor | None = None
     disagreement: Tensor | None = None  # M of UfM* [m^2], or None
-    measured: Tensor | None = None  # share of M that rests on two views or more, of UfM*, NaN where not valid, or None
+    measured: Tensor | None = None  # share of M from two views or more, of UfM*, NaN where not valid, or None
     anchored: Tensor | None = None  # B of UfM* with anchors [m^2], or None
     bias: Tensor | None = None  # r of UfM* with anchors, or None
     posterior_depth: Tensor | None = None  # of UfM* with anchors and a posterior [m], or None
     posterior_variance: Tensor | None = None  # likewise [m^2]
     posterior_inlier_variance: Tensor | None = None  # variance of pixels on the surface of their evidence [m^2]
-    posterior_outlier: Tensor | None = None  # probability that a pixel is not
+    posterior_outlier: Tensor | None = None  # probability that a pixel is not on that surface
     statistics: FrameStatistics | None = None  # of UfM*, [1] per count, or None
-    confidence: Tensor | None = None  # of the prediction, in its own unit, where UfM* had it; or None
-    network_variance: Tensor | None  # A + E of the prediction, whatever the row uses [m^2]; None if it states neither
+    confidence: Tensor | None = None  # of the prediction, in the network's unit, if UfM* used it; or None
+    network_variance: Tensor | None  # A + E of the prediction, even if the row ignores them [m^2]; None without both
     intrinsics: NDArray[np.float64]  # [3, 3] of the maps [px]
     truth: NDArray[np.float32] | None  # [h, w] ground truth at the maps' pixels [m], 0 = none; None without a depth map
-    T_world_cam: NDArray[np.float64]  # [4, 4] the pose as the row sees it [m]
-    member: int | None  # which network predicted; None where all did, and of maps
-    landmarks: Landmarks | None  # of the frame, behind its anchors; None of a row without anchors
-    ms: dict[str, float]  # "network" where one ran, "anchors" where some were tracked, and "uncertainty" [ms]
+    T_world_cam: NDArray[np.float64]  # [4, 4] the row's pose, with noise [m]
+    member: int | None  # index of the network that predicted; None if all predicted, and for maps
+    landmarks: Landmarks | None  # from which the frame's anchors were made; None for a row without anchors
+    ms: dict[str, float]  # "network" if one ran, "anchors" if some were tracked, and "uncertainty" [ms]
 
     @property
     def mixture(self) -> tuple[Tensor, Tensor] | None:
-        """The posterior's variance of inliers [m^2] and probability of an outlier."""
+        """The posterior's variance of inliers [m^2] and probability of an outlier, or None."""
         if self.posterior_inlier_variance is None or self.posterior_outlier is None:
             return None
         return self.posterior_inlier_variance, self.posterior_outlier
@@ -79,16 +79,16 @@ class RowResult:
 
 
 class RowRunner:
-    """A row in the middle of a sequence, after ``images`` that its estimator was given.
+    """A row on a sequence; ``images`` is the number of images that its estimator has processed.
 
     Args:
-        key: its name, unique in its stream.
+        key: unique name in its stream.
         source: of its depth.
         estimator: of its variance, in its initial state.
-        every: all members (or samples) predict on every image, instead of one in turn.
-        setting: which images it leaves out, and how poses and anchors are disturbed.
-        anchors: None = it has none.
-        skips_faults: skip frames whose pose or intrinsics the estimator refuses; they count as images for the turns.
+        every: True if all members (or samples) predict on every image, instead of alternating.
+        setting: skipped images, noise on poses and anchors.
+        anchors: their source; None = no anchors.
+        skips_faults: True to skip frames with bad poses or intrinsics; they count as images when members alternate.
     """
 
     def __init__(
@@ -109,8 +109,8 @@ class RowRunner:
         self._drift = Drift(setting)
 
     def update(self, frame: Frame, prediction: DepthPrediction, truth: NDArray[np.float32] | None) -> RowResult:
-        """Process the next frame. Its ground truth [h, w] is only for anchors that are drawn from it. Raises
-        FrameError: the row skips frames with faults, and the pose or the intrinsics have one."""
+        """Process the next frame. Ground truth [h, w] is used for anchors alone. Raises FrameError: ``skips_faults``,
+        and the pose or the intrinsics are bad."""
         T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
         landmarks, anchors, tracking_ms = (
             (None, None, None) if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
@@ -139,21 +139,21 @@ class RowRunner:
         )
 
     def memory(self) -> dict[str, float]:
-        """``Estimator.memory``, with the bytes behind the anchors: tracks or evidence."""
+        """``Estimator.memory``, with the bytes of the anchors' tracks or evidence."""
         memory = self.estimator.memory()
         if self._tracks is not None:
             memory["bytes"] += sum(value.nbytes for value in self._tracks.state().values())
         return memory
 
     def state(self) -> dict[str, Tensor]:
-        """All tensors on which the next frame depends; networks remember nothing."""
+        """All tensors on which the next frame depends; networks have no state."""
         anchors = {} if self._tracks is None else self._tracks.state()
         parts = ((_ESTIMATOR, self.estimator.state()), (_TRACKER, anchors), (_DRIFT, self._drift.state()))
         tensors = {prefix + name: value for prefix, state in parts for name, value in state.items()}
         return {_IMAGES: torch.tensor(self.images), **tensors}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken. Raises ValueError: it is the state of another kind of row."""
+        """Continue from ``state``. Raises ValueError: it belongs to another kind of row."""
 
         def part(prefix: str) -> dict[str, Tensor]:
             return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}

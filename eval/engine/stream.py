@@ -32,17 +32,17 @@ class Stopped(Exception):
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """The result of one frame. ``skipped`` is why a row that selects the frame cannot use it, ``state`` the stream's
-    after the frame, for sinks in a ``WriterThread``. ``ms`` has "read" (time spent waiting: frames are read ahead),
-    "predict" and "truth" [ms]; sinks may add their own."""
+    """The result of one frame."""
 
-    number: int  # of the frame among those that the stream selects, from 0
+    number: int  # of the frame in the stream, from 0
     index: int  # of the frame in its sequence
     name: str  # of the frame
-    frame: Frame | None = None  # as it was read; None where no row selects it, or it cannot be used
-    rows: Mapping[str, RowResult] = field(default_factory=dict)  # by key, of the rows that used it
-    skipped: Mapping[str, str] = field(default_factory=dict)  # by key
+    frame: Frame | None = None  # None if no row selects it, or it cannot be used
+    rows: Mapping[str, RowResult] = field(default_factory=dict)  # by key, of the rows that used the frame
+    skipped: Mapping[str, str] = field(default_factory=dict)  # by key, why a row that selects the frame cannot use it
+    # "read" (the wait for the prefetch), "predict" and "truth" [ms]; sinks may add others.
     ms: dict[str, float] = field(default_factory=dict)
+    # The stream's state after the frame, for sinks in a ``WriterThread``.
     state: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
 
 
@@ -50,28 +50,28 @@ class FrameSink(ABC):
     """Receives the result of every frame: metrics, writers, progress."""
 
     def begin(self, stream: FrameStream) -> None:
-        """Before the first frame, or the first one after a resume."""
+        """Called before the first frame, also after a resume."""
 
     @abstractmethod
     def take(self, result: FrameResult) -> None:
-        """After every frame, skipped ones too. The stream's state is that after the frame."""
+        """Called after every frame, skipped ones included, when the stream's state includes the frame."""
 
     def end(self) -> None:
-        """After the last frame; not after a stop or an error."""
+        """Called after the last frame, but not after a stop or an error."""
 
 
 class FrameStream:
-    """The frames of a sequence, passed through rows. A frame that no row selects is not decoded. One that cannot be
-    read or predicted from is skipped by all rows that select it, and counts for none of them.
+    """The frames of a sequence, processed by rows. A frame that no row selects is not decoded. If a frame cannot be
+    read or predicted from, all rows skip it.
 
     Args:
         sequence: posed frames.
-        indices: which of them, in order.
+        indices: of the frames, in order.
         rows: with different keys.
-        store: of predictions; None = every prediction is computed.
-        device: of the rows' estimators, where they want their maps.
-        check: raises ``FrameError`` for a frame that no row is to use.
-        start: number of frames that are finished, skipped ones included (``position``); the rows are in that state.
+        store: of predictions; None = compute all.
+        device: of the rows' estimators and their maps.
+        check: raises ``FrameError`` for a frame that all rows must skip.
+        start: number of finished frames, skipped ones included (``position``); the rows are in that state.
     """
 
     def __init__(
@@ -92,8 +92,8 @@ class FrameStream:
         self.position = start
 
     def drive(self, sinks: Sequence[FrameSink], *, stop: Callable[[], bool] = lambda: False) -> None:
-        """Process the frames that are left, and hand each one's result to the sinks in their order. ``stop`` is called
-        before every frame.
+        """Process the remaining frames, and pass each result to the sinks in order. ``stop`` is called before every
+        frame.
 
         Raises:
             Stopped: ``stop`` returned True.
@@ -145,22 +145,22 @@ class FrameStream:
         return FrameResult(number, index, name, frame, results, skipped, ms)
 
     def _selected(self) -> list[int]:
-        """Those of the remaining frames that a row selects."""
-        left = range(self.position, len(self.indices))
-        return [self.indices[n] for n in left if any(selects(row.setting, n) for row in self.rows)]
+        """Indices of the remaining frames that a row selects."""
+        remaining = range(self.position, len(self.indices))
+        return [self.indices[n] for n in remaining if any(selects(row.setting, n) for row in self.rows)]
 
     def _prepare(self, frame: Frame) -> None:
-        """Compute the networks' input in the thread that reads ahead, unless a store may have all predictions. Only
-        where torch computes with one thread: this thread would start a second team of OpenMP threads, beside which the
-        first one no longer spins, and networks took three times as long."""
+        """Compute the networks' input in the prefetch thread, unless a store may have all predictions. Only if torch
+        uses one thread: a second team of OpenMP threads would stop the first one's spinning, which made networks three
+        times slower."""
         if self._store is None and torch.get_num_threads() == 1:
             for row in self.rows:
                 row.source.prepare(frame)
 
 
 def _truths(frame: Frame, predictions: Mapping[str, DepthPrediction]) -> dict[str, NDArray[np.float32] | None]:
-    """Ground truth at the pixels of every row's maps, once for every camera. Raises FrameError: the depth map has
-    none."""
+    """Ground truth at the pixels of every row's maps, computed once per camera. Raises FrameError: the depth map has no
+    ground truth."""
     computed: dict[tuple[object, ...], NDArray[np.float32] | None] = {}
     truths = {}
     for key, prediction in predictions.items():
@@ -178,8 +178,8 @@ _AHEAD = 2  # frames; decoding releases Python's lock
 def prefetch(
     sequence: FrameSequence, indices: Iterable[int], prepare: Callable[[Frame], None] = lambda _: None
 ) -> Generator[Future[Frame]]:
-    """The frames of a sequence at some indices, in order, read by one thread that is at most two frames ahead and calls
-    ``prepare`` with each. A frame's ``result()`` raises FrameError if it cannot be read. Closing it ends the thread."""
+    """Yield the frames at some indices, in order, read by one thread at most two frames ahead, which calls ``prepare``
+    with each. A frame's ``result()`` raises FrameError if it cannot be read. Closing the generator ends the thread."""
 
     def read(index: int) -> Frame:
         frame = sequence[index]

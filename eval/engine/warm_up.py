@@ -13,7 +13,7 @@ from ufmstar_torch.ufmstar import UfMStar
 from ufmstar_torch.warm_up import warm_up
 
 _WALL, _FOCAL = (96, 128), 100.0  # [px] of the images of a wall
-_STEP, _FRAMES = 4, 8  # the wall moves by so many pixels a frame
+_STEP, _FRAMES = 4, 8  # motion of the wall [px per frame], and number of frames
 
 
 def warm_up_command(config: UfMStarConfig, show: Callable[[Progress], object], *, dense: bool = False) -> None:
@@ -23,7 +23,7 @@ def warm_up_command(config: UfMStarConfig, show: Callable[[Progress], object], *
 
 
 def dense_anchors() -> None:
-    """The search of depths in images, of a textured wall along which the camera moves."""
+    """Run the depth search of :class:`DenseEvidence` on images of a textured wall along which the camera moves."""
     height, width = _WALL
     wall = np.random.default_rng(0).integers(0, 256, (height, width + _STEP * _FRAMES, 3), dtype=np.uint8)
     evidence, K = DenseEvidence(), np.array([[_FOCAL, 0, width / 2], [0, _FOCAL, height / 2], [0, 0, 1]])

@@ -1,6 +1,6 @@
-"""Metrics and files in a thread of their own, while network and step compute the next frames.
+"""Computes metrics and writes files in another thread, while network and step process the next frames.
 
-Compressing and writing release Python's lock. The thread works frame by frame, in order.
+Compressing and writing release Python's lock. The thread processes frames in order.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from time import perf_counter
 
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 
-# Frames that wait for their sinks; each holds its maps and the state after it, about 3 MB at 224 x 224.
+# Largest number of queued frames; each holds its maps and the state after it, about 3 MB at 224 x 224.
 _WAITING = 4
 
 
 class WriterThread(FrameSink):
-    """A sink that hands the results to other sinks in a thread of its own, with the stream's state after each frame.
+    """A sink that passes the results to other sinks in another thread, with the stream's state after each frame.
 
-    Use it as a context: at its end all results taken have gone through the sinks, in their order. The error of a sink
-    is raised in the loop, at the next frame or at the end; no later frame comes to a sink then.
-    ``FrameResult.ms`` gets "cycle", the time since the frame before [ms], waiting for these sinks included.
+    Use it as a context manager; its exit waits until the sinks have processed all results. The error of a sink is
+    raised in the loop, at the next frame or at the end; no sink gets a later frame. ``FrameResult.ms`` gets "cycle",
+    the time since the previous frame [ms], waiting for these sinks included.
     """
 
     def __init__(self, sinks: Sequence[FrameSink]) -> None:
@@ -35,7 +35,7 @@ class WriterThread(FrameSink):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Wait until all results are through; a second interrupt leaves out those that have not begun."""
+        """Wait until all results are processed; a second interrupt cancels those that have not begun."""
         try:
             self._wait(0)
         finally:
@@ -48,13 +48,13 @@ class WriterThread(FrameSink):
         self._last = perf_counter()
 
     def take(self, result: FrameResult) -> None:
-        """Queue a frame; waits where the sinks are too far behind. Raises what a sink raised for an earlier frame."""
+        """Queue a frame; wait if the queue is full. Raises the error of a sink for an earlier frame."""
         self._wait(_WAITING)
         rows = self._stream.state().items()
-        state = {key: {name: value.clone() for name, value in own.items()} for key, own in rows}
-        now = perf_counter()
-        result.ms["cycle"] = 1000 * (now - self._last)
-        self._last = now
+        state = {key: {name: value.clone() for name, value in tensors.items()} for key, tensors in rows}
+        time = perf_counter()
+        result.ms["cycle"] = 1000 * (time - self._last)
+        self._last = time
         self._waiting.append(self._thread.submit(self._work, replace(result, state=state)))
 
     def end(self) -> None:
@@ -63,7 +63,7 @@ class WriterThread(FrameSink):
             sink.end()
 
     def _wait(self, most: int) -> None:
-        """Wait until at most ``most`` frames are queued; those that are done raise their error."""
+        """Wait until at most ``most`` frames are queued. Raises the error of a finished frame."""
         while self._waiting and (len(self._waiting) > most or self._waiting[0].done()):
             self._waiting.popleft().result()
 

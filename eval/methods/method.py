@@ -1,6 +1,6 @@
-"""The rows of the paper's tables: which network, how often it is run, and what judges its views.
+"""The methods of the paper's tables: the network, its number of inferences per image, and the fusion of views.
 
-A row's name is the paper's: "Ensemble", "UfM-MCD-100K", "UfM*-Aleatoric", "UfM*-FullBatchEnsemble",
+A method has the paper's name: "Ensemble", "UfM-MCD-100K", "UfM*-Aleatoric", "UfM*-FullBatchEnsemble",
 "UfM*-DepthOnly-fixed-param".
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-# The kinds of networks, each with its name alone and its name behind UfM or UfM*.
+# The kinds of networks: name alone, and name after "UfM-" or "UfM*-".
 BASES = {
     "ensemble": ("Ensemble", "Ensemble"),
     "mc_dropout": ("MC-Dropout", "MCD"),
@@ -18,11 +18,11 @@ BASES = {
     "aleatoric": ("Aleatoric", "Aleatoric"),
     "depth_only": ("DepthOnly", "DepthOnly"),
 }
-# Those whose several passes on an image differ.
+# Bases with several different passes on an image.
 MANY = ("ensemble", "mc_dropout", "batch_ensemble")
 ALONE, UFM, UFM_STAR = "alone", "ufm", "ufm_star"
 FUSIONS = (ALONE, UFM, UFM_STAR)
-# Of a method of one's own (``sequences.plugins``).
+# Name of a user's method (``sequences.plugins``).
 _OWN = r"[a-z][a-z0-9_]*"
 _NAME = re.compile(
     rf"(?P<fusion>UfM\*?|{_OWN})-(?P<full>Full)?(?P<base>[A-Za-z]+)(-(?P<cap>\d+)K)?(?P<fixed>-fixed-param)?"
@@ -31,18 +31,18 @@ _NAME = re.compile(
 
 @dataclass(frozen=True)
 class Method:
-    """A row.
+    """A method of a row.
 
     Raises:
-        ValueError: the fields do not go together.
+        ValueError: the fields contradict each other.
     """
 
     base: str  # a key of ``BASES``
-    fusion: str = ALONE  # "alone" (the network's own variance), "ufm", "ufm_star", or the name of a method of one's own
-    # behind UfM or UfM*, run all members (or samples) on every image instead of one in turn.
+    fusion: str = ALONE  # "alone" (the network's variance), "ufm", "ufm_star", or the name of a user's method
+    # With UfM or UfM*: run all members (or samples) on every image instead of alternating.
     full: bool = False
     max_points: int | None = None  # of UfM; None = unpruned
-    # of UfM*, the segmentation's thresholds in pixels as at 224 x 224, whatever the image's size.
+    # With UfM*: thresholds of the segmentation in pixels as at 224 x 224, for every size of image.
     fixed_param: bool = False
 
     def __post_init__(self) -> None:
@@ -61,7 +61,7 @@ class Method:
 
     @property
     def name(self) -> str:
-        """The name as the paper prints it."""
+        """The name in the paper."""
         alone, behind = BASES[self.base]
         if self.fusion == ALONE:
             return alone
@@ -71,26 +71,26 @@ class Method:
 
     @property
     def every_member(self) -> bool:
-        """True if all members (or samples) are run on every image, not one in turn."""
+        """True if all members (or samples) run on every image instead of alternating."""
         return self.base in MANY and (self.full or self.fusion == ALONE)
 
     @property
     def uses_aleatoric(self) -> bool:
-        """True if the network's own variance is used; "DepthOnly" ignores it."""
+        """True if the network's variance is used; "DepthOnly" ignores it."""
         return self.base != "depth_only"
 
     @classmethod
     def parse(cls, name: str) -> Method:
-        """The row of that name. Raises ValueError: no row is called so."""
+        """The method of that name. Raises ValueError: no method has that name."""
         by_alone = {alone: base for base, (alone, _) in BASES.items()}
         if name in by_alone:
             return cls(by_alone[name])
         by_behind = {behind: base for base, (_, behind) in BASES.items()}
         match = _NAME.fullmatch(name)
         if match is None or match["base"] not in by_behind or match["fusion"] in FUSIONS:
-            known = f"{', '.join(by_alone)}, or UfM-, UfM*-, UfM*-Full with {', '.join(by_behind)}"
+            names = f"{', '.join(by_alone)}, or UfM-, UfM*-, UfM*-Full with {', '.join(by_behind)}"
             raise ValueError(
-                f"no method is called {name!r}; there are {known}, UfM's with -100K, UfM*'s with -fixed-param, "
+                f"no method is called {name!r}; there are {names}, UfM's with -100K, UfM*'s with -fixed-param, "
                 "and NAME- of a plug-in's"
             )
         return cls(

@@ -1,4 +1,4 @@
-"""Ablations of the input: frames that are left out, noise and drift of the poses."""
+"""Ablations of the input: skipped frames, noise and drift of the poses."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from ufmstar_torch.eval.methods.setting import Setting
 if TYPE_CHECKING:
     from torch import Tensor
 
-# Third number of the seed of drift; 1 and 2 belong to the frame's anchors, noise has none.
+# Third number of the seed of drift. Anchors use 1 and 2; the seed of noise has two numbers.
 _DRIFT = 3
-# Names in a walk's state.
-_KEPT = ("index", "T_world_cam", "drifted")
+# Names of the tensors of a drift's state.
+_STATE = ("index", "T_world_cam", "drifted")
 
 
 def selects(setting: Setting, number: int) -> bool:
-    """Return whether image ``number`` (0, 1, ... of those to be judged) is used: ``skip`` are left out after each."""
+    """True if image ``number``, from 0, is used: ``skip`` images are skipped after each used one."""
     return number % (setting.skip + 1) == 0
 
 
 def perturbed(T_world_cam: NDArray[np.float64], setting: Setting, index: int) -> NDArray[np.float64]:
     """A pose with noise, (R exp([w]x), t + n), w and n drawn from normal distributions.
 
-    The noise depends on the setting's seed and the frame's index alone, not on what was run before, and only its size
-    on the setting's standard deviations: along a sweep it is the same noise, stronger and stronger.
+    The random numbers depend on the setting's seed and the frame's index alone; the setting's standard deviations scale
+    them. A sweep of standard deviations therefore scales the same noise.
 
     Args:
         T_world_cam: [4, 4] camera-to-world [m].
@@ -37,7 +37,7 @@ def perturbed(T_world_cam: NDArray[np.float64], setting: Setting, index: int) ->
         index: of the frame in its sequence.
 
     Returns:
-        [4, 4], the pose itself where the setting has no noise.
+        [4, 4] the noisy pose; ``T_world_cam`` if the setting has no noise.
     """
     if not (setting.rotation_noise or setting.translation_noise):
         return T_world_cam
@@ -49,16 +49,16 @@ def perturbed(T_world_cam: NDArray[np.float64], setting: Setting, index: int) ->
 
 
 class Drift:
-    """Poses as odometry gives them: each step from a frame to the next errs a little, and moves all that follow.
+    """Poses with the drift of odometry: each relative pose has a small error, which moves all later poses.
 
-    Frame j after frame i has the pose T'_j = T'_i (T_i^-1 T_j) (exp([w]x), n): the pose relative to the frame before
-    has the noise w, n, about and along the camera's axes. Both are sums of one normal increment for every frame of the
-    sequence from i + 1 to j, used or not, so variances grow linearly with frames. An increment depends on the seed and
-    its frame's index alone, and only its size on the setting. The first pose is exact. Orientations err by a random
-    walk; positions by another one, and by where wrong orientations lead.
+    Frame j after frame i has the pose T'_j = T'_i (T_i^-1 T_j) (exp([w]x), n). The noise w, n is about and along the
+    camera's axes. Both are sums of one normal increment for every frame of the sequence from i + 1 to j, used or not,
+    so variances grow linearly with frames. The random numbers of an increment depend on the seed and its frame's index
+    alone; the setting scales them. The first pose is exact. Orientations err by a random walk, positions by another one
+    and by the wrong orientations.
 
-    Unlike independent noise, of which two neighbours differ by as much as any two frames, it leaves nearby views nearly
-    consistent: what a SLAM system does between two loops.
+    Nearby views stay nearly consistent, as in a SLAM system between two loops; independent noise makes neighbours as
+    inconsistent as distant frames.
 
     Args:
         setting: with the standard deviations of an increment of w [deg] and n [m].
@@ -69,9 +69,8 @@ class Drift:
         self._last: tuple[int, NDArray[np.float64], NDArray[np.float64]] | None = None
 
     def of(self, T_world_cam: NDArray[np.float64], index: int) -> NDArray[np.float64]:
-        """The pose with drift [4, 4], the pose itself where the setting has none, of the next frame at camera-to-world
-        [4, 4] [m]; ``index`` is larger than that of the frame before. Raises ValueError: frames do not come in
-        order."""
+        """The pose with drift [4, 4] of the next frame at camera-to-world [4, 4] [m]; ``T_world_cam`` itself without
+        drift. Raises ValueError: ``index`` is not larger than that of the previous frame."""
         setting = self._setting
         if not (setting.rotation_drift or setting.translation_drift):
             return T_world_cam
@@ -90,18 +89,18 @@ class Drift:
         return drifted
 
     def state(self) -> dict[str, Tensor]:
-        """The last frame's index, pose and pose with drift; {} before the first frame, and without drift."""
+        """The last frame's index, pose and pose with drift; {} before the first frame or without drift."""
         import torch
 
         if self._last is None:
             return {}
-        return {name: torch.tensor(value) for name, value in zip(_KEPT, self._last, strict=True)}
+        return {name: torch.tensor(value) for name, value in zip(_STATE, self._last, strict=True)}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken, with the same poses to the last bit."""
+        """Continue from ``state``, with the same poses to the last bit."""
         self._last = None
         if state:
-            index, T_world_cam, drifted = (state[name].numpy() for name in _KEPT)
+            index, T_world_cam, drifted = (state[name].numpy() for name in _STATE)
             self._last = int(index), T_world_cam, drifted
 
     def _increment(self, index: int) -> NDArray[np.float64]:

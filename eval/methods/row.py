@@ -1,4 +1,4 @@
-"""A row of a suite: a method under a setting."""
+"""A row of a suite: a method with a setting."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ufmstar_torch.eval.methods.setting import CORNERS, DEFAULT, Setting, config
 
 @dataclass(frozen=True)
 class Row:
-    """A method under a setting."""
+    """A method with a setting."""
 
     method: Method
     setting: Setting = DEFAULT  # the changes of an ablation
-    # in tables and figures; "" = by method and setting. Ignored when rows are compared.
+    # Title in tables and figures; "" = named by method and setting. Ignored when rows are compared.
     title: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
@@ -33,13 +33,13 @@ class Row:
 
     @property
     def slug(self) -> str:
-        """A name for files: "UfMstar-Ensemble", "UfMstar-Ensemble@0c3f..." where the setting is not the default."""
+        """A name for files: "UfMstar-Ensemble"; "UfMstar-Ensemble@0c3f..." if the setting is not the default."""
         name, setting = self.method.name.replace("*", "star"), self.setting.slug
         return f"{name}@{setting}" if setting else name
 
     @property
     def name(self) -> str:
-        """The method's name, and what tracked corners serve: "UfM*-Anchored-Ensemble", "UfM*-Posterior-Ensemble"."""
+        """The method's name; with tracked corners "UfM*-Anchored-Ensemble" or "UfM*-Posterior-Ensemble"."""
         if self.setting.anchors != CORNERS:
             return self.method.name
         kind = "Posterior" if self.setting.posterior else "Anchored"
@@ -47,7 +47,7 @@ class Row:
 
     @property
     def changed(self) -> dict[str, Any]:
-        """Settings that are not the default, but for what is part of ``name``."""
+        """Settings that are not the default and not part of ``name``."""
         values = self.setting.to_dict()
         if self.setting.recalibration:  # without the folder
             values["recalibration"] = Path(self.setting.recalibration).name
@@ -56,12 +56,12 @@ class Row:
 
     @property
     def label(self) -> str:
-        """For people: "UfM*-Ensemble", "UfM*-Ensemble (ema_alpha 1.0)"."""
+        """The displayed name: "UfM*-Ensemble", "UfM*-Ensemble (ema_alpha 1.0)"."""
         changed = ", ".join(f"{name} {value}" for name, value in self.changed.items())
         return f"{self.name} ({changed})" if changed else self.name
 
     def to_dict(self) -> dict[str, Any]:
-        """The row as plain values, as eval.json has it."""
+        """The row as plain values for eval.json."""
         named = {"label": self.title} if self.title else {}
         return {"method": self.method.name, "setting": self.setting.to_dict(), **named}
 
@@ -73,7 +73,7 @@ def row_from(values: Mapping[str, Any]) -> Row:
 
 
 def plain_rows(rows: Iterable[Row]) -> list[Row]:
-    """The first row of each method that no ablation varies; in the paper's suites it has the paper's settings."""
+    """The first row of each method without ablated settings; in the paper's suites it has the paper's settings."""
     first: dict[Method, Row] = {}
     for row in rows:
         if row.setting.plain:

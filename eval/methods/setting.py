@@ -1,6 +1,6 @@
-"""The settings of a row: those of UfM*, preprocessing, noise on poses, frames left out, anchors.
+"""The settings of a row: those of UfM*, preprocessing, noise on poses, skipped frames, anchors.
 
-A setting's values have flat names: ``Setting``'s own fields, and those of ``UfMStarConfig``, as "segment.min_pixels".
+A setting's values have flat names: the fields of ``Setting``, and those of ``UfMStarConfig``, as "segment.min_pixels".
 """
 
 from __future__ import annotations
@@ -20,38 +20,39 @@ from ufmstar_torch.stateful import flat
 
 TRUTH = "truth"
 DEFAULTS, PAPER = "default", "paper"
-# How an image comes to the network's input.
+# Preprocessing of an image to the network's input.
 OF_NETWORK, RESIZE, CROP = "network", "resize", "crop"
 _OF_POSES = ("rotation_noise", "translation_noise", "rotation_drift", "translation_drift")
 
 
 @dataclass(frozen=True)
 class Setting(Checked):
-    """One point of an ablation; the default is the row with UfM*'s defaults and the network's own preprocessing.
+    """One point of an ablation; the default is the row with UfM*'s defaults and the network's preprocessing.
 
     Attributes:
-        ufm_preset: from which UfM*'s settings start: "default", or "paper" (``UfMStarConfig.paper``).
-        preprocess: how an image comes to the network's input: "network", as its weights declare; "resize", the whole
-            frame, each axis by its own factor, as the paper's loader of ScanNet does; "crop", the centre as NYU's
+        ufm_preset: initial settings of UfM*: "default", or "paper" (``UfMStarConfig.paper``).
+        preprocess: of an image to the network's input: "network", as its weights declare; "resize", the whole frame,
+            each axis by a separate factor, as in the paper's loader of ScanNet; "crop", the centre as in NYU's
             validation. The input's size, colours and range stay the network's.
         overrides: of ``UfMStarConfig`` by dotted name, as {"ema_alpha": 1.0, "segment.min_pixels": 2000}.
         rotation_noise: standard deviation of each component of a rotation vector that is added to a pose [deg].
-        translation_noise: the same of each component of the position [m].
+        translation_noise: standard deviation of each component of the position [m].
         rotation_drift: of a random walk of the orientation, see ``perturb.Drift`` [deg per square root of frames].
-        translation_drift: the same of the position [m per square root of frames].
-        skip: images left out between two that are used; the paper's skip interval, 0 = consecutive ones.
-        seed: of everything that is drawn: noise, and which anchors are taken.
-        anchors: what UfM* is anchored by (``UfMStarConfig.anchors`` follows): "" nothing; "corners": those of the
-            images, tracked and triangulated with the row's poses; "dense": dense evidence, likewise; "truth": ground
-            truth at pixels drawn at random, the upper bound; or a file of landmarks in the folder of each sequence, see
+        translation_drift: of a random walk of the position [m per square root of frames].
+        skip: number of skipped images between two used ones; the paper's skip interval, 0 = use all.
+        seed: of all random numbers: noise, and the choice of anchors.
+        anchors: source of UfM*'s anchors (``UfMStarConfig.anchors`` follows): "" none; "corners" of the images, tracked
+            and triangulated with the row's poses; "dense" evidence, likewise; "truth", ground truth at random pixels,
+            the upper bound; or a file of landmarks in the folder of each sequence, see
             ``ufmstar_torch.anchors.LandmarkMap.read``.
-        anchor_count: anchors of a frame at most, drawn at random; None = all that are tracked, 100 of ground truth.
+        anchor_count: largest number of anchors of a frame, chosen at random; None = all tracked ones, or 100 of ground
+            truth.
         track_noise: standard deviation of noise on tracked positions [px of the image]; see ``engine.anchors``.
-        posterior: judge the posterior's depth and variance (``UfMStarConfig.posterior`` follows).
+        posterior: True to evaluate the posterior's depth and variance (``UfMStarConfig.posterior`` follows).
         recalibration: file of a map of the variance (``ufmstar recalibrate``); "" = none.
 
     Raises:
-        ValueError: a value is out of range, or they do not go together.
+        ValueError: a value is out of range, or values contradict each other.
     """
 
     overrides: Mapping[str, Any] = field(default_factory=dict)
@@ -90,34 +91,34 @@ class Setting(Checked):
         return hash(self.slug)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A mapping proxy cannot be pickled."""
+        """Pickle the overrides as a dict, because a mapping proxy cannot be pickled."""
         return Setting, (dict(self.overrides), *(getattr(self, name) for name in _OWN))
 
     def to_dict(self) -> dict[str, Any]:
-        """The values that differ from the default, flat: {} for the row as it is."""
+        """The values that differ from the default, flat; {} for the default."""
         defaults = {f.name: f.default for f in fields(self) if f.name not in ("overrides", "seed")}
         changed = {name: getattr(self, name) for name, plain in defaults.items() if getattr(self, name) != plain}
         return {**dict(self.overrides), **changed, **({"seed": self.seed} if self.draws else {})}
 
     @property
     def chosen(self) -> Setting:
-        """The values that are chosen and not varied: the preset and the preprocessing alone."""
+        """The setting with this one's preset and preprocessing, which are no ablations, and defaults otherwise."""
         return Setting(ufm_preset=self.ufm_preset, preprocess=self.preprocess)
 
     @property
     def plain(self) -> bool:
-        """True if no ablation varies anything."""
+        """True if no ablation changes a value."""
         return self == self.chosen
 
     @property
     def of_ufm_star(self) -> tuple[str, ...]:
-        """Names of what is changed of UfM*, which other methods do without."""
+        """Names of the changed values that apply to UfM* alone."""
         names = ("ufm_preset", "anchors", "recalibration")
         return (*self.overrides, *(name for name in names if getattr(self, name) != getattr(DEFAULT, name)))
 
     @property
     def draws(self) -> bool:
-        """True if anything is drawn at random, so that the seed matters."""
+        """True if the setting uses random numbers, so that the seed matters."""
         noisy = bool(self.pose_noise or self.track_noise)
         return noisy or self.anchors == TRUTH or self.anchor_count is not None
 
@@ -143,10 +144,10 @@ _OWN = tuple(f.name for f in fields(Setting) if f.name != "overrides")
 def setting_from(values: Mapping[str, Any]) -> Setting:
     """A setting from the flat form of ``Setting.to_dict``.
 
-    Values that UfM* has anyway, by the preset, are left out, so that such a row is the plain one.
+    Values equal to those of the preset are omitted, so that such a row is the plain one.
 
     Raises:
-        ValueError: an unknown name, or a value that it does not take.
+        ValueError: an unknown name or an invalid value.
     """
     direct = {name: value for name, value in values.items() if name in _OWN}
     overrides = {name: value for name, value in values.items() if name not in _OWN}
@@ -158,18 +159,18 @@ def setting_from(values: Mapping[str, Any]) -> Setting:
 
 
 def default_of(name: str, preset: str = DEFAULTS) -> Any:
-    """The value that a row has where nothing is changed; None of a section that is off.
+    """The default value of a setting; None in a section that is off.
 
     Args:
-        name: of a setting.
-        preset: from which UfM*'s settings start.
+        name: of the setting.
+        preset: of UfM*'s settings.
 
     Raises:
-        ValueError: no setting has the name, or there is no such preset.
+        ValueError: no such setting or preset.
     """
     if name in _OWN:
         return getattr(DEFAULT, name)
-    # Sections that the row's own ``anchors`` and ``posterior`` switch on; merging is off where nothing is changed.
+    # The row's ``anchors`` and ``posterior`` switch their sections on; merging is off by default.
     on = started(preset, anchors=True, posterior=True).replace(confidence=ConfidenceConfig())
     off = dict.fromkeys(flat(MergeConfig().to_dict(), "merge."))
     values = flat(on.to_dict()) | off
@@ -178,15 +179,15 @@ def default_of(name: str, preset: str = DEFAULTS) -> Any:
     if name in values:
         return values[name]
     expected = [field_ for field_ in _OWN if field_ != "seed"]
-    near = get_close_matches(name, [*expected, *values], n=1)
-    meant = f"; did you mean {near[0]}?" if near else ""
+    similar = get_close_matches(name, [*expected, *values], n=1)
+    meant = f"; did you mean {similar[0]}?" if similar else ""
     raise ValueError(
         f"no setting is called {name!r}: expected {', '.join(expected)}, or UfM*'s own, as ema_alpha{meant}"
     )
 
 
 def configured(setting: Setting) -> UfMStarConfig:
-    """UfM*'s configuration under a setting. Raises ValueError: an unknown name, or a value that it does not take."""
+    """UfM*'s configuration under a setting. Raises ValueError: an unknown name or an invalid value."""
     config = started(setting.ufm_preset, anchors=bool(setting.anchors), posterior=setting.posterior)
     for name in setting.overrides:
         default_of(name)
@@ -194,7 +195,7 @@ def configured(setting: Setting) -> UfMStarConfig:
 
 
 def started(preset: str, *, anchors: bool, posterior: bool) -> UfMStarConfig:
-    """UfM*'s settings of a preset, with these extensions; another preset raises ValueError."""
+    """UfM*'s settings of a preset, with these extensions. Raises ValueError: no such preset."""
     if preset not in (DEFAULTS, PAPER):
         raise ValueError(f"ufm_preset must be {DEFAULTS} or {PAPER}, got {preset!r}")
     start = UfMStarConfig.paper() if preset == PAPER else UfMStarConfig()

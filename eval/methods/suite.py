@@ -1,23 +1,23 @@
 """Suites: the rows of a table or figure. Each is a TOML file, in ``suites/`` or of a user.
 
 ```toml
-title = "Smoothing"                        # name: the file's, unless given
-base = "ensemble"                          # the network it is about, unless --base names another one; or
+title = "Smoothing"                        # ``name`` is the file's by default
+base = "ensemble"                          # the suite's network, unless --base names another one; or
 bases = ["ensemble", "aleatoric"]          # several: the rows of each in turn
-efficiency = true                          # time, energy and memory are measured as well
-include = ["ablation-eta"]                 # rows of other suites as well
+efficiency = true                          # also measure time, energy and memory
+include = ["ablation-eta"]                 # also the rows of other suites
 
 [[rows]]
-methods = ["{alone}", "UfM*-{behind}"]     # as the paper names them: "Ensemble", "UfM*-Ensemble", or by the base
+methods = ["{alone}", "UfM*-{behind}"]     # the paper's names: "Ensemble", "UfM*-Ensemble"; or by the base
 
 [[rows]]
-bases = ["ensemble"]                       # of no other base
+bases = ["ensemble"]                       # only for these bases
 methods = ["UfM*-{behind}"]
 setting = { "segment.min_pixels" = 2000 }  # of UfM*, or of ``Setting``: ufm_preset, preprocess, rotation_noise ...
 each = { ema_alpha = [0.1, 0.25, 1.0] }    # one row for every value
 ```
 
-A row that occurs several times is taken once.
+A row that occurs several times is used once.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ class Suite:
     """
 
     name: str  # small letters, digits and single dashes
-    title: str  # one line for people
-    rows: tuple[Row, ...]  # each of them once
-    efficiency: bool = False  # whether time, energy and memory are what it is about
+    title: str  # one line
+    rows: tuple[Row, ...]  # without duplicates
+    efficiency: bool = False  # True if time, energy and memory are measured
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -70,11 +70,11 @@ class Suite:
 
     @property
     def bases(self) -> tuple[str, ...]:
-        """The networks that the rows need, in their order."""
+        """The bases of the rows, in order."""
         return tuple(dict.fromkeys(row.method.base for row in self.rows))
 
     def with_bases(self, bases: Iterable[str]) -> Suite:
-        """The suite with the rows of some bases only. Raises ValueError: none is left."""
+        """The suite with the rows of some bases only. Raises ValueError: no row remains."""
         available = set(bases)
         rows = tuple(row for row in self.rows if row.method.base in available)
         if not rows:
@@ -104,14 +104,14 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
 
     Args:
         name: one of ``names()``, or a TOML file (\*.toml).
-        base: the network that a figure or ablation is about, instead of its own; a key of ``method.BASES``.
-        preset: where UfM*'s settings start in all rows of UfM*, "paper" or "default"; None = as the suite has it. What
-            rows change beside it stays.
+        base: network of a figure or ablation, a key of ``method.BASES``; None = the suite's.
+        preset: of UfM*'s settings in all rows of UfM*, "paper" or "default"; None = the suite's. Other changes of the
+            rows stay.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: no suite is called so, no such base, or a suite that names its networks itself; a file that is not
-            TOML, an unknown key, a value of the wrong kind, or an impossible row; the message names the file.
+        ValueError: no such suite or base, or the suite's rows name their networks; the file is not TOML, or has an
+            unknown key, a value of the wrong type or an impossible row. The message names the file.
     """
     _file(name)
     if base is not None:
@@ -130,7 +130,7 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
 
 
 def _file(name: str) -> Traversable:
-    """The file of a suite. Raises ValueError: no suite is called so."""
+    """The file of a suite. Raises ValueError: no such suite."""
     if name.endswith(".toml"):
         return Path(name)
     if name not in names():
@@ -139,7 +139,7 @@ def _file(name: str) -> Traversable:
 
 
 def _read(name: str) -> dict[str, Any]:
-    """The content of a suite's file, its keys and bases checked."""
+    """The content of a suite's file. Raises ValueError: unknown keys or bases."""
     values = tomllib.loads(_file(name).read_text(encoding="utf-8"))
     _check(values, _KEYS, "the suite")
     for base in (*values.get("bases", []), values.get("base", "ensemble")):
@@ -148,7 +148,7 @@ def _read(name: str) -> dict[str, Any]:
 
 
 def _rows_of(values: Mapping[str, Any], base: str | None, preset: str | None) -> Iterator[Row]:
-    """The rows of a suite and of those that it includes, for a base or for the suite's own bases."""
+    """The rows of a suite and of the suites that it includes, for a base or for the suite's ``bases``."""
     for network in values.get("bases", [base]):
         for n, part in enumerate(values.get("rows", [])):
             _check(part, _ROW_KEYS, f"rows {n + 1}")
@@ -161,7 +161,7 @@ def _rows_of(values: Mapping[str, Any], base: str | None, preset: str | None) ->
 
 
 def _expanded(part: Any, base: str | None, preset: str | None) -> Iterator[Row]:
-    """The rows of one [[rows]]: every method at every point."""
+    """The rows of one [[rows]]: every method at every point of ``each``."""
     methods = part.get("methods")
     if not methods:
         raise ValueError('methods must name at least one, as ["UfM*-Ensemble"]')
@@ -190,7 +190,7 @@ def _require_base(base: str, name: str = "base") -> None:
 
 
 def _check(values: Any, kinds: Mapping[str, type], where: str) -> None:
-    """Raise ValueError for an unknown key, or a value of the wrong kind."""
+    """Raises ValueError: an unknown key, or a value of the wrong type."""
     if not isinstance(values, dict):
         raise ValueError(f"{where} must be a table, got {values!r}")
     unknown = sorted(values.keys() - kinds.keys())

@@ -1,11 +1,11 @@
 """UfM, the pointwise predecessor of UfM*, as a baseline.
 
-Sudhakar, Karaman, Sze, "Uncertainty from Motion for DNN Monocular Depth Estimation" (ICRA 2022). Where UfM* keeps a few
-hundred Gaussians, UfM keeps every pixel it has ever seen as a point: 40 bytes each (float32), 4.0 MB at the
-100,000 points that the authors allow at 224 x 224. ``ufm_cloud`` has the equations and the deliberate differences.
+Sudhakar, Karaman, Sze, "Uncertainty from Motion for DNN Monocular Depth Estimation" (ICRA 2022). UfM* stores a few
+hundred Gaussians; UfM stores every observed pixel as a point of 40 bytes (float32): 4.0 MB with the authors' limit of
+100,000 points at 224 x 224. ``ufm_cloud`` has the equations and the deliberate differences.
 
-The modes of the paper differ only in what a network predicts. "Aleatoric": depth and A. "Ensemble" and "MC-dropout":
-the members in turn, or one stochastic pass. "Depth only": no variance, s^2 = 0. "Full": mean depth, A and E of several
+The paper's modes differ only in the network's prediction. "Aleatoric": depth and A. "Ensemble" and "MC-dropout":
+alternating members, or one stochastic pass. "Depth only": no variance, s^2 = 0. "Full": mean depth, A and E of several
 inferences.
 """
 
@@ -26,18 +26,18 @@ from ufmstar_torch.stateful import full_precision, outliving
 class UfMOutput(NamedTuple):
     """The variance of one frame."""
 
-    variance: Tensor  # [1, H, W] S_zz of the newest point at each pixel, s^2 where there was none [m^2]; NaN: not valid
+    variance: Tensor  # [1, H, W] S_zz of the newest point at each pixel, s^2 without a point [m^2]; NaN: not valid
     valid: Tensor  # [1, H, W] True where the pixel was used
 
 
 class UfM:
-    """Uncertainty from Motion: feed it one predicted depth map per image, read a variance per pixel.
+    """Uncertainty from Motion: a variance per pixel from one predicted depth map per image.
 
-    A frame that raises leaves the state as it was. No gradient flows through it.
+    A frame that raises an error leaves the state unchanged. There are no gradients.
 
     Args:
-        max_points: points that are kept; the paper's 100,000 at 224 x 224, 300,000 at 518 x 518. None = all. With fewer
-            than an image has pixels, points are dropped before they are seen again.
+        max_points: largest number of points; the paper's 100,000 at 224 x 224, 300,000 at 518 x 518. None = no limit.
+            With fewer than an image has pixels, points are dropped before they are observed again.
         dtype: of the points and of the computation, torch.float32 or torch.float64.
 
     Attributes:
@@ -69,11 +69,11 @@ class UfM:
 
         Args:
             depth: [1, H, W] metric depth along the optical axis [m]. Pixels that are NaN, infinite, zero or negative
-                are left out.
+                are ignored.
             pose: [1, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m].
             intrinsics: [1, 3, 3] or [3, 3] in pixels of this depth map, first pixel's centre at (0, 0).
-            aleatoric: like ``depth``, the network's own variance A [m^2]; pixels where it is not a finite
-                number >= 0 are left out.
+            aleatoric: like ``depth``, the network's variance A [m^2]; pixels where it is not a finite number >= 0 are
+                ignored.
             epistemic: likewise E [m^2].
             valid: like ``depth``, bool, True = use.
 

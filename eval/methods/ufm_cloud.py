@@ -1,10 +1,10 @@
-"""The points of UfM and what one frame does to them: a pure function per stream.
+"""The points of UfM and their update by one frame: a pure function per stream.
 
-UfM (Sudhakar, Karaman, Sze, "Uncertainty from Motion for DNN Monocular Depth Estimation", ICRA 2022) keeps every
-predicted pixel as a point with a mean, a covariance and a count. Two differences from the authors' release, both on
-purpose. The points stay in the frame of the first camera; the release moves all of them into each new
-camera, where rotations that are not quite orthonormal add up. And covariances keep negative entries, which the
-release sets to zero through a mistyped threshold.
+UfM (Sudhakar, Karaman, Sze, "Uncertainty from Motion for DNN Monocular Depth Estimation", ICRA 2022) stores every
+predicted pixel as a point with a mean, a covariance and a count. There are two deliberate differences from the authors'
+release. The points stay in the frame of the first camera; the release moves all points into each new camera, which
+accumulates the error of rotations that are not quite orthonormal. Covariances may have negative entries; the release
+sets them to zero through a mistyped threshold.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# The covariance is symmetric: six of its entries are stored, row by row from the diagonal on.
+# The covariance is symmetric: the six entries of its upper triangle are stored, row by row.
 _ROW, _COLUMN = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 # x, y, z and the six entries above.
 MOMENTS = 9
@@ -59,7 +59,7 @@ class View:
     """The prediction of one camera, in one stream."""
 
     depth: Tensor  # [H, W] [m], 0 where not valid
-    variance: Tensor  # [H, W] s^2 [m^2] that the network itself states, 0 where it states none
+    variance: Tensor  # [H, W] the network's variance s^2 [m^2], 0 without one
     valid: Tensor  # [H, W] bool, True = use
     intrinsics: Tensor  # [3, 3] float64 [px]
     R_first_cam: Tensor  # [3, 3] float64 rotation from this camera into the first one
@@ -70,13 +70,14 @@ def take_in(cloud: Cloud, view: View, max_points: int | None) -> tuple[Cloud, Te
     """Steps 1 to 5 of a frame: correspond, fuse, read out, append, prune. Returns the points after the frame, and the
     variance [H, W] [m^2], NaN where not valid.
 
-    A point corresponds to the pixel that it is projected into, whatever lies in between: there is no test of
-    occlusion or depth. Points that land on an invalid pixel are left as they are.
+    A point corresponds to the pixel that it projects into, without a test of occlusion or depth. Points that project
+    into an invalid pixel are unchanged.
 
     Args:
         cloud: in the frame of the first camera; not modified.
-        view: its depth's dtype need not be the cloud's, in which all is computed.
-        max_points: the oldest points out of view are dropped beyond it, then the oldest of all; None = never.
+        view: its depth may have another dtype than the cloud, whose dtype is used for the computation.
+        max_points: limit beyond which the oldest points out of view are dropped, then the oldest of all; None = no
+            limit.
     """
     pixel, seen = _landing(cloud, view)
     observed = _observations(view, cloud.moments.dtype)
@@ -90,7 +91,7 @@ def take_in(cloud: Cloud, view: View, max_points: int | None) -> tuple[Cloud, Te
         torch.cat([fused.moments, observed.index_select(0, fresh)]),
         torch.cat([fused.count, torch.ones_like(fresh, dtype=torch.int32)]),
     )
-    keep = _kept(torch.cat([seen, torch.ones_like(fresh, dtype=torch.bool)]), max_points)
+    keep = _retained(torch.cat([seen, torch.ones_like(fresh, dtype=torch.bool)]), max_points)
     if keep is not None:
         cloud = Cloud(cloud.moments.index_select(0, keep), cloud.count.index_select(0, keep))
     return cloud, variance
@@ -104,7 +105,7 @@ def _landing(cloud: Cloud, view: View) -> tuple[Tensor, Tensor]:
     height, width = view.depth.shape
     dtype = cloud.moments.dtype
     K, R, t = (value.to(dtype) for value in (view.intrinsics, view.R_first_cam, view.t_first_cam))
-    # Column by column: three numbers a point are too few for a matrix product to pay.
+    # Column by column, which is faster than a matrix product of three numbers per point.
     offset = [cloud.moments[:, axis] - t[axis] for axis in range(3)]
     x, y, z = (offset[0] * R[0, i] + offset[1] * R[1, i] + offset[2] * R[2, i] for i in range(3))
     u = torch.round(K[0, 0] * x / z + K[0, 2])
@@ -123,7 +124,7 @@ def _observations(view: View, dtype: torch.dtype) -> Tensor:
     x = (torch.arange(width, dtype=dtype, device=device) - K[0, 2]) / K[0, 0]
     y = (torch.arange(height, dtype=dtype, device=device) - K[1, 2]) / K[1, 1]
     ray = [x * R[i, 0] + y[:, None] * R[i, 1] + R[i, 2] for i in range(3)]
-    # 0 where not valid: a NaN there must not travel through 0 * NaN.
+    # 0 where not valid, because 0 * NaN is NaN.
     depth = torch.where(view.valid, view.depth, torch.zeros_like(view.depth)).to(dtype)
     s2 = torch.where(view.valid, view.variance, torch.zeros_like(view.variance)).to(dtype)
     points = [depth * ray[i] + t[i] for i in range(3)]
@@ -132,7 +133,7 @@ def _observations(view: View, dtype: torch.dtype) -> Tensor:
 
 
 def _fused(cloud: Cloud, met: Tensor, observed: Tensor) -> Cloud:
-    """Step 2 at the points ``met`` [P], each with the pixel it landed on, ``observed`` [P, 9]; M = n + 1:
+    """Step 2 at the points ``met`` [P], with the observations ``observed`` [P, 9] of their pixels; M = n + 1:
 
     mu' = mu + (p - mu)/M and S' = (M-1)/M S + A/M + (M-1)/M^2 (p - mu)(p - mu)^T.
     """
@@ -148,12 +149,20 @@ def _fused(cloud: Cloud, met: Tensor, observed: Tensor) -> Cloud:
 
 
 def _read_out(met: Tensor, pixel: Tensor, view: View) -> tuple[Tensor, Tensor]:
-    """Step 3: s^2 everywhere, S'_zz of this camera where a point landed, the newest of several; of fused points ``met``
-    [P, 9], oldest first, on pixels [P]. Returns variance [H, W] [m^2], NaN where not valid, and hit [H*W]."""
+    """Step 3: S'_zz in this camera of the newest fused point at a pixel, s^2 at pixels without a point.
+
+    Args:
+        met: [P, 9] fused points, oldest first.
+        pixel: [P] their pixels.
+        view: of this camera.
+
+    Returns:
+        variance [H, W] [m^2], NaN where not valid; and hit [H*W], True at pixels with a point.
+    """
     axis = view.R_first_cam[:, 2].to(met.dtype)
     weight = torch.stack([axis[i] * axis[j] * (1 if i == j else 2) for i, j in zip(_ROW, _COLUMN, strict=True)])
     along_z = (met[:, 3:] * weight).sum(1).clamp_min(0)  # not below 0 by rounding
-    # The largest position is the newest point, in whatever order a device writes.
+    # The maximum selects the newest point, independent of the order in which a device writes.
     newest = torch.full((view.depth.numel(),), -1, dtype=torch.int64, device=pixel.device)
     newest = newest.scatter_reduce(0, pixel, torch.arange(len(pixel), device=pixel.device), "amax")
     hit = newest >= 0
@@ -163,8 +172,8 @@ def _read_out(met: Tensor, pixel: Tensor, view: View) -> tuple[Tensor, Tensor]:
     return variance.view(view.depth.shape), hit
 
 
-def _kept(seen: Tensor, max_points: int | None) -> Tensor | None:
-    """Step 5: indices of the points to keep, given which of them [N] are in view; None = all."""
+def _retained(seen: Tensor, max_points: int | None) -> Tensor | None:
+    """Step 5: indices of the points to keep; ``seen`` [N] is True for points in view. None = all."""
     excess = 0 if max_points is None else len(seen) - max_points
     if excess <= 0:
         return None

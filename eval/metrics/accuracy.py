@@ -14,12 +14,12 @@ TOLERANCE = 0.25  # [1] of delta1, in both definitions
 
 
 class Delta1(SumMetric):
-    """delta1, the share of pixels with depth right within 25 % (section "Experimental Setup").
+    """delta1, the share of pixels whose depth is right within 25 % (section "Experimental Setup").
 
     ``compute()``: ``delta1``, in the paper's words "within 25 % of the ground truth", |d - g| <= .25 g;
-    ``delta1_ratio``, as elsewhere in the literature, max(d/g, g/d) < 1.25, with d <= 0 a miss; ``pixels``, how many
-    were judged; ``left_out_share``, of the pixels with ground truth, those whose depth is NaN or infinite.
-    Without any pixel the figures are NaN.
+    ``delta1_ratio``, as elsewhere in the literature, max(d/g, g/d) < 1.25, False for d <= 0; ``pixels``, their number;
+    ``left_out_share``, the share of pixels with ground truth whose depth is NaN or infinite.
+    Without a pixel the figures are NaN.
     """
 
     STATES = (("hits", COUNT), ("hits_ratio", COUNT), ("pixels", COUNT), ("with_truth", COUNT))

@@ -1,4 +1,4 @@
-"""The base of all metrics: sum states in float64 or int64, saved with the state_dict, merged with care."""
+"""The base of all metrics: states are float64 or int64 sums, which the state_dict saves and which can be merged."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ COUNT, SUM = torch.int64, torch.float64  # kinds of states
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """The pixels of one or more frames, flat on the CPU. Ground truth counts where it is positive and finite, a depth
-    where it is finite, a variance where it is finite and not negative."""
+    """The pixels of one or more frames, flat on the CPU. Ground truth is valid if positive and finite, a depth if
+    finite, a variance if finite and not negative."""
 
     depth: Array  # [P] d [m]
-    variance: Array  # [P] v [m^2]; [0] where there is none
+    variance: Array  # [P] v [m^2]; [0] without one
     target: Array  # [P] g [m]
     use: NDArray[np.bool_]  # [P] True = use
-    inlier: Array  # [P] variance of a mixture's inliers [m^2]; [0] where there is no mixture
-    outlier: Array  # [P] probability of an outlier; likewise
+    inlier: Array  # [P] variance of a mixture's inliers [m^2]; [0] without a mixture
+    outlier: Array  # [P] probability of an outlier; [0] without a mixture
 
     @cached_property
     def with_truth(self) -> NDArray[np.bool_]:
@@ -43,30 +43,29 @@ class Pixels:
 
     @cached_property
     def depths(self) -> tuple[Array, Array]:
-        """d and g where there are both."""
+        """d and g where both are valid."""
         both = self.with_truth & np.isfinite(self.depth)
         return self.depth[both], self.target[both]
 
     @cached_property
     def judged(self) -> tuple[Array, Array, Array]:
-        """d, v and g where there are all."""
+        """d, v and g where all are valid."""
         every = self.with_truth & self.predicted
         return self.depth[every], self.variance[every], self.target[every]
 
 
 class SumMetric(Metric):
-    """A metric whose states are sums of fixed size, over the pixels with ground truth and a usable prediction.
+    """A metric whose states are sums of fixed size, over the pixels with ground truth and a valid prediction.
 
-    ``compute()`` returns the figures of all updates so far as a dict of float64 tensors by name: scalars, and curves
-    [B] where the metric has one. States reduce by addition: across processes (torchmetrics synchronises at
-    ``compute``; pass ``sync_on_compute=False`` where every process holds another sequence) and through
-    ``merge_state``. Counts are int64 and exact; float64 sums depend on the order of the updates in the last bits only.
-    Float64 rules out MPS: keep the metric on the CPU there.
+    ``compute()`` returns the figures of all updates as float64 tensors by name: scalars and curves [B]. States reduce
+    by addition: across processes (torchmetrics synchronises at ``compute``; pass ``sync_on_compute=False`` if every
+    process has another sequence) and through ``merge_state``. Counts are int64 and exact; float64 sums depend on the
+    order of the updates in the last bits only. MPS has no float64: keep the metric on the CPU there.
 
     Attributes:
-        OF_VARIANCE: the name, in messages, of a metric that needs a variance; "" for one of the depth alone.
-        STATES: of each its name, ``COUNT`` or ``SUM``, and the sizes of its dimensions; zeros at the start.
-        settings: of the instance; sums of other settings cannot be merged.
+        OF_VARIANCE: the name, in messages, of a metric that needs a variance; "" if it needs depth alone.
+        STATES: name, ``COUNT`` or ``SUM``, and sizes of the dimensions of each state; initially zeros.
+        settings: of the instance; sums with other settings cannot be merged.
     """
 
     OF_VARIANCE: ClassVar[str] = ""
@@ -78,7 +77,7 @@ class SumMetric(Metric):
     if TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Tensor:
-            """The states are the only attributes that are not in ``__dict__``."""
+            """The type of the states, which are not in ``__dict__``."""
 
     def __init__(self, **kwargs: Any) -> None:
         # torchmetrics keeps a computed value across merge_state and load_state_dict, where it is stale.
@@ -89,7 +88,7 @@ class SumMetric(Metric):
 
     @property
     def update_called(self) -> bool:
-        """True: sums that were loaded or merged are as good as updated ones, and no frame gives NaN."""
+        """True, because loaded or merged sums are valid too, and figures without a frame are NaN."""
         return True
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
@@ -98,8 +97,8 @@ class SumMetric(Metric):
         self.add(flat_pixels(depth, variance, target, valid))
 
     def add(self, pixels: Pixels) -> None:
-        """Add pixels. States are exchanged, never changed in place: others may hold the previous ones. Raises
-        ValueError: a needed variance is missing."""
+        """Add pixels. States are replaced instead of changed in place, because others may hold references to them.
+        Raises ValueError: a needed variance is missing."""
         if self.OF_VARIANCE and len(pixels.variance) != len(pixels.depth):
             judged = f"{self.OF_VARIANCE} judges the predicted distribution N(depth, variance)"
             raise ValueError(f"variance must be given: {judged}")
@@ -109,11 +108,10 @@ class SumMetric(Metric):
 
     @abstractmethod
     def sums(self, pixels: Pixels) -> Mapping[str, Any]:
-        """The pixels' contribution to each state, by its name; a state that is left out stays."""
+        """The pixels' contribution to each state, by name; a missing state stays unchanged."""
 
     def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:
-        """Add another metric's sums to this one's. Raises ValueError: the other one was made with other settings, so
-        that its sums mean something else."""
+        """Add another metric's sums to this one's. Raises ValueError: the other metric has other settings."""
         if isinstance(incoming_state, SumMetric) and incoming_state.settings != self.settings:
             raise ValueError(
                 f"incoming_state must come from a metric with the settings {self.settings}, "
@@ -135,14 +133,14 @@ def flat_pixels(
         variance: predicted variance v [m^2], or None; not finite or < 0 = no prediction.
         target: ground truth [m]; NaN, infinite or <= 0 means there is none.
         valid: bool, True = use; None = everywhere.
-        mixture: variance of the inliers [m^2] and probability of an outlier; None: no mixture is stated.
+        mixture: variance of the inliers [m^2] and probability of an outlier; None = no mixture.
 
     Raises:
         ValueError: an argument has another shape than ``depth`` or the wrong type.
     """
     inlier, outlier = mixture or (None, None)
-    given = {"depth": depth, "variance": variance, "target": target, "valid": valid}
-    for name, value in (given | {"inlier": inlier, "outlier": outlier}).items():
+    maps = {"depth": depth, "variance": variance, "target": target, "valid": valid}
+    for name, value in (maps | {"inlier": inlier, "outlier": outlier}).items():
         if value is None:
             continue
         if value.shape != depth.shape:

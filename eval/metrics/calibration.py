@@ -18,18 +18,18 @@ class ECEDelta(SumMetric):
     """ECE_delta = sum_b |b|/S |acc(b) - conf(b)| and the delta calibration curve.
 
     Confidence: mass of N(d, v) on [(1 - delta) d, (1 + delta) d]; accuracy: 1 if the ground truth lies
-    in that interval; B equal-width bins on [0, 1], of which three sums each are kept.
+    in that interval; B equal-width bins on [0, 1], with three sums each.
     ``compute()``: ``ece_delta``, NaN without a pixel; curve [B] ``ece_delta_confidence``,
     ``ece_delta_accuracy`` (NaN in empty bins) and ``ece_delta_pixels``; ``overconfidence`` = mean
-    confidence - mean accuracy, positive where the variance is too small.
+    confidence - mean accuracy, positive if the variance is too small.
 
     A variant in circulation (the helper of the older MIT code) bins between the smallest and largest
-    confidence, takes bin centres for conf(b), and tests the accuracy around the ground truth. Its
+    confidence, uses bin centres for conf(b), and tests the accuracy around the ground truth. Its
     figures differ, so do not compare them with these.
 
     Args:
         delta: half-width of the interval relative to the depth; the paper's .25.
-        bins: B; the paper names none, 10 here; the authors' 100.
+        bins: B; the paper names none, the default is 10, the authors use 100.
     """
 
     OF_VARIANCE = "ECE_delta"
@@ -68,7 +68,7 @@ class ECEDelta(SumMetric):
 
 
 def quantile_levels(bins: int) -> Tensor:
-    """[B] q_b = (b - 1/2) / B, b = 1..B: the levels 0 and 1, which are always right, stay out."""
+    """[B] q_b = (b - 1/2) / B, b = 1..B; the levels 0 and 1, which are always right, are excluded."""
     return (torch.arange(bins, dtype=torch.float64) + 0.5) / bins
 
 
@@ -80,8 +80,8 @@ class ECEQuantile(SumMetric):
     ``compute()``: ``ece_q``, NaN without a pixel; curve [B] ``ece_q_levels``, ``ece_q_observed``.
 
     Args:
-        levels: q_b, rising, within [0, 1]; None = .05, .15, ..., .95 (B = 10, which the paper leaves open); the
-            authors' 0, .01, ..., 1, of which the ends are right by definition.
+        levels: q_b, rising, within [0, 1]; None = .05, .15, ..., .95 (the paper names no B). The authors use
+            0, .01, ..., 1, whose ends are right by definition.
     """
 
     OF_VARIANCE = "ECE_q"

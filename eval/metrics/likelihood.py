@@ -21,9 +21,9 @@ def gaussian_nll(d: Array, v: Array, g: Array) -> Array:
 class NLL(SumMetric):
     """Mean negative log-likelihood (g - d)^2 / (2 v) + 0.5 ln(2 pi v) over the pixels with ground truth and v > 0.
 
-    ``compute()``: ``nll`` [nats], NaN without a pixel; ``nll_left_out_share``, of the pixels with valid
-    ground truth those without an NLL, because v = 0 there or the prediction is not finite: to be read
-    beside the NLL, since a method may leave out its worst pixels.
+    ``compute()``: ``nll`` [nats], NaN without a pixel; ``nll_left_out_share``, the share of pixels with ground truth
+    but without an NLL, because v = 0 or the prediction is not finite. Compare NLLs together with this share: a method
+    may exclude its worst pixels.
     """
 
     OF_VARIANCE = "NLL"
@@ -41,8 +41,8 @@ class NLL(SumMetric):
 class EntropyHistogram(SumMetric):
     """Histogram of the predictive entropy 0.5 ln(2 pi e v) over all predicted pixels, with ground truth or without.
 
-    ``compute()``: ``entropy_counts`` [66], first and last = under and over the range (v = 0 lies
-    under it), which is sigma = 81 um to 721 m; ``entropy_edges`` [65] [nats]; ``entropy`` the mean over v > 0.
+    ``compute()``: ``entropy_counts`` [66], first and last = below (v = 0 included) and above the range, which is
+    sigma = 81 um to 721 m; ``entropy_edges`` [65] [nats]; ``entropy``, the mean over v > 0.
     """
 
     OF_VARIANCE = "the entropy"

@@ -1,4 +1,4 @@
-"""The posterior as the mixture that it states: with probability 1 - p on its evidence's surface, else on another."""
+"""The posterior as a mixture: with probability 1 - p a pixel is on its evidence's surface, else on another one."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _THREE_SIGMA = 0.9973002039367398
 
 
 class Mixture(SumMetric):
-    """NLL, calibration and coverage of (1 - p) N(d, v_1) + p N(d, v_2), which has the variance v in all.
+    """NLL, calibration and coverage of (1 - p) N(d, v_1) + p N(d, v_2), whose variance is v.
 
-    v_2 = (v - (1 - p) v_1)/p, at least v_1. Pixels count that have ground truth, a finite depth, v_1 > 0 and p.
+    v_2 = (v - (1 - p) v_1)/p, at least v_1. The pixels are those with ground truth, a finite depth, v_1 > 0 and p.
     ``compute()``: ``mixture_nll`` [nats], ``mixture_ece_delta`` and ``mixture_ece_q`` with the bins of ``ECEDelta`` and
     ``ECEQuantile``, ``mixture_coverage``: share of ground truths in the central interval of three sigma's mass, .9973.
-    Nothing without a pixel: only a posterior states a mixture.
+    {} without a pixel: only a posterior has a mixture.
     """
 
     OF_VARIANCE = "the mixture"

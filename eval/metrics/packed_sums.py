@@ -1,6 +1,6 @@
-"""Sums of metrics as they are stored: large ones by their non-zero entries.
+"""The stored form of metrics' sums: large ones by their non-zero entries.
 
-Spearman's 514 x 514 counts are mostly 0, and there is a file for every row on every sequence.
+Spearman's 514 x 514 counts are mostly 0, and every row has a file on every sequence.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_DENSE_ENTRIES = 4096  # up to here as they are
+_DENSE_ENTRIES = 4096  # largest tensor that is stored unpacked
 
 
 def pack(value: Tensor) -> Tensor | dict[str, Any]:
     """Tensors and plain values for ``torch.save``, equal to ``value`` after :func:`unpack`."""
     if value.numel() <= _DENSE_ENTRIES:
-        # A view would be saved with all of the storage that it looks at.
+        # A view would be saved with its whole storage.
         return value.clone()
     flat = value.flatten()
     index = flat.nonzero()[:, 0]

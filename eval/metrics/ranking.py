@@ -1,8 +1,8 @@
 """Metrics of the order of variances and errors: AUSE, AURG, Spearman, and the NLL by size of the error.
 
-Ranks need all pixels at once; a stream has none of the earlier ones. So the pixels go into bins of equal
-width in the logarithm of the variance and of the error, finer than anyone reads a variance, and pixels
-of one bin count as ties. Each class states a bound on the error that this makes.
+Ranks need all pixels at once, which a stream does not store. The pixels are therefore counted in bins of equal width in
+the logarithm of the variance and of the error; pixels of one bin are ties. Each class states a bound on the error of
+this approximation.
 """
 
 from __future__ import annotations
@@ -19,45 +19,44 @@ from torch import Tensor
 from ufmstar_torch.eval.metrics.base import COUNT, SUM, Array, Pixels, SumMetric
 from ufmstar_torch.eval.metrics.likelihood import gaussian_nll
 
-# In the logarithm of the variance or of the error; of both together: 5.5 % in variance, 2 MB of counts.
+# Bins of the logarithm of variance or error; bins of each in their joint histogram (5.5 % in variance, 2 MB).
 BINS, JOINT_BINS = 4096, 512
-# Variances and squared errors [m^2] between (0.1 mm)^2 and (100 m)^2 are distinguished; 0 and what is
-# smaller share the bin below, what is larger the bin above. Relative errors use the same bins.
+# Range of the bins of variances and squared errors [m^2]: (0.1 mm)^2 to (100 m)^2. One bin below has all smaller values
+# and 0, one bin above all larger ones. Relative errors use the same bins.
 LOW, HIGH = 1e-8, 1e4
 
 
 def log_bin(value: Array, bins: int) -> NDArray[np.intp]:
     """Bins in [0, bins + 1] of values >= 0: 0 below ``LOW``, bins + 1 from ``HIGH`` on."""
-    at = np.log(np.maximum(value, LOW) / LOW) * (bins / math.log(HIGH / LOW))
-    return np.where(value < LOW, 0, np.minimum(at, bins).astype(np.intp) + 1)
+    index = np.log(np.maximum(value, LOW) / LOW) * (bins / math.log(HIGH / LOW))
+    return np.where(value < LOW, 0, np.minimum(index, bins).astype(np.intp) + 1)
 
 
 def mean_of_share(count: Tensor, total: Tensor, shares: Tensor) -> Tensor:
     """[F] mean over the ``shares`` (0, 1] of the pixels in the first bins.
 
-    Within a bin the order is random: the expectation over all orders is linear in the pixels taken.
+    The order within a bin is random; the expectation over all orders is linear in the number of its pixels.
     """
     pixels, sums = count.double().cumsum(0), total.cumsum(0)
-    wanted = shares * pixels[-1]
-    bin_ = torch.searchsorted(pixels, wanted).clamp(max=count.numel() - 1)
+    pixels_taken = shares * pixels[-1]
+    bin_ = torch.searchsorted(pixels, pixels_taken).clamp(max=count.numel() - 1)
     before, sum_before = pixels[bin_] - count[bin_], sums[bin_] - total[bin_]
-    part = (wanted - before) / count[bin_].clamp(min=1)
-    return (sum_before + part * total[bin_]) / wanted
+    part = (pixels_taken - before) / count[bin_].clamp(min=1)
+    return (sum_before + part * total[bin_]) / pixels_taken
 
 
 class Sparsification(SumMetric):
     """AUSE and AURG for RMSE and AbsRel, from sparsification curves with ties broken at random.
 
-    The curve at f is the error of the pixels left after the share f with the largest variance is gone,
-    f = 0, .02, ..., .98; its area is the trapezoid rule, the last value held up to 1. The oracle removes
-    by the error itself; random removal leaves the error as it is. Nothing is normalised, so the RMSE
-    figures are in metres.
+    The curve at f is the error of the pixels without the share f with the largest variance,
+    f = 0, .02, ..., .98; its area is by the trapezoid rule, with the last value extended to 1. The oracle removes the
+    largest errors; random removal does not change the error. Nothing is normalised, so the RMSE figures are in metres.
     ``compute()``: ``ause_rmse`` = area - oracle's area (0 is best), ``aurg_rmse`` = overall error -
     area (positive: better than random), ``ause_abs_rel``, ``aurg_abs_rel``, curves [50]
     ``sparsification_rmse``, ``sparsification_oracle_rmse`` and the same for abs_rel.
 
-    Ties: pixels whose variance agrees within a bin (4096 bins: .7 %, .35 % of sigma) count as equal, so
-    the curve is exactly that of variances rounded so far.
+    Ties: pixels whose variance is in the same bin (4096 bins: .7 %, .35 % of sigma) are equal, so the curve is exactly
+    that of variances rounded to bins.
     """
 
     OF_VARIANCE = "AUSE"
@@ -81,12 +80,12 @@ class Sparsification(SumMetric):
         }
 
     def compute(self) -> dict[str, Tensor]:
-        kept = 1 - torch.arange(50, dtype=torch.float64, device=self.count.device) / 50
+        shares = 1 - torch.arange(50, dtype=torch.float64, device=self.count.device) / 50
         curves = {
-            "rmse": mean_of_share(self.count, self.squared, kept).sqrt(),
-            "oracle_rmse": mean_of_share(self.count_squared, self.sum_squared, kept).sqrt(),
-            "abs_rel": mean_of_share(self.count, self.relative, kept),
-            "oracle_abs_rel": mean_of_share(self.count_relative, self.sum_relative, kept),
+            "rmse": mean_of_share(self.count, self.squared, shares).sqrt(),
+            "oracle_rmse": mean_of_share(self.count_squared, self.sum_squared, shares).sqrt(),
+            "abs_rel": mean_of_share(self.count, self.relative, shares),
+            "oracle_abs_rel": mean_of_share(self.count_relative, self.sum_relative, shares),
         }
         results = {f"sparsification_{name}": curve for name, curve in curves.items()}
         for error in ("rmse", "abs_rel"):
@@ -97,15 +96,15 @@ class Sparsification(SumMetric):
 
 
 def _area(curve: Tensor) -> Tensor:
-    """[] trapezoid rule over f = 0, .02, ..., .98, the last value held up to 1."""
+    """[] trapezoid rule over f = 0, .02, ..., .98, with the last value extended to 1."""
     return torch.trapezoid(curve, dx=1 / 50) + curve[-1] / 50
 
 
 class SpearmanCorrelation(SumMetric):
     """Spearman's rank correlation of variance and squared error, ties at their mean rank.
 
-    ``compute()``: ``spearman``, NaN where all variances or all errors are alike. Pixels of a bin count as ties:
-    on drawn maps the figure is within .002 of that of the single pixels.
+    ``compute()``: ``spearman``, NaN if all variances or all errors are equal. Pixels of a bin are ties: on random maps
+    the figure is within .002 of the exact one.
     """
 
     OF_VARIANCE = "Spearman's correlation"
@@ -125,17 +124,17 @@ class SpearmanCorrelation(SumMetric):
 
 
 def _centred_ranks(count: Tensor) -> Tensor:
-    """[bins] mean rank of each bin less the overall mean."""
+    """[bins] mean rank of each bin minus the overall mean."""
     return count.cumsum(0) - count / 2 - count.sum() / 2  # the mean of n_b successive ranks, less 1/2
 
 
 class NLLByError(SumMetric):
     """Mean NLL by percentile of the error (the paper's figure of binned error against NLL).
 
-    The paper looks at pixels where another method is confident: pass these as ``valid``, and the same
-    ones for every method that is compared.
-    ``compute()``: curve [10] ``nll_by_error``, mean NLL over v > 0 of the pixels between one decile and the next, NaN
-    without a pixel. Errors that agree within a bin count as equal: 4096 bins of squared error, .35 % of the error.
+    The paper uses the pixels where another method is confident: pass them as ``valid``, the same for every compared
+    method.
+    ``compute()``: curve [10] ``nll_by_error``, mean NLL over v > 0 of the pixels between two deciles of the error, NaN
+    without a pixel. Errors in the same bin are equal: 4096 bins of squared error, .35 % of the error.
     """
 
     OF_VARIANCE = "NLL by error"
@@ -147,6 +146,6 @@ class NLLByError(SumMetric):
         return {"count": np.bincount(b, minlength=BINS + 2), "nll": np.bincount(b, gaussian_nll(d, v, g), BINS + 2)}
 
     def compute(self) -> dict[str, Tensor]:
-        kept = torch.arange(1, 11, dtype=torch.float64, device=self.count.device) / 10
-        mean = mean_of_share(self.count, self.nll, kept) * kept
+        shares = torch.arange(1, 11, dtype=torch.float64, device=self.count.device) / 10
+        mean = mean_of_share(self.count, self.nll, shares) * shares
         return {"nll_by_error": torch.diff(mean, prepend=mean.new_zeros(1)) * 10}

@@ -1,7 +1,7 @@
 """Fits of a :class:`Recalibration` to the joint counts of variance and squared error, and their figures.
 
-``SpearmanCorrelation`` counts the pixels of a sequence by variance and squared error, 512 bins each, which is all that
-a map of the variance can be fitted to. Every sequence has the same weight, however many pixels it has.
+``SpearmanCorrelation`` counts the pixels of a sequence by variance and squared error, 512 bins each; a map of the
+variance is fitted to these counts. Every sequence has the same weight, whatever its number of pixels.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from ufmstar_torch.eval.metrics.base import Array
 from ufmstar_torch.eval.metrics.ranking import HIGH, LOW
 from ufmstar_torch.recalibrate import CONFIDENCE, Recalibration
 
-# Levels of |z| of a standard normal variable at which errors are compared with it. The outer tenth is left out:
-# gross errors of the depth would set the variance of all other pixels.
+# Levels at which the quantiles of |z| are compared with a standard normal variable's. The outer tenth is excluded:
+# gross errors of the depth would dominate the variance of all other pixels.
 LEVELS = np.arange(0.1, 0.91, 0.1)
-NORMAL = ndtri(0.5 + LEVELS / 2)  # |z| below which these shares lie
+NORMAL = ndtri(0.5 + LEVELS / 2)  # quantiles of |z| at these levels
 GROUPS, CONFIDENCE_GROUPS = 32, 16
-LARGEST = 25.0  # squared error over the variance that counts, as of anchors (``ConfidenceConfig.largest``)
+LARGEST = 25.0  # limit of squared error over variance, as for anchors (``ConfidenceConfig.largest``)
 
 
 def centres(bins: int) -> Array:
-    """[bins + 2] the bins' values [m^2]: the geometric centre of each; 0 below the range, ``HIGH`` above it."""
+    """[bins + 2] values of the bins [m^2]: their geometric centres; 0 below the range, ``HIGH`` above it."""
     inner = LOW * (HIGH / LOW) ** ((np.arange(bins) + 0.5) / bins)
     return np.concatenate([[0.0], inner, [HIGH]])
 
 
 def fit(joints: Sequence[Array], groups: int = GROUPS) -> Recalibration:
-    """The map that fits some sequences.
+    """Fit a map of the variance to sequences.
 
-    The pixels are divided by V into ``groups`` groups of one size; each group's V' is the scale at which its errors'
-    quantiles at ``LEVELS`` agree best, in the logarithm, with those of a normal distribution, and an isotonic
-    regression of log V' (Barlow and Brunk 1972) over the groups makes it monotone.
+    The pixels are divided by V into ``groups`` groups of equal size. Each group's V' is the scale at which its errors'
+    quantiles at ``LEVELS`` agree best, in the logarithm, with those of a normal distribution. An isotonic regression of
+    log V' (Barlow and Brunk 1972) over the groups makes the map monotone.
 
     Args:
         joints: of each sequence, [V, e] pixels by variance and squared error (``SpearmanCorrelation.joint``).
-        groups: at most; fewer where many pixels have one variance.
+        groups: largest number of groups; there are fewer if many pixels have the same variance.
 
     Raises:
-        ValueError: no pixel.
+        ValueError: a sequence without pixels.
     """
     joint = _weighted(joints)
     value = centres(joint.shape[0] - 2)
@@ -63,29 +63,29 @@ def fit(joints: Sequence[Array], groups: int = GROUPS) -> Recalibration:
 
 
 def fit_confidence(samples: Sequence[Array], groups: int = CONFIDENCE_GROUPS) -> Recalibration:
-    """The factor of the variance as a monotone function of the confidence that fits some sequences.
+    """Fit the factor of the variance to sequences, as a monotone function of the confidence.
 
-    Every sequence has the same weight. Its pixels are divided by confidence into groups of one size; each group's
-    factor is the mean of the squared error over the variance, at most ``LARGEST``; an isotonic regression of its
-    logarithm, rising or falling, whichever fits better, makes it monotone.
+    Every sequence has the same weight. The pixels are divided by confidence into groups of equal size. Each group's
+    factor is the mean of the squared error over the variance, clipped to ``LARGEST``. An isotonic regression of its
+    logarithm, rising or falling, whichever fits better, makes the function monotone.
 
     Args:
         samples: of each sequence, [n, 3] confidence, variance [m^2] and squared error [m^2].
-        groups: at most; fewer where many pixels have one confidence.
+        groups: largest number of groups; there are fewer if many pixels have the same confidence.
 
     Raises:
-        ValueError: a sequence without a pixel.
+        ValueError: a sequence without pixels.
     """
     from scipy.optimize import isotonic_regression
 
-    if not samples or any(not len(of_sequence) for of_sequence in samples):
+    if not samples or any(not len(sample) for sample in samples):
         raise ValueError("a recalibration needs pixels with ground truth of every sequence")
-    weight = np.concatenate([np.full(len(of_sequence), 1 / len(of_sequence)) for of_sequence in samples])
+    weight = np.concatenate([np.full(len(sample), 1 / len(sample)) for sample in samples])
     c, variance, error = np.concatenate(samples).T
     ratio = np.minimum(error / variance, LARGEST)
-    _, at = np.unique(c, return_inverse=True)  # pixels of one confidence stay together
-    upto = np.cumsum(np.bincount(at, weight)) / weight.sum()
-    group = np.minimum((upto * groups - 1e-9).astype(int), groups - 1)[at]
+    _, level = np.unique(c, return_inverse=True)  # pixels of one confidence stay together
+    cumulative = np.cumsum(np.bincount(level, weight)) / weight.sum()
+    group = np.minimum((cumulative * groups - 1e-9).astype(int), groups - 1)[level]
     mass = np.bincount(group, weight, minlength=groups)
     full = np.flatnonzero(mass)
     knots = [float(np.median(c[group == k])) for k in full]
@@ -96,7 +96,7 @@ def fit_confidence(samples: Sequence[Array], groups: int = CONFIDENCE_GROUPS) ->
 
 
 def figures_of_samples(samples: Array, recalibration: Recalibration | None) -> dict[str, float]:
-    """As :func:`figures`, from samples as :func:`fit_confidence` takes them."""
+    """As :func:`figures`, from samples as for :func:`fit_confidence`."""
     c, variance, error = samples.T
     if recalibration is not None:
         variance = variance * recalibration.factor(torch.from_numpy(np.ascontiguousarray(c))).numpy()
@@ -104,15 +104,15 @@ def figures_of_samples(samples: Array, recalibration: Recalibration | None) -> d
 
 
 def figures(joint: Array, recalibration: Recalibration | None) -> dict[str, float]:
-    """Compute the figures of N(d, V) on a sequence from its counts, with a recalibration or without one (None).
+    """The figures of N(d, V) on a sequence from its counts, with a recalibration or without one (None).
 
     Returns:
         "coverage_error": mean over nine central intervals of |share of errors inside - the interval's level|;
-        "nll" [nats], the mean over the pixels with V > 0 (within .03 nats of the exact one, by the bins' width);
-        "zero_share": of the pixels, those with V = 0.
+        "nll" [nats], the mean over the pixels with V > 0 (within .03 nats of the exact one, because of the bins);
+        "zero_share": the share of pixels with V = 0.
 
     Raises:
-        ValueError: no pixel.
+        ValueError: the sequence has no pixels.
     """
     joint = _weighted([joint])
     value = centres(joint.shape[0] - 2)
@@ -121,7 +121,7 @@ def figures(joint: Array, recalibration: Recalibration | None) -> dict[str, floa
 
 
 def _figures(variance: Array, error: Array, weight: Array) -> dict[str, float]:
-    """The figures of squared errors [m^2] under variances [m^2], by the share of the pixels that have both."""
+    """The figures of squared errors [m^2] with variances [m^2]; ``weight`` is the share of the pixels with both."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(error == 0, 0.0, error / variance)
         nll = 0.5 * (ratio + np.log(2 * math.pi * variance))
@@ -136,7 +136,7 @@ def _figures(variance: Array, error: Array, weight: Array) -> dict[str, float]:
 
 
 def _weighted(joints: Sequence[Array]) -> Array:
-    """Sum of the sequences' shares, 1 in all."""
+    """Mean of the sequences' normalised counts; its sum is 1."""
     if not joints or any(joint.sum() == 0 for joint in joints):
         raise ValueError("a recalibration needs pixels with ground truth of every sequence")
     total: Array = np.sum([joint / joint.sum() for joint in joints], axis=0) / len(joints)
@@ -144,12 +144,12 @@ def _weighted(joints: Sequence[Array]) -> Array:
 
 
 def _groups(mass: Array, count: int) -> list[Array]:
-    """Weights [V] in [0, 1] of each of ``count`` groups of equal mass, in order; a bin may be divided."""
-    upto = np.concatenate([[0.0], np.cumsum(mass)])
-    edges = np.linspace(0, upto[-1], count + 1)
+    """Weights [V] in [0, 1] of the bins in each of ``count`` groups of equal mass, in order; a bin may be divided."""
+    cumulative = np.concatenate([[0.0], np.cumsum(mass)])
+    edges = np.linspace(0, cumulative[-1], count + 1)
     weights = []
     for low, high in pairwise(edges):
-        part = np.clip(np.minimum(upto[1:], high) - np.maximum(upto[:-1], low), 0, None)
+        part = np.clip(np.minimum(cumulative[1:], high) - np.maximum(cumulative[:-1], low), 0, None)
         weights.append(np.divide(part, mass, out=np.zeros_like(mass), where=mass > 0))
     return weights
 
@@ -161,6 +161,6 @@ def _scale(mass: Array, value: Array) -> float:
         mass: [N] of the bins of the squared error.
         value: [N] of the bins, ascending; 0 counts as the smallest positive one.
     """
-    at = np.searchsorted(np.cumsum(mass), LEVELS * mass.sum())
-    quantiles = np.maximum(value[np.minimum(at, len(value) - 1)], value[value > 0].min())
+    index = np.searchsorted(np.cumsum(mass), LEVELS * mass.sum())
+    quantiles = np.maximum(value[np.minimum(index, len(value) - 1)], value[value > 0].min())
     return float(np.exp(np.mean(np.log(quantiles) - 2 * np.log(NORMAL))))

@@ -1,4 +1,4 @@
-"""All metrics of one sequence in one go, and the mean with its confidence interval over sequences."""
+"""All metrics of one sequence, and their mean and confidence interval over sequences."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ufmstar_torch.eval.metrics.ranking import Sparsification, SpearmanCorrelati
 
 OURS, AUTHORS = "ours", "authors"
 BINS = (OURS, AUTHORS)
-_OWN = "own_"  # before the names of a user's metrics
+_PLUGIN_PREFIX = "own_"  # of the names of a user's metrics
 _LEVELS = [level / 100 for level in range(101)]
 _AUTHORS: dict[type[SumMetric], dict[str, Any]] = {ECEDelta: {"bins": 100}, ECEQuantile: {"levels": _LEVELS}}
 
@@ -26,14 +26,14 @@ _AUTHORS: dict[type[SumMetric], dict[str, Any]] = {ECEDelta: {"bins": 100}, ECEQ
 class SequenceMetrics(nn.Module):
     """delta1, AbsRel, RMSE and, with a variance, NLL, ECE_delta, ECE_q, entropy, AUSE, AURG, Spearman of one sequence.
 
-    Memory is 2.4 MB however many frames are added. ``state_dict`` saves the sums;
-    ``merge_state`` adds those of another part of the sequence.
+    Memory is 2.4 MB for any number of frames. ``state_dict`` saves the sums; ``merge_state`` adds those of another part
+    of the sequence.
 
     Args:
         with_variance: False for a network that predicts depth alone.
         bins: of the calibration errors: "ours", 10 of the confidence and 10 levels, or "authors", 100 and 101.
-        own: classes of ``SumMetric`` by name, whose figures are called "own.FIGURE"; without a variance, those that
-            need none.
+        plugins: a user's classes of ``SumMetric`` by name; their figures are called "own.FIGURE". Those that need a
+            variance are ignored without one.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class SequenceMetrics(nn.Module):
         *,
         with_variance: bool = True,
         bins: str = OURS,
-        own: Mapping[str, Any] = MappingProxyType({}),
+        plugins: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         super().__init__()
         if bins not in BINS:
@@ -52,8 +52,8 @@ class SequenceMetrics(nn.Module):
             kinds += [NLL, ECEDelta, ECEQuantile, EntropyHistogram, Sparsification, SpearmanCorrelation, Mixture]
         finer = _AUTHORS if bins == AUTHORS else {}
         made = {kind.__name__: kind(**finer.get(kind, {}), sync_on_compute=False) for kind in kinds}
-        usable = {name: kind for name, kind in own.items() if with_variance or not kind.OF_VARIANCE}
-        made |= {f"{_OWN}{name}": kind(sync_on_compute=False) for name, kind in usable.items()}
+        usable = {name: kind for name, kind in plugins.items() if with_variance or not kind.OF_VARIANCE}
+        made |= {f"{_PLUGIN_PREFIX}{name}": kind(sync_on_compute=False) for name, kind in usable.items()}
         self.metrics = nn.ModuleDict(made)
 
     def update(
@@ -64,12 +64,12 @@ class SequenceMetrics(nn.Module):
 
         Args:
             depth: [...] predicted depth [m].
-            variance: [...] predicted variance [m^2]; None only if made with ``with_variance=False``.
+            variance: [...] predicted variance [m^2]; None only with ``with_variance=False``.
             target: [...] ground truth [m]; NaN or <= 0 means there is none.
             valid: [...] bool, True = use.
             mixture: of a posterior (``Mixture``), the inliers' variance and the probability of an outlier, [...] each.
 
-        All figures but the entropy are of the pixels with ground truth.
+        All figures except the entropy use the pixels with ground truth.
 
         Raises:
             ValueError: shapes or types disagree, or a needed variance is missing.
@@ -90,12 +90,12 @@ class SequenceMetrics(nn.Module):
         return {name: value.tolist() for name, value in self._results().items() if value.dim() > 0}
 
     def sums(self) -> dict[str, Tensor]:
-        """``state_dict`` without copies: updates exchange the sums, they change none in place."""
+        """``state_dict`` without copies: updates replace the sums instead of changing them in place."""
         kinds = zip(self.metrics, self._all(), strict=True)
         return {f"metrics.{kind}.{name}": getattr(metric, name) for kind, metric in kinds for name, *_ in metric.STATES}
 
     def merge_state(self, other: SequenceMetrics) -> None:
-        """Add the sums of another part of the same sequence. Raises ValueError: the other one judges other things."""
+        """Add the sums of another part of the same sequence. Raises ValueError: the other part has other metrics."""
         if other.metrics.keys() != self.metrics.keys():
             raise ValueError(f"other must hold the metrics {list(self.metrics)}, got {list(other.metrics)}")
         for mine, theirs in zip(self._all(), other._all(), strict=True):
@@ -111,7 +111,7 @@ class SequenceMetrics(nn.Module):
 
     def _results(self) -> dict[str, Tensor]:
         return {
-            f"own.{name}" if kind.startswith(_OWN) else name: value
+            f"own.{name}" if kind.startswith(_PLUGIN_PREFIX) else name: value
             for kind, metric in zip(self.metrics, self._all(), strict=True)
             for name, value in metric.compute().items()
         }

@@ -1,4 +1,4 @@
-"""Keyframes: the images of a video that lie far enough apart to triangulate, by how far its corners move."""
+"""Keyframes: images of a video that are far enough apart to triangulate, by the motion of corners."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError
 
-# A new keyframe where the median corner has moved by this share of the image's width since the last one, or where fewer
-# than half of its corners are left.
+# An image is a keyframe if the median corner has moved by this share of the image's width since the last keyframe, or
+# if fewer than this share of its corners remain.
 _MOTION, _LEFT = 0.03, 0.5
 _WIDTH = 320  # [px] to which images are reduced for tracking
-_CORNERS, _FEWEST = 300, 20  # in an image; one with fewer corners is no keyframe
+_CORNERS, _FEWEST = 300, 20  # largest number of corners in an image, and smallest number in a keyframe
 _JPEG_QUALITY = 95
 
 
@@ -25,9 +25,9 @@ def write_keyframes(
     progress: Callable[[int], object] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[list[int], int]:
-    """Decode a video's images once, in order, and write its keyframes as ``folder/NAME.jpg``; their positions in
-    ``images``, and how many images cannot be decoded. Images named in ``always`` are keyframes wherever they lie.
-    ``progress`` gets the number of decoded images; ``stop`` is called before every image, and True ends the video."""
+    """Decode a video's images once, in order, and write its keyframes as ``folder/NAME.jpg``. Returns their indices in
+    ``images``, and the number of images that cannot be decoded. Images named in ``always`` are always keyframes.
+    ``progress`` gets the number of decoded images; ``stop`` is called before every image, and True ends the loop."""
     import cv2
 
     chosen, broken, motion = [], 0, _Motion()
@@ -50,7 +50,7 @@ def write_keyframes(
 
 
 class _Motion:
-    """Corners followed from image to image since the last keyframe."""
+    """Corners tracked from image to image since the last keyframe."""
 
     def __init__(self) -> None:
         self._last: np.ndarray | None = None
@@ -59,7 +59,7 @@ class _Motion:
         self._count = 0
 
     def is_keyframe(self, image: np.ndarray, required: bool) -> bool:
-        """Return whether the next image [H, W, 3] is a keyframe: ``required``, or far enough from the last one."""
+        """True if the next image [H, W, 3] is a keyframe: ``required``, or far enough from the last one."""
         import cv2
 
         scale = min(1.0, _WIDTH / image.shape[1])
@@ -68,12 +68,12 @@ class _Motion:
         )
         if self._last is not None and self._last.shape == grey.shape and len(self._now):
             moved, found, _ = cv2.calcOpticalFlowPyrLK(self._last, grey, self._now, np.zeros_like(self._now))
-            kept = found.ravel() == 1
-            self._start, self._now = self._start[kept], np.asarray(moved, np.float32)[kept]
+            tracked = found.ravel() == 1
+            self._start, self._now = self._start[tracked], np.asarray(moved, np.float32)[tracked]
         self._last = np.asarray(grey)
-        left = len(self._now) >= max(_LEFT * self._count, 1)
+        enough = len(self._now) >= max(_LEFT * self._count, 1)
         distance = np.linalg.norm(self._now - self._start, axis=-1)
-        if left and not required and np.median(distance) < _MOTION * grey.shape[1]:
+        if enough and not required and np.median(distance) < _MOTION * grey.shape[1]:
             return False
         corners = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.01, 5)
         if (corners is None or len(corners) < _FEWEST) and not required:

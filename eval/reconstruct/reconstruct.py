@@ -1,12 +1,12 @@
 """Structure from motion of keyframes: SIFT on the CPU, matching, COLMAP's global mapper; models, landmarks and gaps.
 
 ```
-DIR/images/NAME.jpg     keyframes; DIR/rgb.txt has their times [s], where they are known
-DIR/sparse/0, 1, ...    COLMAP models, the largest first; metric only 0, and only with a scale
+DIR/images/NAME.jpg     keyframes; DIR/rgb.txt has their times [s], if known
+DIR/sparse/0, 1, ...    COLMAP models, the largest first; only model 0 can be metric, if a scale is known
 DIR/landmarks.npz       points [P, 3] and sigma [P] [m] of model 0, for --anchors
-DIR/poses.json          what was found, and where the scale comes from
+DIR/poses.json          the result, and the origin of the scale
 ```
-The incremental mapper is not used: it put a walk with a HoloLens 148 cm off.
+The incremental mapper is not used: its error on a walk with a HoloLens was 148 cm.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.optional import optional
 from ufmstar_torch.trajectory import Trajectory
 
-# Up to so many keyframes, all pairs are matched; of more, each with the next ten and those 16, 32, ... 512 later.
+# Largest number of keyframes for which all pairs are matched; with more, each is matched with the next ten and those
+# 16, 32, ... 512 later.
 _ALL_PAIRS = 60
-_FEATURES, _LARGEST_IMAGE = 4096, 1600  # of an image [1], [px]
-# A landmark: seen by three images, from directions at least so far apart [rad], with at most this error [px]. Its error
-# counts as at least half a pixel, as SIFT places a feature.
+_FEATURES, _LARGEST_IMAGE = 4096, 1600  # largest number of features of an image, and its largest side [px]
+# A landmark: smallest number of images, smallest angle between their rays [rad], largest error [px], and lower limit of
+# the error [px], SIFT's accuracy.
 _VIEWS, _ANGLE, _MOST_ERROR, _LEAST_ERROR = 3, np.radians(1.5), 2.0, 0.5
 
 
@@ -40,7 +41,7 @@ POSES = FolderKind("ufmstar poses", "reconstruction", SCALE_FILE, _MADE)
 
 
 def require_pycolmap() -> Any:
-    """The package. Raises ModuleNotFoundError: it is missing; the message names the extra that brings it."""
+    """The package. Raises ModuleNotFoundError: it is missing; the message names the extra to install."""
     return optional("pycolmap", "`ufmstar poses` needs pycolmap", "'ufmstar-torch[recordings]'")
 
 
@@ -53,8 +54,8 @@ def reconstruct(
     say: Callable[[str], object] = lambda _: None,
 ) -> list[Any]:
     """The models (``pycolmap.Reconstruction``) of ``out/images/NAME.jpg`` for ``names`` in the order of the video, the
-    largest first. K [3, 3] of all of them [px] is kept as it is; None = one focal length and one distortion coefficient
-    are estimated. ``say`` gets a line at the start of each stage. Raises ValueError: the images fit no model."""
+    largest first. K [3, 3] of all images [px] is not refined; None = estimate one focal length and one distortion
+    coefficient. ``say`` gets a line at the start of each stage. Raises ValueError: the images fit no model."""
     if len(names) < _VIEWS:
         raise ValueError(f"{len(names)} keyframes, of which {_VIEWS} are needed: too few images, or blank or alike")
     pycolmap = require_pycolmap()
@@ -106,43 +107,46 @@ def scale_model(
     trajectory: Trajectory | None = None,
     options: Options | None = None,
 ) -> dict[str, Any]:
-    """Bring a model into metres, in place, and for a trajectory into its axes: ``scale_from``, None without either;
-    ``metres_per_unit``, and for a trajectory ``residual`` [m].
+    """Convert a model to metres, in place, and with a trajectory also to its axes.
 
     Args:
         model: ``pycolmap.Reconstruction``.
         images: all of the video, in order, with their times.
-        length: two places as ``endpoint`` reads them, and their distance [m].
-        trajectory, options: positions of the camera in metres, and how their times meet the images'.
+        length: two places in the form of ``endpoint``, and their distance [m].
+        trajectory: positions of the camera in metres.
+        options: of the association of the trajectory's times with the images'.
+
+    Returns:
+        ``scale_from``, None without length and trajectory; ``metres_per_unit``; with a trajectory ``residual`` [m].
 
     Raises:
-        ValueError: the two places are one, or see ``endpoint``, ``attach`` and ``similarity``.
+        ValueError: the two places are equal, or see ``endpoint``, ``attach`` and ``similarity``.
     """
     pycolmap = require_pycolmap()
     if length is not None:
         first, second = (endpoint(model, word) for word in length[:2])
-        apart = float(np.linalg.norm(second - first))
-        if not apart > 0:
+        distance = float(np.linalg.norm(second - first))
+        if not distance > 0:
             raise ValueError(f"--length: {length[0]} and {length[1]} are the same place")
-        metres = length[2] / apart
+        metres = length[2] / distance
         model.transform(pycolmap.Sim3d(metres, pycolmap.Rotation3d(), np.zeros(3)))
         return {"scale_from": "length", "metres_per_unit": metres}
     if trajectory is None:
         return {"scale_from": None}
-    known = (f for f in attach(images, trajectory, options or Options()) if isinstance(f, Entry))
-    position = {frame.name: frame.T_world_cam[:3, 3] for frame in known if np.isfinite(frame.T_world_cam).all()}
+    posed = (f for f in attach(images, trajectory, options or Options()) if isinstance(f, Entry))
+    position = {frame.name: frame.T_world_cam[:3, 3] for frame in posed if np.isfinite(frame.T_world_cam).all()}
     centres = {Path(i.name).stem: i.projection_center() for i in model.images.values()}
-    both = sorted(position.keys() & centres.keys())
-    pairs = (np.array([values[name] for name in both]).reshape(-1, 3) for values in (centres, position))
+    common = sorted(position.keys() & centres.keys())
+    pairs = (np.array([values[name] for name in common]).reshape(-1, 3) for values in (centres, position))
     metres, R, t, residual = similarity(*pairs)
     model.transform(pycolmap.Sim3d(metres, pycolmap.Rotation3d(R), t))
     return {"scale_from": "trajectory", "metres_per_unit": metres, "residual": residual}
 
 
 def landmarks(model: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Points [P, 3] of a model that several images see from different directions, and the standard deviations [P] of
-    their depths: sqrt(2) e z / (f sin(angle)), e the error of their pixels [px], z their depth, ``angle`` the largest
-    between two of their rays."""
+    """Points [P, 3] of a model that are seen from several directions, and the standard deviations [P] of their depths:
+    sqrt(2) e z / (f sin(angle)), with the error e of their pixels [px], their depth z and the largest angle between two
+    of their rays."""
     centres = {key: image.projection_center() for key, image in model.images.items()}
     focal = {key: model.cameras[image.camera_id].mean_focal_length() for key, image in model.images.items()}
     points, sigma = [], []
@@ -169,15 +173,15 @@ def gaps(keyframes: Sequence[str], model: Any) -> list[tuple[str, str]]:
     return [(run[0], run[-1]) for run in runs]
 
 
-# A known point is the nearest landmark in its image, at most this share of the image's width away.
+# Largest distance of a landmark from the pixel of an endpoint, as a share of the image's width.
 _NEAR = 0.02
-# Positions that lie farther from the fit than so many times the median are left out of a second one.
+# Positions farther from the first fit than this multiple of the median distance are excluded from the second one.
 _OUTLIER = 3.0
 
 
 def endpoint(model: Any, word: str) -> np.ndarray:
-    """[3] a point of a model (``pycolmap.Reconstruction``): the camera's place in an image, "NAME", or the landmark
-    next to a pixel of it, "NAME:U,V". Raises ValueError: no such image in the model, or no landmark near the pixel."""
+    """[3] a point of a model (``pycolmap.Reconstruction``): "NAME" is the camera's position at an image, "NAME:U,V" the
+    landmark nearest to its pixel. Raises ValueError: no such image in the model, or no landmark near the pixel."""
     name, _, pixel = word.partition(":")
     number = int(name) if name.isdecimal() else None  # images may be named by their number
     stems = [(Path(i.name).stem, i) for i in model.images.values()]
@@ -195,21 +199,21 @@ def endpoint(model: Any, word: str) -> np.ndarray:
         raise ValueError(f"--length: {word!r} must be NAME, or NAME:U,V with a pixel [px]") from None
     seen = [point for point in image.points2D if point.has_point3D()]
     # COLMAP's first pixel has its centre at (0.5, 0.5)
-    apart = np.array([np.hypot(point.xy[0] - 0.5 - u, point.xy[1] - 0.5 - v) for point in seen])
+    distances = np.array([np.hypot(point.xy[0] - 0.5 - u, point.xy[1] - 0.5 - v) for point in seen])
     reach = _NEAR * model.cameras[image.camera_id].width
-    if not len(apart) or apart.min() > reach:
-        nearest = f"the nearest is {apart.min():.0f} px away" if len(apart) else "it has none"
+    if not len(distances) or distances.min() > reach:
+        nearest = f"the nearest is {distances.min():.0f} px away" if len(distances) else "it has none"
         raise ValueError(f"--length: no landmark within {reach:.0f} px of {word}: {nearest}; choose a corner")
-    return np.array(model.points3D[seen[int(apart.argmin())].point3D_id].xyz)
+    return np.array(model.points3D[seen[int(distances.argmin())].point3D_id].xyz)
 
 
 def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, float]:
     """Scale s, rotation R [3, 3], translation t [3] that minimise sum |s R x + t - y|^2 over pairs of points x, y [N,
-    3] (Umeyama 1991), fitted again without those far off; and the root mean square of the rest's distances. Raises
-    ValueError: fewer than three points, or all at one place."""
-    kept = np.ones(len(source), bool)
+    3] (Umeyama 1991), fitted again without outliers; and the root mean square distance of the inliers. Raises
+    ValueError: fewer than three points, or all points are equal."""
+    inliers = np.ones(len(source), bool)
     for _ in range(2):
-        x, y = source[kept], target[kept]
+        x, y = source[inliers], target[inliers]
         if len(x) < 3:
             raise ValueError(f"--trajectory: {len(x)} keyframes have a pose there and in the model, 3 are needed")
         dx, dy = x - x.mean(0), y - y.mean(0)
@@ -222,5 +226,5 @@ def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarra
         s = float((singular * sign).sum() / variance)
         t = y.mean(0) - s * R @ x.mean(0)
         distance = np.linalg.norm(s * source @ R.T + t - target, axis=1)
-        kept = distance <= max(_OUTLIER * float(np.median(distance)), 1e-9)
-    return s, R, t, float(np.sqrt(np.square(distance[kept]).mean()))
+        inliers = distance <= max(_OUTLIER * float(np.median(distance)), 1e-9)
+    return s, R, t, float(np.sqrt(np.square(distance[inliers]).mean()))

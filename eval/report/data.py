@@ -31,14 +31,14 @@ class Results:
 
     out: Path
     about: Mapping[str, Any]  # eval.json
-    records: tuple[Record, ...]  # by data set, sequence and row (in the suite's order), whichever process wrote them
+    records: tuple[Record, ...]  # ordered by data set, sequence and row (in the suite's order)
     # ``SequenceMetrics.curves()`` and "nll_by_error:REFERENCE" over all pixels of a data set, by (dataset, row); only
-    # where the sums of all sequences exist.
+    # if the sums of all sequences exist.
     merged: Mapping[tuple[str, Row], Curves] = field(default_factory=dict)
     failed: tuple[Failed, ...] = ()
     missing: tuple[tuple[str, str, Row], ...] = ()  # (dataset, sequence, row) not evaluated yet
     efficiency: Mapping[str, Any] | None = None  # efficiency.json
-    notes: tuple[str, ...] = ()  # problems of the folder, a sentence each
+    notes: tuple[str, ...] = ()  # problems of the folder, one sentence each
 
     @property
     def suite(self) -> str:
@@ -58,21 +58,21 @@ class Results:
 
     @cached_property
     def bases(self) -> tuple[str, ...]:
-        """Bases (kinds of network) of the rows, in their order."""
+        """Bases (kinds of network) of the rows, in order."""
         return tuple(dict.fromkeys(row.method.base for row in self.rows))
 
     @cached_property
     def datasets(self) -> tuple[str, ...]:
-        """Names, sorted."""
+        """Names of the data sets, sorted."""
         return tuple(sorted({record.dataset for record in self.records}))
 
     def of(self, row: Row, dataset: str | None = None, sequence: str | None = None) -> tuple[Record, ...]:
-        """The records of a row, of one data set or sequence or (None) of all, by data set and sequence."""
+        """The records of a row, ordered by data set and sequence; of one data set or sequence, or (None) of all."""
         listed = self._by_row.get(row, ())
         return tuple(r for r in listed if dataset in (None, r.dataset) and sequence in (None, r.sequence))
 
     def default_rows(self, base: str | None = None) -> list[Row]:
-        """The first row of each method of a base (None: of all) that no ablation varies."""
+        """The first row of each method without ablated settings, of one base or (None) of all."""
         return [row for row in plain_rows(self.rows) if base in (None, row.method.base)]
 
     def sequences(self, dataset: str | None = None) -> tuple[tuple[str, str], ...]:
@@ -96,11 +96,11 @@ class Results:
 
 
 def load_results(out: Path, *, with_sums: bool = True) -> Results:
-    """Read the folder of an evaluation, finished or not; ``with_sums`` adds the sums of the sequences of each data set,
-    which figures need (some milliseconds a record).
+    """Read the folder of an evaluation, finished or not. ``with_sums`` adds the sums over the sequences of each data
+    set, which figures need (some milliseconds per record).
 
     Raises:
-        ResultsError: the folder is no evaluation, holds no record, or records that do not belong together.
+        ResultsError: the folder is no evaluation, has no record, or has inconsistent records.
         OSError: a file cannot be read.
     """
     about = _about(out)
@@ -139,7 +139,7 @@ def _about(out: Path) -> dict[str, Any]:
 
 
 def _read_json(path: Path) -> Any:
-    """The content of a JSON file, None where there is no file."""
+    """The content of a JSON file, None if it does not exist."""
     try:
         return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
     except (ValueError, RecursionError) as error:
@@ -147,7 +147,7 @@ def _read_json(path: Path) -> Any:
 
 
 def _check(out: Path, records: Sequence[Record]) -> None:
-    """Raise ResultsError where there is no record, or records of one base are of several networks."""
+    """Raises ResultsError: there is no record, or records of one base are of several networks."""
     if not records:
         raise ResultsError(f"{out} holds no finished sequence yet (no record under {out / 'records'})")
     first: dict[str, Record] = {}
@@ -165,7 +165,7 @@ def _check(out: Path, records: Sequence[Record]) -> None:
 
 
 def _merged(records: Sequence[Record]) -> tuple[dict[tuple[str, Row], Curves], list[str]]:
-    """Curves of each (dataset, row) from sums over its sequences; a note where a file is missing."""
+    """Curves of each (dataset, row) from sums over its sequences, and notes on missing files."""
     groups: dict[tuple[str, Row], list[Record]] = {}
     for record in records:
         groups.setdefault((record.dataset, record.row), []).append(record)
@@ -186,7 +186,7 @@ def _merged(records: Sequence[Record]) -> tuple[dict[tuple[str, Row], Curves], l
 
 
 def _added(total: Sums, sums: Sums) -> Sums:
-    """Sums of some sequences and one more. Raises RuntimeError: they are of other metrics."""
+    """The total plus the sums of another sequence. Raises RuntimeError: the sums are of other metrics."""
     added = dict(total)
     for name, states in sums.items():
         before = total.get(name, states)

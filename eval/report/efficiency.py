@@ -1,7 +1,7 @@
-"""The paper's table of efficiency: what uncertainty adds, in time, power, energy and memory; one per architecture.
+"""The paper's table of efficiency: the cost of uncertainty in time, power, energy and memory; one per architecture.
 
-A part that was not measured has words in its cell, never a number: "not measurable here" without a sensor, "not
-separable" where a network predicts depth and variance in one. A difference that the noise hides is an upper bound.
+The cell of a part that was not measured has words instead of a number: "not measurable here" without a sensor, "not
+separable" if a network predicts depth and variance together. A difference below the noise is an upper bound.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ _SMALLEST = 0.01  # less prints as "<0.01"
 
 
 def efficiency_tables(measured: Mapping[str, Any]) -> list[Table]:
-    """One table per architecture of ``efficiency.json``, then the paper's table 2 of those of its networks that are
-    among them, or of all of its."""
+    """One table per architecture of ``efficiency.json``, then the paper's table 2 of the same networks, or of all its
+    networks if none is the same."""
     tables = {row["network"]: run for run in architectures(measured) for row in run["rows"]}
     quoted = [table for table in paper_tables() if table.number == 2]
-    known = [table for table in quoted if any(table.network.lower() in label.lower() for label in tables)]
-    return [*(_table(run, label) for label, run in tables.items()), *map(_paper_table, known or quoted)]
+    measured_tables = [table for table in quoted if any(table.network.lower() in label.lower() for label in tables)]
+    return [*(_table(run, label) for label, run in tables.items()), *map(_paper_table, measured_tables or quoted)]
 
 
 def architectures(measured: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The measurements of ``efficiency.json``: one of the networks that were evaluated, and of further ones."""
+    """The measurements of ``efficiency.json``: of the evaluated networks, and of further architectures."""
     return [measured, *measured.get("further", ())]
 
 
@@ -58,7 +58,7 @@ def _table(run: Mapping[str, Any], label: str) -> Table:
 
 
 def _paper_table(quoted: PaperTable) -> Table:
-    """The paper's table 2 of one network, column below column of ours."""
+    """The paper's table 2 of one network, with our columns."""
     bases = list(dict.fromkeys(Method.parse(method).base for method in quoted.rows))
     lines = [
         (bases.index(Method.parse(method).base), method, [cells.get(column, Cell()) for column in quoted.columns])
@@ -90,7 +90,7 @@ def _cells(row: Mapping[str, Any], units: Mapping[str, str]) -> list[Cell]:
 
 
 def _counts(row: Mapping[str, Any], part: str) -> bool:
-    """Return whether a row has this part."""
+    """True if a row has this part."""
     return part in row["latency"] and "none" not in row["latency"][part]
 
 
@@ -115,20 +115,20 @@ def _unit_cells(row: Mapping[str, Any], parts: Sequence[str]) -> list[str]:
 
 
 def _sum(parts: Sequence[tuple[float, float, float]]) -> str:
-    """The sum of medians over parts, each with its quartiles; "<" the upper one where the lower one is not above 0."""
+    """The sum of medians over parts (median, q1, q3); for one part "<" and q3 if q1 is not positive."""
     if len(parts) == 1 and parts[0][1] <= 0:
         return f"<{_digits(max(parts[0][2], _SMALLEST))}"
     return _digits(sum(max(0.0, median) for median, _, _ in parts))
 
 
 def megabytes(size: float) -> str:
-    """Bytes as megabytes (10^6), as the paper prints them: 1245, 74.6, 0.03, <0.01."""
+    """Bytes as megabytes (10^6) in the paper's format: 1245, 74.6, 0.03, <0.01."""
     value = size / 1e6
     return _printed(value, 0 if value >= 1000 or value == 0 else 1 if value >= 1 else 2)
 
 
 def _percent(value: float) -> str:
-    """Format a percentage as the paper prints it: 90.0, 0.2, 0.03, <0.01."""
+    """A percentage in the paper's format: 90.0, 0.2, 0.03, <0.01."""
     return _printed(value, 1 if value >= 0.095 or value == 0 else 2)
 
 
@@ -137,7 +137,7 @@ def _printed(value: float, decimals: int) -> str:
 
 
 def _digits(value: float) -> str:
-    """A decimal below 10; times and energies are not known any better."""
+    """One decimal below 10, none above: the accuracy of times and energies."""
     return f"{value:.0f}" if abs(value) >= 10 else f"{value:.1f}"
 
 
@@ -149,12 +149,12 @@ def _notes(run: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], network: M
     ms = network["latency"][DEPTH]["median_ms"]
     notes = [f"Depth alone: {ms:.0f} ms on the {UNITS[units[DEPTH]]}, {size}{whole}."]
     if smoothing := max((row["memory"]["multiview"] or {}).get("smoothing_bytes", 0) for row in rows):
-        kept = f"{megabytes(smoothing)} MB, not counted above, as in the paper"
-        notes.append(f"UfM* keeps a map for smoothing besides: {kept}.")
+        smoothing_size = f"{megabytes(smoothing)} MB, not counted above, as in the paper"
+        notes.append(f"UfM* keeps a map for smoothing besides: {smoothing_size}.")
     used = {units[part] for row in rows for part in (NETWORK, MULTIVIEW) if _counts(row, part)}
     missing = {UNITS[unit]: why for unit, why in power["missing"].items() if unit in used}
     notes += [f"Power and energy of the {unit} are {NOT_MEASURABLE}: {why}." for unit, why in missing.items()]
     gpu = "" if run["machine"]["gpu"] is None else f", and {run['machine']['gpu']}"
-    place = f"{run['machine']['hardware']['cpu']}, {count(plan['threads'], 'thread')}{gpu}"
-    notes.append(f"Medians of {plan['frames']} frames of {run['sequence']['name']}; {place}.")
+    machine = f"{run['machine']['hardware']['cpu']}, {count(plan['threads'], 'thread')}{gpu}"
+    notes.append(f"Medians of {plan['frames']} frames of {run['sequence']['name']}; {machine}.")
     return [*notes, *(f"{method} is left out: {why}." for method, why in run["left_out"].items())]

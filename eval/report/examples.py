@@ -1,4 +1,4 @@
-"""The example frames that an evaluation keeps: image, ground truth, and the maps of every row."""
+"""The example frames of an evaluation: image, ground truth, and the maps of every row."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ufmstar_torch.eval.run.colours import known_where, striped
 
 Map = NDArray[np.float32]
 _SCENE = ("image", "truth", "K")
-# The network's own A, the spread of members or samples E, and the disagreement between the views M.
+# The network's A, the spread of members or samples E, and the disagreement between the views M.
 PARTS = ("aleatoric", "epistemic", "disagreement")
 
 
@@ -30,7 +30,7 @@ class RowMaps:
         sigma: standard deviation [m].
         nll: (g - d)^2 / (2 v) + 0.5 ln(2 pi v) [nats], NaN also where v = 0; float64.
         roots: square roots of the parts of the variance that the row has, by their names in ``PARTS`` [m].
-        unmeasured: bool, True where M rests on one view; None where the row has no M.
+        unmeasured: bool, True where M has one view only; None if the row has no M.
     """
 
     depth: Map
@@ -42,14 +42,14 @@ class RowMaps:
 
     @classmethod
     def of(cls, stored: Mapping[str, NDArray], truth: Map) -> RowMaps:
-        """The maps from those of ``suite.examples`` and the ground truth [h, w] [m], 0 or NaN = none."""
+        """The maps from stored ones (``suite.examples``) and the ground truth [h, w] [m], 0 or NaN = none."""
         depth, variance = stored["depth"], stored["variance"]
         with np.errstate(invalid="ignore"):
             valid = np.isfinite(depth) & (depth > 0) & np.isfinite(variance) & (variance >= 0)
-            known = valid & (truth > 0) & np.isfinite(truth)
-            v = np.where(known & (variance > 0), variance, np.nan).astype(np.float64)
-            error = known_where(known, np.abs(depth - truth))
-        exact = np.where(known, depth, 0).astype(np.float64) - np.where(known, truth, 0)
+            judged = valid & (truth > 0) & np.isfinite(truth)
+            v = np.where(judged & (variance > 0), variance, np.nan).astype(np.float64)
+            error = known_where(judged, np.abs(depth - truth))
+        exact = np.where(judged, depth, 0).astype(np.float64) - np.where(judged, truth, 0)
         return cls(
             depth=known_where(valid, depth),
             error=error,
@@ -61,7 +61,7 @@ class RowMaps:
 
     @property
     def mean_nll(self) -> float | None:
-        """The mean NLL [nats]; None without a pixel that has one."""
+        """The mean NLL [nats]; None if no pixel has an NLL."""
         judged = self.nll[np.isfinite(self.nll)]
         return float(judged.mean()) if judged.size else None
 
@@ -82,10 +82,10 @@ class Example:
 
     Attributes:
         image: [H, W, 3] uint8.
-        truth: [h, w] ground truth [m], NaN where there is none.
-        aspect: height by width of what the maps show: networks that take squares squeeze wide images.
+        truth: [h, w] ground truth [m], NaN = none.
+        aspect: height by width of the maps' field of view; networks with square inputs squeeze wide images.
         rows: maps by the row's file name.
-        labels: rows' names for people, by file name.
+        labels: displayed names of rows, by file name.
     """
 
     dataset: str
@@ -106,12 +106,12 @@ class Example:
 def find_examples(folder: Path, dataset: str, sequence: str, labels: Mapping[str, str]) -> list[Example]:
     """The examples of one sequence, ``OUT/records/DATASET/SEQUENCE``, in the order of their frames.
 
-    Rows whose maps show the frame with another camera (a network of another size) make an example of their own. Rows
-    without a variance and frames without any row are left out. Raises ValueError: a file cannot be read or its maps do
-    not fit; the message names it.
+    Rows whose maps have another camera (a network of another size) are a separate example. Rows without a variance and
+    frames without rows are omitted. Raises ValueError: a file cannot be read or its maps do not fit; the message names
+    the file.
     """
     stems = {file.stem: file for file in sorted((folder / "examples").glob("*.npz"))}
-    # A frame's name may hold an "@", as a setting's does: a row's file is one whose frame has a file of its own.
+    # Names of frames and settings may contain "@": a file is a row's if the part before an "@" is a frame's file.
     rows: dict[str, dict[str, Path]] = {}
     for stem, file in stems.items():
         cuts = [at for at, letter in enumerate(stem) if letter == "@" and stem[:at] in stems]
@@ -125,7 +125,7 @@ def find_examples(folder: Path, dataset: str, sequence: str, labels: Mapping[str
 
 
 def load_arrays(file: Path, names: Sequence[str]) -> dict[str, NDArray]:
-    """The arrays of an npz file. Raises ValueError: it is none, or broken, or one of ``names`` is missing."""
+    """The arrays of an npz file. Raises ValueError: the file is no npz or damaged, or one of ``names`` is missing."""
     arrays = read_npz_whole(file)
     missing = [name for name in names if name not in arrays]
     if missing:
@@ -136,7 +136,7 @@ def load_arrays(file: Path, names: Sequence[str]) -> dict[str, NDArray]:
 def _cameras(
     file: Path, row_files: Mapping[str, Path]
 ) -> Iterable[tuple[tuple[NDArray, Map, float], dict[str, RowMaps]]]:
-    """Image, truth and aspect of each camera that the rows of a frame have, and the rows' maps."""
+    """Image, truth and aspect of each camera of a frame's rows, and the rows' maps."""
     common = load_arrays(file, _SCENE)
     cameras: dict[tuple[bytes, tuple[int, ...]], tuple[tuple[NDArray, Map, float], dict[str, RowMaps]]] = {}
     for row, row_file in row_files.items():

@@ -1,4 +1,4 @@
-"""The paper's figure of where the time of UfM* goes."""
+"""The paper's figure of the time of UfM*'s stages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.efficiency import architectures
 from ufmstar_torch.eval.run.colours import INK, plain
 
-# The stages of a step of UfM*, from dark to light, as a print in grey needs it.
+# The stages of a step of UfM*, from dark to light, for prints in grey.
 STAGES = {
     "check": "#4d4d4d", "segment": "#0072B2", "correspond": "#009E73", "fuse": "#D55E00", "append": "#CC79A7",
     "regress": "#E69F00", "average": "#56B4E9",
@@ -18,8 +18,8 @@ STAGES = {
 
 
 def draw_stages(results: Results) -> Any | None:
-    """Shares of the stages in a step of UfM*, the paper's figure, with their numbers where there is room and the sum
-    behind; None unless ``efficiency.json`` has it."""
+    """The paper's figure of the stages' shares in a step of UfM*, with numbers in wide bars and the sum at the right;
+    None unless ``efficiency.json`` has stages."""
     measured = [] if results.efficiency is None else architectures(results.efficiency)
     staged = [row for run in measured for row in run["rows"] if row.get("stages")]
     if not staged:

@@ -18,18 +18,18 @@ from ufmstar_torch.eval.report import style
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import value_of
 from ufmstar_torch.eval.report.names import count
-from ufmstar_torch.eval.report.style import Look
+from ufmstar_torch.eval.report.style import LineStyle
 from ufmstar_torch.eval.run.colours import FAINT, INK
 from ufmstar_torch.eval.suite.record import Record
 
 Curves = Mapping[str, Sequence[float]]
 PER_LINE, MOST_SEQUENCES = 4, 12
-# Words at the axes of the two diagrams of calibration.
+# Axis labels of the two calibration diagrams.
 DELTA, QUANTILE = ("predicted share within 25 %", "true share"), ("predicted quantile", "share of truth below")
-# The looks of methods that are known by name alone, as the demo's.
+# Colours and markers, in order, for methods without a ``Method``.
 _BY_ORDER = (("#6b6b6b", "^"), ("#E69F00", "s"), ("#0072B2", "o"), ("#009E73", "D"), ("#CC79A7", "v"), ("#D55E00", "P"))
-# The paper's groups of its figure of entropy, by the beginnings of words in the names of data sets and sequences
-# (TartanAir's environments, say); other data sets are groups of their own.
+# The groups of the paper's figure of entropy, by the first letters of words in the names of data sets and sequences, as
+# TartanAir's environments. Every other data set is a group.
 ENVIRONMENTS = {
     "indoor": ("indoor", "scannet", "7scenes", "scenes", "tum", "nyu", "tour", "office", "hospital"),
     "forest": ("forest", "seasonsforest", "gascola"),
@@ -42,7 +42,7 @@ ENVIRONMENTS = {
 
 
 def draw_calibration(results: Results, dataset: str) -> Any | None:
-    """Both curves over all pixels of a data set, a column per network; None where no row has a variance."""
+    """Both curves over all pixels of a data set, one column per network; None if no row has a variance."""
     panels: dict[str, dict[Row, Curves]] = {}
     for row in results.default_rows():
         if _has_curves(values := results.merged.get((dataset, row), {})):
@@ -52,15 +52,15 @@ def draw_calibration(results: Results, dataset: str) -> Any | None:
 
 
 def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any | None:
-    """Both curves of at most ``MOST_SEQUENCES`` sequences, evenly from the one on which UfM* (or the last row) has the
-    smallest ECE_delta to that on which it has the largest."""
-    of = {row: [r for r in results.of(row, dataset) if _has_curves(r.curves)] for row in results.default_rows(base)}
-    rows = [row for row, records in of.items() if records]
-    ordered = sorted(of[_ours(rows)] if rows else [], key=lambda r: (value_of(r, "ece_delta"), r.sequence))
+    """Both curves of at most ``MOST_SEQUENCES`` sequences, evenly spaced in the order of the ECE_delta of UfM* (or of
+    the last row), the smallest and the largest included."""
+    by_row = {row: [r for r in results.of(row, dataset) if _has_curves(r.curves)] for row in results.default_rows(base)}
+    rows = [row for row, records in by_row.items() if records]
+    ordered = sorted(by_row[_ours(rows)] if rows else [], key=lambda r: (value_of(r, "ece_delta"), r.sequence))
     chosen = np.linspace(0, len(ordered) - 1, min(len(ordered), MOST_SEQUENCES)).round().astype(int)
     panels = []
     for name in (ordered[i].sequence for i in chosen):
-        shown = {row: record for row in rows for record in of[row] if record.sequence == name}
+        shown = {row: record for row in rows for record in by_row[row] if record.sequence == name}
         titles = (f"{name}\n{_errors(shown, 'ece_delta', 'δ')}", _errors(shown, "ece_q", "q"))
         panels.append((titles, {row: record.curves for row, record in shown.items()}))
     title = f"Calibration on single sequences of {dataset}, {BASES[base][0]}\nerrors alone → UfM*, from best to worst"
@@ -80,24 +80,24 @@ def _errors(records: Mapping[Row, Record], key: str, letter: str) -> str:
 
 
 def _has_curves(curves: Mapping[str, Any]) -> bool:
-    """Return whether a variance was judged on at least one pixel (a curve without one is NaN, None in a record)."""
+    """True if at least one pixel had a variance and ground truth (else the curve is NaN, None in a record)."""
     levels = curves.get("ece_q_observed") or ()
     return len(levels) > 0 and all(value is not None and value == value for value in levels)
 
 
 def _draw_columns(title: str, panels: Sequence[tuple[tuple[str, str], Mapping[Row, Curves]]]) -> Any | None:
     """Delta calibration above quantile calibration in each column, ``PER_LINE`` columns side by side. ``panels`` has
-    the titles of both, and curves by row, of which UfM* is drawn last and so on top."""
+    the titles of both, and curves by row; UfM* is drawn last, on top."""
     if not panels:
         return None
     columns = min(len(panels), PER_LINE)
     lines = -(-len(panels) // columns)
-    # A column alone needs room for the title and the names below.
+    # A single column needs width for the title and the legend.
     figure = style.new_figure(max(5.0, 0.4 + 2.6 * columns), 0.7 + 5.2 * lines, title)
     axes = style.hidden_panels(figure, 2 * lines, columns)
     for n, (titles, curves) in enumerate(panels):
         rows = sorted(curves, key=lambda row: (row.method.fusion == UFM_STAR, row.method.full))
-        drawn = {style.look_of(row.method): curves[row] for row in rows}
+        drawn = {style.line_style(row.method): curves[row] for row in rows}
         for below, words in enumerate((DELTA, QUANTILE)):
             panel = axes[2 * (n // columns) + below, n % columns]
             _draw_shares(panel, words, drawn, titles[below], named=n % columns == 0)
@@ -106,43 +106,43 @@ def _draw_columns(title: str, panels: Sequence[tuple[tuple[str, str], Mapping[Ro
 
 
 def _draw_shares(
-    axes: Any, words: tuple[str, str], lines: Mapping[Look, Curves], title: str, *, named: bool = True
+    axes: Any, words: tuple[str, str], lines: Mapping[LineStyle, Curves], title: str, *, named: bool = True
 ) -> None:
-    """Confidence that the depth is within 25 %, and how often it is (``DELTA``), or predicted quantiles and the share
-    of the truth below them (``QUANTILE``), in the unit square with its diagonal."""
+    """Draw confidence that the depth is within 25 % against its frequency (``DELTA``), or predicted quantiles against
+    the share of truth below them (``QUANTILE``), in the unit square with its diagonal."""
     axes.set_visible(True)
     axes.plot([0, 1], [0, 1], linestyle="--", linewidth=1.0, color=FAINT, label="exactly right")
-    for look, values in lines.items():
+    for line_style, values in lines.items():
         x, y = (np.array(values[f"ece_q_{name}"], float) for name in ("levels", "observed"))
         if words is DELTA:
             names = ("confidence", "accuracy", "pixels")
             x, y, pixels = (np.array(values[f"ece_delta_{name}"], float) for name in names)
-            kept = pixels > 0.001 * pixels.sum()  # bins that have more than hardly a pixel
-            x, y = x[kept], y[kept]
-        axes.plot(x, y, clip_on=False, **look.line)
+            filled = pixels > 0.001 * pixels.sum()  # bins with more than 0.1 % of the pixels
+            x, y = x[filled], y[filled]
+        axes.plot(x, y, clip_on=False, **line_style.line)
     axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", xticks=[0, 0.5, 1], yticks=[0, 0.5, 1])
     style.finish(axes, title=title, x=words[0], y=words[1] if named else "")
 
 
 def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -> None:
-    """Draw delta calibration, quantile calibration and sparsification (``SequenceMetrics.curves()`` by the name that
-    the legend shows) side by side, and write the picture (PNG). Raises ValueError: there are no curves, or more than
-    have a look of their own."""
+    """Draw delta calibration, quantile calibration and sparsification (``SequenceMetrics.curves()`` by the name in the
+    legend) side by side, and write the picture (PNG). Raises ValueError: there are no curves, or more than line
+    styles."""
     if not 1 <= len(curves) <= len(_BY_ORDER):
         raise ValueError(f"curves must hold 1 to {len(_BY_ORDER)} methods, got {len(curves)}")
     figure = style.new_figure(12.6, 4.6, title)
     delta, quantiles, sparse = figure.subplots(1, 3)
-    lines = {Look(name, *look): curves[name] for name, look in zip(curves, _BY_ORDER, strict=False)}
+    lines = {LineStyle(name, *line_style): curves[name] for name, line_style in zip(curves, _BY_ORDER, strict=False)}
     _draw_shares(delta, DELTA, lines, "δ calibration")
     _draw_shares(quantiles, QUANTILE, lines, "quantile calibration")
-    for look, values in lines.items():
+    for line_style, values in lines.items():
         x = np.arange(len(values["sparsification_rmse"])) / len(values["sparsification_rmse"])
-        sparse.plot(x, values["sparsification_rmse"], markevery=10, **look.line)
-        sparse.plot(x, values["sparsification_oracle_rmse"], linewidth=1.0, linestyle=":", color=look.colour)
+        sparse.plot(x, values["sparsification_rmse"], markevery=10, **line_style.line)
+        sparse.plot(x, values["sparsification_oracle_rmse"], linewidth=1.0, linestyle=":", color=line_style.colour)
     sparse.set_xlim(0, 1)
     sparse.set_ylim(bottom=0)
-    title, x_words = "sparsification (dotted: best possible)", "share of pixels left out, largest σ first"
-    style.finish(sparse, title=title, x=x_words, y="RMSE [m]")
+    title, x_label = "sparsification (dotted: best possible)", "share of pixels left out, largest σ first"
+    style.finish(sparse, title=title, x=x_label, y="RMSE [m]")
     style.legend_below(figure)
     style.save_figure(figure, path)
 
@@ -152,7 +152,7 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
 
 def draw_error(results: Results, dataset: str) -> Any | None:
     """The mean NLL of each tenth of the pixels, from a row's smallest errors to its largest: a line of panels per
-    network, a panel per reference (its confident pixels of each frame); None where no row was judged so."""
+    network, a panel per reference (its confident pixels of each frame); None if no row has these curves."""
     panels = {base: of_base for base in results.bases if (of_base := _error_curves(results, dataset, base))}
     if not panels:
         return None
@@ -164,10 +164,10 @@ def draw_error(results: Results, dataset: str) -> Any | None:
             panel.set_visible(True)
             for row, values in sorted(curves.items(), key=lambda item: item[0].method.fusion == UFM_STAR):
                 x = (np.arange(len(values)) + 0.5) * 100 / len(values)
-                panel.plot(x, np.array(values, float), **style.look_of(row.method).line)
+                panel.plot(x, np.array(values, float), **style.line_style(row.method).line)
             panel.set(xlim=(0, 100), xticks=[0, 25, 50, 75, 100])
             method = Method.parse(reference)
-            judge = "it" if method.fusion == ALONE else style.look_of(method).name
+            judge = "it" if method.fusion == ALONE else style.line_style(method).name
             title = f"{BASES[base][0]}: where {judge} is confident in each frame"
             style.finish(panel, title=title, x="percentile of the row's error", y="mean NLL [nats]")
             style.name_lines(panel)
@@ -229,7 +229,7 @@ def _histogram(records: Sequence[Record]) -> Histogram:
 
 def draw_entropy(results: Results, base: str) -> Any | None:
     """Environments (indoor, forest, driving, city) below each other on one axis, the mean of each row as a dashed line
-    with its name beside; None where no row of the base has a variance."""
+    with its name at the right; None if no row of the base has a variance."""
     panels = entropies(results, base)
     if not panels:
         return None
@@ -237,15 +237,15 @@ def draw_entropy(results: Results, base: str) -> Any | None:
     axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True)[:, 0]
     for panel, (environment, rows) in zip(axes, panels.items(), strict=True):
         for number, (row, histogram) in enumerate(rows.items()):
-            look, density, edges = style.look_of(row.method), histogram.density, histogram.edges
-            panel.stairs(density, edges, color=look.colour, linewidth=1.5, label=look.name)
+            line_style, density, edges = style.line_style(row.method), histogram.density, histogram.edges
+            panel.stairs(density, edges, color=line_style.colour, linewidth=1.5, label=line_style.name)
             if row.method.fusion == UFM_STAR and not row.method.full:
-                panel.stairs(density, edges, color=look.colour, alpha=0.15, fill=True)
-            panel.axvline(histogram.mean, color=look.colour, linestyle="--", linewidth=1.1)
-            below = histogram.counts[0] / histogram.counts.sum()  # of V = 0 above all
+                panel.stairs(density, edges, color=line_style.colour, alpha=0.15, fill=True)
+            panel.axvline(histogram.mean, color=line_style.colour, linestyle="--", linewidth=1.1)
+            below = histogram.counts[0] / histogram.counts.sum()  # mostly V = 0
             remark = "" if below < 0.005 else f"\n({100 * below:.0f} % with hardly any V)"
-            how = {"color": look.colour, "size": style.TICK, "va": "top", "transform": panel.transAxes}
-            panel.text(1.02, 0.95 - 0.13 * number, f"{look.name}: mean {histogram.mean:.2f}{remark}", **how)
+            how = {"color": line_style.colour, "size": style.TICK, "va": "top", "transform": panel.transAxes}
+            panel.text(1.02, 0.95 - 0.13 * number, f"{line_style.name}: mean {histogram.mean:.2f}{remark}", **how)
         panel.set_ylim(bottom=0)
         style.finish(panel, title=environment, y="share of pixels per nat")
     axes[0].set_xlim(*_entropy_range([histogram for rows in panels.values() for histogram in rows.values()]))
@@ -254,7 +254,7 @@ def draw_entropy(results: Results, base: str) -> Any | None:
 
 
 def _entropy_range(histograms: Sequence[Histogram]) -> tuple[float, float]:
-    """From the first to the last bin with more than 0.1 % of some row's pixels, and half a nat around."""
+    """From the first to the last bin with more than 0.1 % of a row's pixels, plus half a nat on each side."""
     edges = histograms[0].edges
     shares = np.array([histogram.counts / histogram.counts.sum() for histogram in histograms])
     filled = np.flatnonzero(shares[:, 1:-1].max(0) > 0.001)

@@ -1,4 +1,4 @@
-"""Means and paired differences over sequences, with 95 % confidence intervals where there are enough sequences."""
+"""Means and paired differences over sequences, with 95 % confidence intervals if there are enough sequences."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.names import Quantity
 from ufmstar_torch.eval.suite.record import Record
 
-# Student's interval of fewer values rests on a normal distribution, which nobody checked: no interval is given.
+# Smallest number of sequences for an interval: with fewer values, Student's interval depends on normality.
 MIN_SEQUENCES = 5
 
 
@@ -21,11 +21,11 @@ class Mean(NamedTuple):
 
     value: float = math.nan  # without a sequence
     half: float = math.nan  # half-width of its 95 % confidence interval, NaN below MIN_SEQUENCES
-    sequences: int = 0  # that have the figure
+    sequences: int = 0  # number of sequences with the figure
 
 
 def value_of(record: Record, key: str) -> float:
-    """A figure of a record by ``Quantity.key``, frames without a segment or match as a share; NaN where it has none."""
+    """A figure of a record by ``Quantity.key``, frames without a segment or match as a share; NaN if it is missing."""
     value = record.values.get(key)
     if value is None:
         return math.nan
@@ -34,12 +34,12 @@ def value_of(record: Record, key: str) -> float:
 
 
 def mean_over(values: Iterable[float]) -> Mean:
-    """The mean over sequences; NaN (no such figure) is left out."""
+    """The mean over sequences; NaN (no such figure) is ignored."""
     from ufmstar_torch.eval.metrics import mean_and_ci
 
-    known = [value for value in values if not math.isnan(value)]
-    mean, half = mean_and_ci(known)
-    return Mean(mean, half if len(known) >= MIN_SEQUENCES else math.nan, len(known))
+    finite = [value for value in values if not math.isnan(value)]
+    mean, half = mean_and_ci(finite)
+    return Mean(mean, half if len(finite) >= MIN_SEQUENCES else math.nan, len(finite))
 
 
 def mean_of(records: Iterable[Record], quantity: Quantity) -> Mean:
@@ -48,12 +48,12 @@ def mean_of(records: Iterable[Record], quantity: Quantity) -> Mean:
 
 
 def difference(records: Iterable[Record], reference: Iterable[Record], quantity: Quantity) -> Mean:
-    """Mean of (row - reference) over the sequences that both have.
+    """Mean of (row - reference) over common sequences.
 
-    Sequences differ far more than methods do, and that part cancels in each difference.
+    Sequences differ far more than methods; this part cancels in each difference.
     """
-    theirs = _by_sequence(reference, quantity)
-    return mean_over(v - theirs[where] for where, v in _by_sequence(records, quantity).items() if where in theirs)
+    baseline = _by_sequence(reference, quantity)
+    return mean_over(v - baseline[key] for key, v in _by_sequence(records, quantity).items() if key in baseline)
 
 
 def _by_sequence(records: Iterable[Record], quantity: Quantity) -> dict[tuple[str, str], float]:
@@ -61,10 +61,10 @@ def _by_sequence(records: Iterable[Record], quantity: Quantity) -> dict[tuple[st
     for record in records:
         value = quantity.factor * value_of(record, quantity.key)
         by_sequence.setdefault((record.dataset, record.sequence), []).append(value)
-    return {where: math.fsum(values) / len(values) for where, values in by_sequence.items()}
+    return {key: math.fsum(values) / len(values) for key, values in by_sequence.items()}
 
 
 def reference_row(results: Results, base: str) -> Row | None:
-    """The row with which the others of a base are compared: UfM*, if it is there."""
+    """The row with which the others of a base are compared: UfM*, or None without it."""
     rows = (row for row in results.default_rows(base) if row.method.fusion == UFM_STAR)
     return next((row for row in rows if not (row.method.full or row.method.fixed_param)), None)

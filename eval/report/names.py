@@ -1,4 +1,4 @@
-"""Names and units of figures and settings in tables and figures, and which direction is better."""
+"""Names, units and better direction of quantities, and names of settings, in tables and figures."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from typing import Any
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import PAPER
 
-LOWER, HIGHER = "↓", "↑"  # is better
+LOWER, HIGHER = "↓", "↑"  # the better direction
 
 
 @dataclass(frozen=True)
 class Quantity:
     """A figure, its name and unit in tables and figures."""
 
-    key: str  # of Record.figures, or "state.bytes_mean", "ms.network", "frames.done" for the others
+    key: str  # of ``Record.values``: a figure, or "state.bytes_mean", "ms.network", "frames.done"
     name: str
     decimals: int | None  # None = three significant digits
-    better: str = ""  # "↓", "↑", or "" where neither is
+    better: str = ""  # "↓", "↑", or "" for neither
     unit: str = ""
-    factor: float = 1.0  # by which the recorded value is multiplied to have that unit
+    factor: float = 1.0  # from the recorded value to ``unit``
 
     @property
     def label(self) -> str:
@@ -30,7 +30,7 @@ class Quantity:
 
     @property
     def heading(self) -> str:
-        """The label with an arrow the better way: "RMSE [m] ↓"."""
+        """The label with an arrow in the better direction: "RMSE [m] ↓"."""
         return f"{self.label} {self.better}".strip()
 
 
@@ -40,11 +40,11 @@ ECE_Q = Quantity("ece_q", "ECE_q", 3, LOWER)
 SPEARMAN = Quantity("spearman", "Spearman", 2, HIGHER)
 AUSE = Quantity("ause_rmse", "AUSE", 3, LOWER, "m")
 
-# The cost of uncertainty, where it was measured.
+# The cost of uncertainty, if it was measured.
 ENERGY = Quantity("energy_mj", "energy", None, LOWER, "mJ")
 MEMORY = Quantity("memory_mb", "memory", None, LOWER, "MB")
 
-# The paper's columns, and those that the field expects beside them.
+# The paper's columns, and further columns that are usual in the field.
 _STATE = Quantity("state.bytes_mean", "state", None, "", "MB", 1e-6)
 MAIN = (Quantity("delta1", "δ₁", 3, HIGHER), NLL, ECE_DELTA, ECE_Q, _STATE)
 EXTRA = (
@@ -58,24 +58,24 @@ EXTRA = (
     Quantity("entropy", "entropy", 2, "", "nats"),
     Quantity("left_out_share", "no depth", 1, "", "%", 100.0),
     Quantity("nll_left_out_share", "no NLL", 1, "", "%", 100.0),
-    # Of UfM*'s frames, those without a segment, and those after the first without a segment that met a component.
+    # Shares of UfM*'s frames: without a segment, and (after the first) without a match of a segment with a component.
     Quantity("frames.without_segment", "no segment", 1, "", "%", 100.0),
     Quantity("frames.without_match", "no match", 1, "", "%", 100.0),
     Quantity("ms.network", "network", 1, "", "ms"),
     Quantity("ms.uncertainty", "uncertainty", 1, "", "ms"),
 )
-# The posterior as the mixture that it states; in the table where a row has one.
+# The posterior as a mixture; in the table if a row has a posterior.
 MIXTURE = (
     Quantity("mixture_nll", "mixture: NLL", 2, LOWER),
     Quantity("mixture_ece_delta", "mixture: ECE_δ", 3, LOWER),
     Quantity("mixture_ece_q", "mixture: ECE_q", 3, LOWER),
     Quantity("mixture_coverage", "mixture: within 3 σ", 1, "", "%", 100.0),
 )
-OWN = "own."  # before the figures of a user's metrics
-# Figures of which differences between rows are shown.
+OWN = "own."  # prefix of the figures of a user's metrics
+# Figures with a table of differences between rows.
 DIFFERENCES = (NLL, ECE_DELTA, ECE_Q, AUSE, SPEARMAN)
 
-# Settings for people, with the unit of their values.
+# Displayed names of settings, and units of their values.
 SETTINGS = {
     "rotation_noise": ("rotation noise", "°"),
     "translation_noise": ("translation noise", "m"),
@@ -110,7 +110,7 @@ SETTINGS = {
 }
 
 
-# Settings that a word names, without their own name.
+# Settings that are displayed as one text, without their name.
 _WORDS = {
     ("ufm_preset", "paper"): "paper's settings",
     ("preprocess", "resize"): "whole frame",
@@ -118,22 +118,22 @@ _WORDS = {
     ("aleatoric_in_h", True): "A in H",
     ("posterior", True): "posterior",
 }
-# Values in words.
+# Displayed values.
 _VALUES = {"corners": "tracked corners", "dense": "dense evidence", "truth": "ground truth"}
 
 
 def own_quantities(figures: Iterable[str]) -> list[Quantity]:
-    """The columns of a user's metrics among the names of figures, each once."""
+    """The columns of a user's metrics among the names of figures, without duplicates."""
     return [Quantity(key, key.removeprefix(OWN), 3) for key in dict.fromkeys(figures) if key.startswith(OWN)]
 
 
 def setting_name(name: str) -> str:
-    """A setting's name for people; the config's own where it has none."""
+    """A setting's displayed name; by default the config field's."""
     return SETTINGS[name][0] if name in SETTINGS else name.rpartition(".")[2].replace("_", " ")
 
 
 def setting_label(values: Mapping[str, Any]) -> str:
-    """A setting for people, "" for the default: "rotation noise 2°, images skipped 4"."""
+    """The displayed text of a setting, "" for the default: "rotation noise 2°, images skipped 4"."""
     shown = {name: value for name, value in values.items() if name != "seed" or value}
     return ", ".join(
         _WORDS.get((name, value)) or f"{setting_name(name)} {_with_unit(name, value)}" for name, value in shown.items()
@@ -150,8 +150,8 @@ def _with_unit(name: str, value: Any) -> str:
 
 
 def row_labels(rows: Iterable[Row]) -> dict[Row, str]:
-    """The labels of a table's rows: without the preprocessing that all of them share (:func:`shared_words`), and with
-    "our defaults" where the same method stands there with the paper's settings as well."""
+    """The labels of a table's rows: without a preprocessing shared by all rows (:func:`shared_words`), and with "our
+    defaults" if the same method also has a row with the paper's settings."""
     listed = list(rows)
     shared = {"preprocess"} if len({row.setting.preprocess for row in listed}) == 1 else set()
     papers = {row.method for row in listed if row.setting.ufm_preset == PAPER}
@@ -164,7 +164,7 @@ def row_labels(rows: Iterable[Row]) -> dict[Row, str]:
 
 
 def shared_words(rows: Iterable[Row]) -> str:
-    """The preparation of images that all rows share, "" where their networks' weights decide or rows differ."""
+    """The preprocessing shared by all rows, "" if the networks' weights define it or rows differ."""
     prepared = {row.setting.preprocess for row in rows}
     return _WORDS.get(("preprocess", prepared.pop()), "") if len(prepared) == 1 else ""
 

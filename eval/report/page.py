@@ -1,4 +1,4 @@
-"""``report.html``: the whole evaluation in one file that needs nothing else. ``templates/`` has its markup."""
+"""``report.html``: the whole evaluation in one self-contained file. ``templates/`` has its markup."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from ufmstar_torch.eval.run.files import write_atomic
 
 PAGE = "report.html"
 TEMPLATES = Path(__file__).parent / "templates"
-# WebP's; with less, letters in pictures get visible rings.
+# Quality of WebP; below it, text in pictures has visible rings.
 QUALITY = 84
-# Kinds of figures, the first words of their files' names, by the part of the page in which they stand.
+# Kinds of figures (the first words of their files' names) in each section of the page.
 CURVES, COST = ("calibration", "error", "entropy", "sweep"), ("latency",)
 
 
@@ -35,7 +35,7 @@ def write_page(
     undrawn: Mapping[str, str],
 ) -> Path:
     """Write the report into the folder of the evaluation: tables (of ``tables.all_tables``), figures (SVG, whose names
-    begin with their kind), pictures with their words, and what is missing; its path.
+    begin with their kind), pictures with their captions, and a list of what is missing. Returns its path.
 
     Raises:
         ValueError: a picture cannot be read.
@@ -69,7 +69,7 @@ def _template() -> Any:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
-    # Every template is HTML whatever its file is called: select_autoescape would leave out ".j2".
+    # All templates are HTML: select_autoescape would ignore ".j2".
     how: dict[str, Any] = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=FileSystemLoader(TEMPLATES), **how)
     environment.filters["typeset"] = lambda text: Markup(typeset(text))
@@ -79,19 +79,19 @@ def _template() -> Any:
 
 
 def typeset(text: str) -> str:
-    """Text as HTML, with a minus for a hyphen before a number, and narrow blanks where a line must not break."""
+    """Text as HTML, with a minus for a hyphen before a number, and narrow no-break spaces around units and ±."""
     text = re.sub(r"(?<![\w.–-])-(?=\d)", "−", escape(text))
     return text.replace(" ± ", "\u202f±\u202f").replace(" %", "\u202f%")
 
 
 def _figures(paths: Sequence[Path], kinds: Sequence[str]) -> list[tuple[str, str, bool]]:
-    """Words, a data URI, and whether it is of single sequences, which are folded, of the figures of some kinds."""
+    """Caption, data URI, and True for single sequences (which are collapsed), of the figures of some kinds."""
     chosen = (path for kind in kinds for path in paths if path.stem.startswith(kind))
     return [(re.sub("[_-]", " ", path.stem), _embedded(path), "-sequences-" in path.stem) for path in chosen]
 
 
 def _embedded(path: Path) -> str:
-    """A data URI; a PNG becomes WebP, which is a fifth of it."""
+    """A data URI of a file; a PNG becomes WebP, which is a fifth of its size."""
     kind, content = "svg+xml", path.read_bytes()
     if path.suffix == ".png":
         from PIL import Image
@@ -104,9 +104,9 @@ def _embedded(path: Path) -> str:
 
 
 def limits(results: Results, undrawn: Mapping[str, str]) -> list[tuple[str, tuple[str, ...], list[tuple[str, ...]]]]:
-    """(title, headings, rows) of all that is missing: sequences, rows, frames, networks and figures."""
+    """(title, headings, rows) of missing sequences, rows, frames, networks and figures."""
     missing = Counter((dataset, sequence) for dataset, sequence, _ in results.missing)
-    # Rows on the same frames skip the same ones: one line for each sequence and selection of frames.
+    # Rows with the same selection of frames skip the same frames: one line per sequence and selection.
     skipped: dict[tuple[str, ...], None] = {}
     for record in results.records:
         frames = record.frames
@@ -118,8 +118,8 @@ def limits(results: Results, undrawn: Mapping[str, str]) -> list[tuple[str, tupl
     idle = []
     for row, label in row_labels(results.rows).items():
         for dataset in results.datasets:
-            of = [record.frames for record in results.of(row, dataset)]
-            counted = [sum(f.get(key, 0) for f in of) for key in ("done", "without_segment", "without_match")]
+            frame_counts = [record.frames for record in results.of(row, dataset)]
+            counted = [sum(f.get(key, 0) for f in frame_counts) for key in ("done", "without_segment", "without_match")]
             if any(counted[1:]):
                 idle.append((dataset, label, *map(str, counted)))
     where, uncompared = ("data set", "sequence"), ("data set", "row", "frames", "without a segment", "without a match")
@@ -136,12 +136,12 @@ def limits(results: Results, undrawn: Mapping[str, str]) -> list[tuple[str, tupl
 
 
 def command(about: Mapping[str, Any]) -> str:
-    """The command that repeats the evaluation; DIR stands for a folder of the reader."""
+    """The command that repeats the evaluation; DIR is a placeholder for the reader's folder."""
     parts = ["ufmstar eval", f"--suite {about['suite']}"]
     parts += [f"--root {dataset}=DIR" for dataset in about.get("datasets") or []]
     for base, network in (about.get("networks") or {}).items():
         listed = [(f["name"], f.get("member")) for f in network.get("files") or [] if f.get("name")]
-        # A file can hold several networks: the member that was taken.
+        # A file can contain several networks: name the member.
         files = ",".join(f"DIR/{name}" if member is None else f"DIR/{name}#{member}" for name, member in listed)
         parts.append(f"--network {base}={network.get('model', 'MODEL')}:{files or 'DIR'}")
     for name, value in (about.get("settings") or {}).items():

@@ -1,4 +1,4 @@
-"""The paper's own numbers (``paper.toml``), for columns beside ours."""
+"""The paper's numbers (``paper.toml``), for columns next to ours."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class PaperTable:
     number: int
     network: str
     measured_on: str  # data and machine
-    columns: tuple[str, ...]  # keys, those of Record.figures where they mean the same
-    rows: Mapping[str, Mapping[str, Cell]]  # as printed, by method and column; without those that print a dash
-    suite: str = ""  # that repeats it
+    columns: tuple[str, ...]  # keys; for equal quantities those of Record.figures
+    rows: Mapping[str, Mapping[str, Cell]]  # printed cells by method and column, without dashes
+    suite: str = ""  # name of the suite that repeats it
     alone: Mapping[str, str] = field(default_factory=dict)  # latency_ms, memory_mb without uncertainty (table 2)
 
 
@@ -38,5 +38,5 @@ def paper_tables() -> tuple[PaperTable, ...]:
 
 
 def paper_table_of(suite: str) -> PaperTable | None:
-    """The table that a suite repeats, None of another suite."""
+    """The table that a suite repeats, or None."""
     return next((table for table in paper_tables() if table.suite == suite), None)

@@ -1,4 +1,4 @@
-"""The pictures of a report: which frames and rows, how they are drawn, and the words that go with them."""
+"""The pictures of a report: choice of frames and rows, drawing, and captions."""
 
 from __future__ import annotations
 
@@ -22,57 +22,56 @@ from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, ro
 from ufmstar_torch.eval.run.panels import Bar, GridRow, Panel, draw_grid
 
 STRIP, BREAKDOWN, COMPARE, ROOM = "strip", "breakdown", "compare", "room"
-# So that a report of a hundred sequences stays one that can be read, and mailed.
+# Limits that keep a report of a hundred sequences readable and small.
 MOST_FRAMES, MOST_ROOMS = 4, 3
 _BREAKDOWN_BASES = ("ensemble", "aleatoric")
-# [nats] The same in all strips, so that they can be compared. 6 is an error of some 3.5 sigma (of sigma = .3 m): beyond
-# it a row is simply wrong there, and how much more so would only flatten the rest of the map. Its map is neither
-# depth's nor that of lengths, and has no grey.
+# [nats] One scale for all strips, so that they can be compared. 6 is an error of about 3.5 sigma (for sigma = .3 m); a
+# larger range would reduce the contrast of the rest. The map differs from those of depth and lengths, and has no grey.
 NLL_SCALE = ColourScale(-2.0, 6.0, "plasma")
 DIFFERENCE_MAP = "RdBu_r"
 
 
 class Picture(NamedTuple):
-    """One picture and its words."""
+    """One picture with its title and caption."""
 
     file: str  # name within the figures' folder
     title: str
-    caption: str  # how to read it
-    rows: tuple[str, ...] = ()  # labels of the rows that it shows
+    caption: str
+    rows: tuple[str, ...] = ()  # labels of the displayed rows
 
 
 Drawing = tuple[str, Callable[[], Picture]]
 
 
 def pictures_of(results: Results, folder: Path) -> Iterator[Drawing]:
-    """Name and function of strips, breakdowns, comparisons and rooms of the example frames; the function writes the
-    picture into ``folder``. Raises ValueError: an example cannot be read; the message names the file.
+    """Yield name and function of strips, breakdowns, comparisons and rooms of the example frames. The function writes
+    the picture into ``folder``. Raises ValueError: an example cannot be read; the message names the file.
     """
     labels = {row.slug: label for row, label in row_labels(results.rows).items()}
-    examples = [e for place in results.sequences() for e in find_examples(results.folder(*place), *place, labels)]
+    examples = [e for key in results.sequences() for e in find_examples(results.folder(*key), *key, labels)]
     for e in choose(examples, MOST_FRAMES):
         yield from _of_frame(results, folder, e)
     yield from _of_rooms(results, folder)
 
 
 def file_name(*parts: str) -> str:
-    """A name for a PNG from names of users; a few letters of a digest keep names apart that would look alike."""
+    """A file name for a PNG from arbitrary names; some digits of a digest keep it unique."""
     short = re.sub(r"[^A-Za-z0-9.-]+", "-", "_".join(parts).replace("*", "star"))[:100].strip("-.")
     return f"{short}_{sha256(repr(parts).encode()).hexdigest()[:6]}.png"
 
 
-# ---- which frames and rows ----
+# ---- choice of frames and rows ----
 
 
 def choose(examples: Sequence[Example], most: int) -> list[Example]:
-    """Frames of as many sequences as possible: the last of each first, since by then most has been seen twice."""
+    """Frames of as many sequences as possible, the last frame of each first: by then most surfaces were seen twice."""
     groups = [list(of)[::-1] for _, of in groupby(examples, key=lambda e: (e.dataset, e.sequence))]
     first = [example for turn in zip_longest(*groups) for example in turn if example is not None][:most]
     return [example for group in groups for example in group if example in first]
 
 
 def strip_rows(rows: Sequence[Row], base: str) -> list[Row]:
-    """A base's rows for a strip, as the paper's: alone, UfM (pruned if there is such), UfM*; of default settings."""
+    """A base's rows for a strip as in the paper, with default settings: alone, UfM (pruned if possible), UfM*."""
     of_base = [row for row in plain_rows(rows) if row.method.base == base]
     default = [row for row in of_base if not (row.method.full or row.method.fixed_param)]
     points = sorted((r for r in default if r.method.fusion == UFM), key=lambda r: r.method.max_points is None)
@@ -100,7 +99,7 @@ def _of_rooms(results: Results, folder: Path) -> Iterator[Drawing]:
     drawn = 0
     for dataset, sequence in results.sequences():
         rooms = find_rooms(results.folder(dataset, sequence))
-        # One row of each room is enough: the suite's first UfM* with its default settings.
+        # One row per room: the suite's first UfM* with default settings.
         row = next((row for row in results.rows if row.slug in rooms and row.setting.plain), None)
         if row and drawn < MOST_ROOMS and any(len(snapshot.mean) for snapshot in rooms[row.slug]):
             drawn += 1
@@ -108,7 +107,7 @@ def _of_rooms(results: Results, folder: Path) -> Iterator[Drawing]:
             yield f"{sequence}: room", partial(_room, path, row_labels([row])[row], sequence, rooms[row.slug])
 
 
-# ---- drawing: each writes its PNG into the folder and returns its words ----
+# ---- drawing: each function writes its PNG into the folder and returns the Picture ----
 
 
 def _room(path: Path, label: str, sequence: str, snapshots: Sequence[Snapshot]) -> Picture:
@@ -121,8 +120,8 @@ def _room(path: Path, label: str, sequence: str, snapshots: Sequence[Snapshot]) 
 
 
 def fit_strip_scales(example: Example, rows: Sequence[str]) -> tuple[ColourScale, ColourScale]:
-    """Scales over the truth and these rows of a frame: of depth between percentiles 1 and 99, of sigma and error
-    together from 0 to 99."""
+    """Scales over the truth and these rows of a frame: of depth from the 1st to the 99th percentile, of sigma and error
+    together from 0 to the 99th."""
     shown = [example.rows[row] for row in rows]
     depth = robust_range([example.truth, *(maps.depth for maps in shown)], from_zero=False)
     length = robust_range([m for maps in shown for m in (maps.error, maps.sigma)], from_zero=True)
@@ -151,7 +150,7 @@ def draw_strip(folder: Path, example: Example, rows: Sequence[str], base: str) -
 
 
 def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Picture:
-    """The parts of each row's variance: sqrt of A, E, M and V beside the error and the NLL."""
+    """The parts of each row's variance: sqrt of A, E, M and V, with the error and the NLL."""
     _, length = fit_strip_scales(example, rows)
     body = []
     for row in rows:
@@ -177,8 +176,8 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
     _, length = fit_strip_scales(example, pair)
     old, new = (example.rows[row] for row in pair)
     name_old, name_new = (example.labels[row] for row in pair)
-    reach = robust_range([np.abs(new.sigma - old.sigma)], from_zero=True)[1]
-    signed = ColourScale(-reach, reach, DIFFERENCE_MAP)
+    limit = robust_range([np.abs(new.sigma - old.sigma)], from_zero=True)[1]
+    signed = ColourScale(-limit, limit, DIFFERENCE_MAP)
     panels = [
         Panel(example.image, "image"),
         Panel(length.rgb(new.error), f"|error| of {name_new}"),
@@ -199,10 +198,10 @@ def _sigma(maps: RowMaps, scale: ColourScale) -> np.ndarray:
 
 
 def figures_of(maps: RowMaps) -> list[str]:
-    """A row's figures on a frame, a line each: mean NLL, root mean square error, and the expected one."""
-    known = np.isfinite(maps.error)
-    if not known.any():
+    """A row's figures on a frame, one line each: mean NLL, RMSE, and the expected RMSE."""
+    judged = np.isfinite(maps.error)
+    if not judged.any():
         return ["no ground truth"]
-    rmse, rms_sigma = (np.sqrt(np.square(m[known], dtype=np.float64).mean()) for m in (maps.error, maps.sigma))
+    rmse, rms_sigma = (np.sqrt(np.square(m[judged], dtype=np.float64).mean()) for m in (maps.error, maps.sigma))
     nll = "no NLL: V = 0" if maps.mean_nll is None else f"mean NLL {maps.mean_nll:.2f}"
     return [nll, f"RMSE {rmse:.2f} m", f"rms σ {rms_sigma:.2f} m"]

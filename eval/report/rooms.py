@@ -1,4 +1,4 @@
-"""The paper's figure of a room as Gaussians: obliquely from above, at several times, coloured by their disagreement."""
+"""The paper's figure of a room as Gaussians: an oblique view at several times, coloured by disagreement."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ufmstar_torch.eval.run.colours import ERROR_MAP, INK, ColourScale, plain, r
 from ufmstar_torch.eval.run.panels import Bar, axes_at, draw_bar, new_sheet
 
 Array = NDArray[np.float64]
-# A patch that is evenly covered from -a to a has sigma = a / sqrt(3): so drawn, an ellipse is as large as its patch.
+# A uniform patch from -a to a has sigma = a / sqrt(3): with this factor, an ellipse is as large as its patch.
 SIGMAS = float(np.sqrt(3.0))
-# A ceiling hides the room from above: what lies so far above the highest camera is left out [m].
+# Gaussians higher than this above the highest camera are omitted, because a ceiling hides the room from above [m].
 HEADROOM = 0.3
 ELEVATION = 35.0  # degrees
 _PATH = "#00a6d6"
@@ -27,7 +27,7 @@ _CELL, _LEFT, _TOP, _BOTTOM = 3.1, 0.1, 0.62, 0.66  # inches
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A mixture after some frame, in world coordinates, and the camera then."""
+    """The mixture after a frame, in world coordinates, and the camera of that frame."""
 
     frame: str
     mean: Array  # [K, 3] [m]
@@ -35,23 +35,23 @@ class Snapshot:
     disagreement: Array  # [K] m [m^2]
     count: Array  # [K] views
     T_world_cam: Array  # [4, 4]
-    path: Array  # [n, 3] where the camera has been until then [m]
+    path: Array  # [n, 3] positions of the camera up to the frame [m]
 
     @property
     def root(self) -> Array:
-        """[K] sqrt(m) [m], NaN of what was seen from one view only."""
+        """[K] sqrt(m) [m], NaN for Gaussians seen from one view only."""
         root: Array = np.where(self.count > 1, np.sqrt(np.maximum(self.disagreement, 0)), np.nan)
         return root
 
     def take(self, chosen: NDArray[Any]) -> Snapshot:
         """The snapshot with the Gaussians chosen by an index or a mask."""
-        kept = {name: getattr(self, name)[chosen] for name in ("mean", "covariance", "disagreement", "count")}
-        return replace(self, **kept)
+        arrays = {name: getattr(self, name)[chosen] for name in ("mean", "covariance", "disagreement", "count")}
+        return replace(self, **arrays)
 
 
 def find_rooms(folder: Path) -> dict[str, list[Snapshot]]:
     """The snapshots of one sequence, ``OUT/records/DATASET/SEQUENCE``, by row, in the order of their frames. Raises
-    ValueError: a file cannot be read or holds something else; the message names it.
+    ValueError: a file cannot be read or is no snapshot; the message names it.
     """
     rooms: dict[str, list[Snapshot]] = {}
     for file in sorted((folder / "room").glob("*.npz")):
@@ -63,8 +63,8 @@ def find_rooms(folder: Path) -> dict[str, list[Snapshot]]:
 
 
 def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourScale:
-    """Draw each time in a column, with the camera's path, on one scale of sqrt(m) [m], which is returned; write the
-    picture (PNG). Raises ValueError: no snapshot has a Gaussian.
+    """Draw the snapshots in columns, with the camera's path, on one scale of sqrt(m) [m], and write the picture (PNG).
+    Returns the scale. Raises ValueError: no snapshot has a Gaussian.
     """
     if not any(len(snapshot.mean) for snapshot in snapshots):
         raise ValueError("snapshots must hold at least one Gaussian")
@@ -111,22 +111,22 @@ def _draw_view(axes: Any, view: Array, snapshot: Snapshot, scale: ColourScale) -
 
 
 def _limits(view: Array, snapshots: Sequence[Snapshot]) -> tuple[Array, Array]:
-    """[2] lower and upper corner of what the picture shows, the same at all times [m].
+    """[2] lower and upper corner of the picture, equal for all snapshots [m].
 
-    A Gaussian of a wrong depth can lie far outside; hence percentiles, and all of the camera's path.
+    Percentiles exclude Gaussians of wrong depth, which can be far outside; the camera's whole path is included.
     """
     plane = np.concatenate([snapshot.mean for snapshot in snapshots]) @ view[:2].T
     reach = np.concatenate([project(view, snapshot.covariance)[0][:, :1] for snapshot in snapshots])
     walked = np.concatenate([snapshot.path for snapshot in snapshots]) @ view[:2].T
     low, high = np.percentile(plane - reach, 1, axis=0), np.percentile(plane + reach, 99, axis=0)
     low, high = np.minimum(low, walked.min(0)) - 0.2, np.maximum(high, walked.max(0)) + 0.2
-    # Not flatter or taller than can be looked at.
+    # Limit the aspect ratio.
     size, middle = high - low, (low + high) / 2
     size = np.maximum(size, [size[1] / 1.4, size[0] / 2.5])
     return middle - size / 2, middle + size / 2
 
 
-# ---- Gaussians seen from far away by an orthographic camera, and the ellipses that covariances leave on its image ----
+# ---- orthographic projection of Gaussians to ellipses ----
 
 
 def project(view: Array, covariance: Array) -> tuple[Array, Array]:
@@ -144,14 +144,14 @@ def project(view: Array, covariance: Array) -> tuple[Array, Array]:
 def oblique_view(T_world_cam: Array) -> tuple[Array, Array]:
     """A view from behind the first of cameras [n, 4, 4], ``ELEVATION`` over the horizon.
 
-    Data sets differ in which axis points up; a camera's own up (-y) is right on average.
+    The mean of the cameras' up vectors (-y) is the world's, because data sets have different vertical axes.
 
     Returns [3, 3] the unit vectors of the world that point right and up in the picture and towards the viewer, and [3]
-    the world's own up.
+    the world's up vector.
     """
     up = _unit(-T_world_cam[:, :3, 1].mean(0), np.array([0.0, 0.0, 1.0]))
     first = T_world_cam[0, :3, 2]
-    # A camera that looks straight down has no forward on the floor: any direction serves then.
+    # A camera that looks straight down has no horizontal direction: use any.
     fallback = np.eye(3)[np.argmin(np.abs(up))]
     forward = _unit(first - up * (first @ up), _unit(fallback - up * (fallback @ up), fallback))
     tilt = np.radians(ELEVATION)
@@ -160,6 +160,6 @@ def oblique_view(T_world_cam: Array) -> tuple[Array, Array]:
 
 
 def _unit(vector: Array, otherwise: Array) -> Array:
-    """The vector at length 1, or another one where it has no direction."""
+    """The normalised vector, or ``otherwise`` if its length is 0."""
     length = float(np.linalg.norm(vector))
     return vector / length if length > 1e-6 else otherwise

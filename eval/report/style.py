@@ -1,4 +1,4 @@
-"""The look of figures: one colour and mark per kind of method, names right of the panels, no global state."""
+"""The style of figures: one colour and marker per kind of method, names right of the panels, no global state."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from ufmstar_torch.eval.run.colours import FAINT, INK, plain, require_matplotlib
 from ufmstar_torch.eval.run.files import write_atomic
 
 GRID = "#e6e6e6"
-TITLE, LABEL, TICK = 11, 9, 8  # sizes of letters [pt]
+TITLE, LABEL, TICK = 11, 9, 8  # font sizes [pt]
 DPI = 130
 
 
-class Look(NamedTuple):
-    """A line's name, colour (Okabe and Ito's, which the colour-blind tell apart) and mark (for print in grey)."""
+class LineStyle(NamedTuple):
+    """A line's name, colour (Okabe and Ito's, for the colour-blind) and marker (for print in grey)."""
 
     name: str
     colour: str
@@ -23,26 +23,26 @@ class Look(NamedTuple):
 
     @property
     def line(self) -> dict[str, Any]:
-        """For ``Axes.plot``."""
+        """Keyword arguments of ``Axes.plot``."""
         return {
             "label": self.name, "color": self.colour, "marker": self.marker, "linewidth": 1.6, "markersize": 4.5,
         }  # fmt: skip
 
 
-def look_of(method: Method) -> Look:
-    """The same in every figure, whatever the network: "alone", "UfM-100K", "UfM*", "UfM*-Full"."""
+def line_style(method: Method) -> LineStyle:
+    """The style of a method, equal in every figure and for every network: "alone", "UfM-100K", "UfM*", "UfM*-Full"."""
     if method.fusion == ALONE:
-        return Look("alone", "#6b6b6b", "^")
+        return LineStyle("alone", "#6b6b6b", "^")
     full = "-Full" if method.full else ""
     if method.fusion == UFM:
         cap = "" if method.max_points is None else f"-{method.max_points // 1000}K"
-        colour = ("#F0E442", "X") if full else ("#D55E00", "v") if cap else ("#E69F00", "s")
-        return Look(f"UfM{full}{cap}", *colour)
+        style = ("#F0E442", "X") if full else ("#D55E00", "v") if cap else ("#E69F00", "s")
+        return LineStyle(f"UfM{full}{cap}", *style)
     if method.fusion != UFM_STAR:
-        return Look(f"{method.fusion}{full}", "#56B4E9", "*")
+        return LineStyle(f"{method.fusion}{full}", "#56B4E9", "*")
     fixed = " fixed-param" if method.fixed_param else ""
-    colour = ("#009E73", "D") if full else ("#CC79A7", "P") if fixed else ("#0072B2", "o")
-    return Look(f"UfM*{full}{fixed}", *colour)
+    style = ("#009E73", "D") if full else ("#CC79A7", "P") if fixed else ("#0072B2", "o")
+    return LineStyle(f"UfM*{full}{fixed}", *style)
 
 
 def new_figure(width: float, height: float, title: str) -> Any:
@@ -58,7 +58,7 @@ def new_figure(width: float, height: float, title: str) -> Any:
 
 
 def hidden_panels(figure: Any, lines: int, columns: int) -> Any:
-    """[lines, columns] axes that are invisible until they are drawn on."""
+    """[lines, columns] invisible axes; a drawing function makes them visible."""
     axes = figure.subplots(lines, columns, squeeze=False)
     for panel in axes.flat:
         panel.set_visible(False)
@@ -66,7 +66,7 @@ def hidden_panels(figure: Any, lines: int, columns: int) -> Any:
 
 
 def finish(axes: Any, *, title: str = "", x: str = "", y: str = "") -> None:
-    """Words, a faint grid behind, no box."""
+    """Set title, labels and a faint grid; remove the box."""
     axes.set_title(plain(title), size=LABEL + 0.5, color=INK, loc="left")
     axes.set_xlabel(plain(x), size=LABEL, color=INK)
     axes.set_ylabel(plain(y), size=LABEL, color=INK)
@@ -80,20 +80,20 @@ def finish(axes: Any, *, title: str = "", x: str = "", y: str = "") -> None:
 
 
 def name_lines(axes: Any) -> None:
-    """The names of the lines, right of a panel."""
+    """Add the names of the lines at the right of a panel."""
     if axes.get_legend_handles_labels()[0]:
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=TICK)
 
 
 def legend_below(figure: Any) -> None:
-    """The names of all lines, below the panels."""
+    """Add the names of all lines below the panels."""
     named = {label: h for axes in figure.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     how: dict[str, Any] = {"ncols": len(named), "frameon": False, "fontsize": TICK}
     figure.legend(list(named.values()), list(named), loc="outside lower center", **how)
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure, by its suffix (.svg or .png); the same figure gives the same bytes."""
+    """Write a figure in the format of the suffix (.svg or .png); the same figure gives the same bytes."""
     matplotlib = require_matplotlib()
     kind = path.suffix.removeprefix(".")
     plain = {"Date": None} if kind == "svg" else {"Software": None}

@@ -14,15 +14,15 @@ import pandas as pd
 from ufmstar_torch.eval.report.means import Mean
 from ufmstar_torch.eval.report.names import LOWER, Quantity
 
-# A narrower interval is not printed, as in the paper.
+# Smallest half-width of a printed interval, as in the paper.
 SMALL_INTERVAL = 0.01
 DASH = "–"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """The content of a cell, as printed: "" = no such figure (a dash), the half-width of its confidence interval ("" =
-    none), whether it is the best of its block, and a word behind it.
+    """The printed content of a cell: value ("" = a dash), half-width of the confidence interval ("" = none), bold for
+    the best of a block, and a remark after it.
     """
 
     value: str = ""
@@ -32,8 +32,8 @@ class Cell:
 
     @classmethod
     def of(cls, mean: Mean, quantity: Quantity, *, signed: bool = False) -> Cell:
-        """A mean with its interval, where there is one and it is at least .01 wide; of a difference (``signed``) any,
-        with "better" or "worse" where the interval leaves out 0."""
+        """A mean with its interval if its half-width is at least .01. A difference (``signed``) has an interval of any
+        width, and "better" or "worse" if the interval excludes 0."""
         if math.isnan(mean.value):
             return cls()
         decimals = significant(mean.value) if quantity.decimals is None else quantity.decimals
@@ -47,13 +47,12 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """A table. Bold means one thing: the best value of a block."""
+    """A table. The best value of a block is bold."""
 
     name: str  # of its files
     title: str
     first: str  # heading of the labels
-    # of Cell, by (block, label) and (group, heading): rows of a block belong together, neighbouring columns of a group
-    # share a heading above ("" = none)
+    # Cells by (block, label) and (group, heading). Adjacent columns of a group share a heading above ("" = none).
     cells: pd.DataFrame
     notes: Sequence[str] = ()
 
@@ -69,7 +68,7 @@ class Table:
 
     @property
     def groups(self) -> list[tuple[str, int]]:
-        """Headings over neighbouring columns, and the number of columns below each; [] without any heading."""
+        """Headings over adjacent columns, and the number of columns below each; [] without such headings."""
         spans = [(name, len(list(of))) for name, of in groupby(group for group, _ in self.cells.columns)]
         return spans if any(name for name, _ in spans) else []
 
@@ -87,7 +86,7 @@ def frame_of(lines: Sequence[tuple[int, str, Sequence[Cell]]], columns: Sequence
 
 
 def number(value: float, decimals: int, *, signed: bool = False) -> str:
-    """A number as printed: never "-0.00", and large ones with an exponent."""
+    """A number as text: never "-0.00", large numbers with an exponent."""
     sign = "+" if signed else ""
     if abs(value) >= 1e6:
         return f"{value:{sign}.2e}"
@@ -101,7 +100,7 @@ def significant(value: float) -> int:
 
 
 def mark_best(cells: Sequence[Cell], quantity: Quantity) -> list[Cell]:
-    """Bold where a cell prints the best value of its block; none where all print the same, or there is one alone."""
+    """Make the best printed values of a block bold, unless all are equal or there is only one."""
     printed = [float(cell.value) for cell in cells if cell.value]
     if not quantity.better or len(set(printed)) < 2:
         return list(cells)
@@ -113,7 +112,7 @@ def mark_best(cells: Sequence[Cell], quantity: Quantity) -> list[Cell]:
 
 
 def markdown(table: Table) -> str:
-    """The table under its title, with its notes below."""
+    """The table with its title above and its notes below."""
     rows = [[table.first, *table.headings], ["---", *["---:"] * len(table.headings)]]
     cells = table.cells.map(_markdown_cell).to_numpy().tolist()
     rows += [[markdown_text(label), *line] for label, line in zip(table.labels, cells, strict=True)]
@@ -123,10 +122,10 @@ def markdown(table: Table) -> str:
 
 
 def markdown_text(text: str) -> str:
-    """Plain text for Markdown, on one line: nothing of it becomes emphasis, code, HTML, a formula or a link.
+    """Escape plain text for Markdown, on one line: no part becomes emphasis, code, HTML, a formula or a link.
 
-    Links without brackets ("https://...", "www...", addresses with an @) are known by letters alone, which cannot be
-    escaped: an invisible word joiner (U+2060) breaks them.
+    Links without brackets ("https://...", "www...", addresses with an @) cannot be escaped; an invisible word joiner
+    (U+2060) breaks them.
     """
     text = re.sub(r"([\\|*_<`\[\]~$])", r"\\\1", " ".join(text.split()))
     return re.sub(r"(?i)://|(?<=\bwww)\.|(?<=\w)@(?=\w)", lambda mark: f"\u2060{mark[0]}", text)
@@ -171,7 +170,7 @@ def latex(table: Table) -> str:
 
 
 def _latex_heading(name: str) -> str:
-    """A heading as LaTeX: the letter behind "_" becomes an index."""
+    """A heading as LaTeX: the letter after "_" becomes an index."""
     first, *rest = name.split("_")
     indices = (f"$_{{{part[0].translate(_LATEX).strip('$')}}}${part[1:].translate(_LATEX)}" for part in rest)
     return first.translate(_LATEX) + "".join(indices)
@@ -189,7 +188,7 @@ def _latex_cell(cell: Cell) -> str:
 
 
 def table_csv(tables: Iterable[Table]) -> str:
-    """Tables below each other: title, label, and for each column its value and, where any has one, its half-width."""
+    """Tables below each other: title, label, and for each column its values and, if it has any, its half-widths."""
     frames = []
     for table in tables:
         columns: dict[str, Any] = {"table": table.title, table.first: table.labels}
@@ -202,7 +201,7 @@ def table_csv(tables: Iterable[Table]) -> str:
 
 
 def csv_text(value: Any) -> str:
-    """A CSV field: text that a spreadsheet would take for a formula gets an apostrophe, numbers do not."""
+    """A CSV field: text that a spreadsheet would read as a formula gets an apostrophe, numbers do not."""
     text = "" if value is None or value != value else str(value)
     if text[:1] not in ("=", "+", "-", "@", "\t", "\r"):
         return text

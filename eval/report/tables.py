@@ -42,26 +42,26 @@ OURS, PAPER = "Ours", "Paper"
 _PAPER_COLUMNS = {quantity.key: quantity for quantity in (*MAIN, ENERGY, MEMORY)}
 _SEQUENCES = Quantity("", "sequences", 0)
 Records = Mapping[Row, Sequence[Record]]
-# Cells by row, by the heading above the column ("" = none) and its quantity.
+# By heading above the column ("" = none) and quantity, the cells by row.
 Columns = dict[tuple[str, Quantity], dict[Row, Cell]]
 
 
 def main_table(results: Results, dataset: str | None = None) -> Table:
-    """The paper's columns, over the sequences of a data set or (None) of all; where the suite is the paper's, with the
-    paper's own figures beside ours, and energy and memory where they were measured."""
+    """The paper's columns, over the sequences of a data set or (None) of all; with the paper's figures next to ours if
+    the suite is the paper's, and with energy and memory if they were measured."""
     records, quoted, efficiency = _records(results, dataset), paper_table_of(results.suite), results.efficiency
     group = OURS if quoted else ""
-    own = own_quantities(key for record in results.records for key in record.figures)
-    columns, notes = _means(records, [*MAIN, *own], group), _notes(results, records)
+    plugin_columns = own_quantities(key for record in results.records for key in record.figures)
+    columns, notes = _means(records, [*MAIN, *plugin_columns], group), _notes(results, records)
     costs = _costs(efficiency, records, group) if efficiency else {}
     if efficiency and any(cell.value for cells in costs.values() for cell in cells.values()):
         columns |= costs
         notes.append(_cost_note(efficiency))
     if quoted:
-        theirs = {row: quoted.rows.get(row.method.name, {}) for row in plain_rows(records)}
+        paper_cells = {row: quoted.rows.get(row.method.name, {}) for row in plain_rows(records)}
         for key in quoted.columns:
             quantity = replace(_PAPER_COLUMNS[key], better="")
-            columns[PAPER, quantity] = {row: cells[key] for row, cells in theirs.items() if key in cells}
+            columns[PAPER, quantity] = {row: cells[key] for row, cells in paper_cells.items() if key in cells}
         notes.append(f"The paper's own figures are of {quoted.network} on {quoted.measured_on}.")
     return _table("main", f"{results.title}, {_where(results, dataset)}", records, columns, notes)
 
@@ -75,7 +75,7 @@ def extra_table(results: Results, dataset: str | None = None) -> Table:
 
 
 def sequence_tables(results: Results, dataset: str) -> list[Table]:
-    """The paper's columns for each sequence of a data set: no intervals, since it is one."""
+    """The paper's columns for each sequence of a data set, without intervals."""
     tables = []
     for _, sequence in results.sequences(dataset):
         records = _records(results, dataset, sequence)
@@ -86,7 +86,7 @@ def sequence_tables(results: Results, dataset: str) -> list[Table]:
 
 
 def difference_table(results: Results, dataset: str | None = None) -> Table:
-    """Rows less UfM* of the same base, in pairs on the same sequences; a remark where the interval leaves out 0."""
+    """Rows minus UfM* of the same base, paired by sequence; with a remark if the interval excludes 0."""
     lines, labels = [], row_labels(results.rows)
     for block, base in enumerate(results.bases):
         ours = reference_row(results, base)
@@ -111,20 +111,20 @@ def _records(results: Results, dataset: str | None, sequence: str | None = None)
 
 
 def _means(records: Records, quantities: Iterable[Quantity], group: str = "") -> Columns:
-    """A column for each quantity, of the means over the sequences."""
+    """A column for each quantity, with the means over the sequences."""
     return {(group, q): {row: Cell.of(mean_of(listed, q), q) for row, listed in records.items()} for q in quantities}
 
 
 def _costs(efficiency: Mapping[str, Any], records: Records, group: str) -> Columns:
-    """Energy and memory of the rows' uncertainty: energy over the sequences that were measured, memory over all of
-    them; dashes where nothing was measured."""
+    """Energy and memory of the rows' uncertainty: energy over the measured sequences, memory over all sequences; dashes
+    where nothing was measured."""
     measured = {line["row"]: line for line in efficiency.get("rows", ())}
     energy, memory = {}, {}
     for row, listed in records.items():
         if row.label in measured:
-            where = {(record.dataset, record.sequence) for record in listed}
-            spent = [one for one in efficiency.get("sequences", ()) if (one["dataset"], one["sequence"]) in where]
-            joules = mean_over(v for one in spent if (v := one["energy_mj"].get(row.label)) is not None)
+            keys = {(record.dataset, record.sequence) for record in listed}
+            energies = [one for one in efficiency.get("sequences", ()) if (one["dataset"], one["sequence"]) in keys]
+            joules = mean_over(v for one in energies if (v := one["energy_mj"].get(row.label)) is not None)
             network = measured[row.label]["memory"].get("network_uncertainty_bytes")
             sizes = () if network is None else (network + (r.state.get("bytes_mean") or 0.0) for r in listed)
             energy[row] = Cell.of(joules, ENERGY)
@@ -133,21 +133,21 @@ def _costs(efficiency: Mapping[str, Any], records: Records, group: str) -> Colum
 
 
 def _table(name: str, title: str, records: Records, columns: Columns, notes: Sequence[str] = ()) -> Table:
-    """Rows by base, the best of each in bold unless rows are of different sequences; one block where every base has a
-    single row, as in table 4."""
-    alike = len({frozenset((r.dataset, r.sequence) for r in listed) for listed in records.values()}) == 1
-    if not alike:
+    """Rows in blocks by base, the best of each block in bold unless rows have different sequences; a single block if
+    every base has one row, as in table 4."""
+    same_sequences = len({frozenset((r.dataset, r.sequence) for r in listed) for listed in records.values()}) == 1
+    if not same_sequences:
         group = next(iter(columns))[0]
         columns = {(group, _SEQUENCES): {row: Cell(str(len(listed))) for row, listed in records.items()}} | columns
         notes = [*notes, "The rows are means over different sequences, so none is marked as the best."]
     labels = row_labels(records)
     bases = [row.method.base for row in labels]
-    together = len(set(bases)) == len(bases)
+    single_block = len(set(bases)) == len(bases)
     lines = []
-    for block, (_, of_base) in enumerate(groupby(labels, key=lambda row: None if together else row.method.base)):
+    for block, (_, of_base) in enumerate(groupby(labels, key=lambda row: None if single_block else row.method.base)):
         rows = list(of_base)
         by_column = [[cells.get(row, Cell()) for row in rows] for cells in columns.values()]
-        if alike:
+        if same_sequences:
             by_column = [mark_best(cells, q) for (_, q), cells in zip(columns, by_column, strict=True)]
         lines += [(block, labels[row], cells) for row, *cells in zip(rows, *by_column, strict=True)]
     return Table(name, title, "Method", frame_of(lines, [(group, q.heading) for group, q in columns]), notes)
@@ -161,7 +161,7 @@ def _where(results: Results, dataset: str | None) -> str:
 
 
 def _notes(results: Results, records: Records) -> list[str]:
-    """Networks, preparation of the images and intervals."""
+    """Notes on networks, preprocessing and intervals."""
     networks: dict[str, list[str]] = {}
     for base in results.bases:
         networks.setdefault(results.network(base) or "", []).append(base)
@@ -190,8 +190,8 @@ def _cost_note(efficiency: Mapping[str, Any]) -> str:
 
 def all_tables(results: Results) -> dict[str, list[Table]]:
     """The tables by the name of their file, without empty ones: "main", "differences" and "extra" over all sequences
-    and, where there are several data sets, over those of each ("main-DATASET"); "sequences-DATASET" of single
-    sequences; "efficiency" with the paper's table 2 below ours where it was measured."""
+    and, with several data sets, over those of each ("main-DATASET"); "sequences-DATASET" of single sequences;
+    "efficiency", if it was measured, with the paper's table 2 below ours."""
     files: dict[str, list[Table]] = {}
     for make in (main_table, difference_table, extra_table):
         for dataset in (None, *(results.datasets if len(results.datasets) > 1 else ())):
@@ -199,12 +199,12 @@ def all_tables(results: Results) -> dict[str, list[Table]]:
             files[table.name if dataset is None else f"{table.name}-{dataset}"] = [table]
     files |= {f"sequences-{dataset}": sequence_tables(results, dataset) for dataset in results.datasets}
     files["efficiency"] = efficiency_tables(results.efficiency) if results.efficiency else []
-    kept = {name: [table for table in listed if not table.is_empty] for name, listed in files.items()}
-    return {name: listed for name, listed in kept.items() if listed}
+    non_empty = {name: [table for table in listed if not table.is_empty] for name, listed in files.items()}
+    return {name: listed for name, listed in non_empty.items() if listed}
 
 
 def write_tables(folder: Path, files: Mapping[str, Sequence[Table]]) -> list[Path]:
-    """Write ``NAME.md``, ``.tex`` and ``.csv`` of :func:`all_tables` into a folder; their paths."""
+    """Write ``NAME.md``, ``.tex`` and ``.csv`` of :func:`all_tables` into a folder. Returns their paths."""
     folder.mkdir(exist_ok=True)
     written = []
     for name, tables in files.items():
@@ -215,7 +215,7 @@ def write_tables(folder: Path, files: Mapping[str, Sequence[Table]]) -> list[Pat
 
 def write_tidy(results: Results) -> Path:
     """Write ``results.csv``, a line per row, sequence and figure, with a column for each setting; numbers in full,
-    nothing for a missing value; its path."""
+    missing values empty. Returns its path."""
     lines = []
     for record in results.records:
         names = ("suite", "dataset", "sequence", "network", "method")

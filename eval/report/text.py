@@ -1,4 +1,4 @@
-"""Text for the terminal: results of a run, an evaluation, a report and the demo on board."""
+"""Text for the terminal: results of a run, an evaluation, a report and the onboard demo."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.eval.report.write import Report
 from ufmstar_torch.eval.run.frame_record import NEAR_ZERO
 
-# [nats] A mean NLL above it is that of a few pixels: sigma = .25 d of a room makes about 1.
+# [nats] A larger mean NLL is dominated by a few pixels: sigma = .25 d in a room gives about 1.
 NLL_OF_FEW = 100.0
 _RUN_COLUMNS = {
     "delta1": "delta1", "abs_rel": "AbsRel", "rmse": "RMSE [m]", "nll": "NLL", "ece_delta": "ECE_delta",
     "ece_q": "ECE_q", "spearman": "Spearman",
 }  # fmt: skip
-_TARGET_MS, _TARGET_LOST = 50.0, 0.01  # of the demo on board
-_CALIBRATED = 4.0  # mean z^2 of held-out anchors, and its inverse: sigma is right to a factor of two
+_TARGET_MS, _TARGET_LOST = 50.0, 0.01  # of the onboard demo
+_CALIBRATED = 4.0  # largest mean z^2 of held-out anchors, and inverse of the smallest: sigma is right within a factor 2
 _UNSUPPORTED = "mean sigma not shown: neither truth nor held-out anchors (--posterior) support it"
-# The counts of a frame's anchors by their source: how many have a depth, and of how many.
+# By source of anchors, the names of the count of anchors with a depth and of the total.
 _FOUND = {
     "corners": ("triangulated", "tracked"),
     "landmarks": ("in view", "in the map"),
@@ -47,7 +47,7 @@ def summary(results: Results) -> str:
 
 
 def written(out: Path, report: Report) -> str:
-    """The files of a folder by name, those of its subfolders by number, and the figures that could not be drawn."""
+    """The names of files in a folder, the numbers of files in its subfolders, and the figures that failed."""
     folders = Counter(file.parent for file in report.files if file.parent != out)
     names = [file.name for file in report.files if file.parent == out]
     names += [f"{folder.name}/ ({count} files)" for folder, count in folders.items()]
@@ -56,7 +56,7 @@ def written(out: Path, report: Report) -> str:
 
 
 def run_table(summary: Mapping[str, Any]) -> str:
-    """The end of ``ufmstar run``: methods by metrics, and the figures of the run."""
+    """The table that ``ufmstar run`` prints: methods by metrics, and the figures of the run."""
     uncertainty, mixture, time = summary["uncertainty"], summary["mixture"], summary["time"]
     lines = _metric_lines(summary)
     if uncertainty["unmeasured_share"]:
@@ -105,13 +105,13 @@ def _metric_lines(summary: Mapping[str, Any]) -> list[str]:
 
 
 def supported(summary: Mapping[str, Any]) -> bool:
-    """Return whether the errors at held-out anchors agree with the posterior's sigma to a factor of two."""
+    """True if the errors at held-out anchors agree with the posterior's sigma within a factor of two."""
     calibration = summary.get("posterior", {}).get("calibration")
     return calibration is not None and 1 / _CALIBRATED < calibration < _CALIBRATED
 
 
 def _anchor_lines(summary: Mapping[str, Any]) -> list[str]:
-    """A line on the effect of anchors, and one on the frames that had none."""
+    """A line on the effect of anchors, and one on the frames without anchors."""
     anchors, frames, kind = summary["anchors"], summary["frames"]["done"], summary["source"]["anchors"]
     used, actual, tracked = (anchors[f"{key}_per_frame"] for key in ("used", "found", "tracked"))
     line = f"anchors: {used:.1f} used a frame, of {actual:.1f} {_FOUND[kind][0]} and {tracked:.1f} {_FOUND[kind][1]}"
@@ -132,7 +132,7 @@ def _anchor_lines(summary: Mapping[str, Any]) -> list[str]:
 
 
 def onboard_table(summary: Mapping[str, Any]) -> str:
-    """The real-time table of ``ufmstar demo --onboard``, its target, and what disagreement adds."""
+    """The real-time table of ``ufmstar demo --onboard``, its target, and the contrast of disagreement."""
     measured, network = summary["realtime"], summary["network"]
     lines = [realtime_table(measured)]
     latency = measured["latency_ms"] or {}
@@ -144,14 +144,14 @@ def onboard_table(summary: Mapping[str, Any]) -> str:
             f"{network['quantised']}: depth shifted by {100 * shift['median']:.2g} % in the median, "
             f"{100 * shift['p99']:.2g} % at most for 99 % of the pixels"
         )
-    if found := summary.get("contrast"):
-        m = {name: number(value) for name, value in found.items()}
+    if contrast := summary.get("contrast"):
+        m = {name: number(value) for name, value in contrast.items()}
         lines.append(
             f"where the aleatoric variance is low: RMSE {m['rmse_high']} m at high disagreement "
-            f"({100 * found['share']:.0f} % of the pixels; aleatoric sigma {m['aleatoric_sigma_high']} m, sqrt(M) "
+            f"({100 * contrast['share']:.0f} % of the pixels; aleatoric sigma {m['aleatoric_sigma_high']} m, sqrt(M) "
             f"{m['disagreement_high']} m), {m['rmse_low']} m elsewhere"
         )
-    return "\n".join([*lines, f"{summary['out']}: summary.json{', onboard.png' if found else ''}"])
+    return "\n".join([*lines, f"{summary['out']}: summary.json{', onboard.png' if contrast else ''}"])
 
 
 def realtime_table(summary: Mapping[str, Any]) -> str:

@@ -16,12 +16,12 @@ from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.report.tables import all_tables, write_tables, write_tidy
 from ufmstar_torch.eval.run.files import remove_temporaries
 
-# Errors of drawing, after which a report goes on without the picture.
+# Errors of drawing, after which a report continues without the picture.
 _DRAWING_ERRORS = (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError)
 
 
 class Report(NamedTuple):
-    """The files of a report in the order in which they were written, and why some figures could not be drawn."""
+    """The files of a report in the order of writing, and by figure why it could not be drawn."""
 
     files: list[Path]
     undrawn: Mapping[str, str]
@@ -30,16 +30,16 @@ class Report(NamedTuple):
 def write_report(out: Path, *, figures: bool = True) -> Report:
     """Write the report of an evaluation, finished or not, into its folder.
 
-    ``figures=False`` writes tables and results alone, without a page, and needs no matplotlib. A figure that cannot be
-    drawn is left out, and named on the page.
+    ``figures=False`` writes tables and results alone, without a page, and needs no matplotlib. The page names figures
+    that cannot be drawn.
 
     Raises:
-        ResultsError: the folder is no evaluation, or its records do not belong together.
-        ValueError: a file with an example cannot be read.
+        ResultsError: the folder is no evaluation, or its records are inconsistent.
+        ValueError: an example's file cannot be read.
         ImportError: matplotlib, Pillow or Jinja2 is missing.
     """
     results = load_results(out, with_sums=figures)
-    # Remains of a killed report; eval.json and the records belong to `ufmstar eval`.
+    # Temporary files of a killed report; those of eval.json and the records belong to `ufmstar eval`.
     for pattern in ("tables/.*.tmp", "figures/.*.tmp", ".results.*.tmp", ".table.*.tmp", ".report.*.tmp"):
         remove_temporaries(out.glob(pattern))
     tables = all_tables(results)
@@ -52,7 +52,7 @@ def write_report(out: Path, *, figures: bool = True) -> Report:
 
 
 def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Name (its first word is the kind) and function of every figure; None where there is nothing to draw."""
+    """Yield name (its first word is the kind) and function of every figure; the function returns None without data."""
     for dataset in results.datasets:
         yield f"calibration {dataset}", partial(figures_curves.draw_calibration, results, dataset)
         for base in results.bases:
@@ -67,7 +67,7 @@ def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 
 def _draw(results: Results, undrawn: dict[str, str]) -> tuple[list[Path], list[Picture]]:
-    """Draw figures and pictures into ``figures/``, and note why some could not be drawn."""
+    """Draw figures and pictures into ``figures/``; add the reasons for failures to ``undrawn``."""
     folder = results.out / "figures"
     folder.mkdir(exist_ok=True)
     figures: list[Path] = []

@@ -1,1 +1,1 @@
-"""The job, folder, files and summary of ``ufmstar run``; its folder, files and machine serve other commands too."""
+"""The job, folder, files and summary of ``ufmstar run``; other commands also use ``folder``, ``files``, ``machine``."""

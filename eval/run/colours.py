@@ -1,4 +1,4 @@
-"""Colours of pictures: perceptually uniform maps, ranges by percentile, grey for what is unknown; writing of PNGs."""
+"""Colours of pictures: perceptually uniform maps, ranges by percentile, grey for unknown values; writing of PNGs."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from numpy.typing import NDArray
 from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.optional import optional
 
-# Depth and uncertainty get different maps, so that the two pictures cannot be confused.
+# Depth and uncertainty have different maps, so that their pictures cannot be confused.
 DEPTH_MAP = "viridis"
 ERROR_MAP = "magma"
-INK, FAINT = "#1a1a1a", "#6b6b6b"  # of words
-# In neither map: both are coloured at medium lightness.
+INK, FAINT = "#1a1a1a", "#6b6b6b"  # of text
+# Grey is in neither map.
 INVALID_GREY = 150
 PERCENTILES = (1.0, 99.0)
 
 
 @dataclass(frozen=True)
 class ColourScale:
-    """A matplotlib map and the values [m] at its dark and its bright end, low < high; values beyond an end get its
-    colour. ``logarithmic``: equal factors are equal steps of colour, and 0 < low.
+    """A matplotlib map and the values [m] at its dark and its bright end, low < high. Values beyond an end have its
+    colour. ``logarithmic``: the colour is linear in the logarithm of the value, and 0 < low.
     """
 
     low: float
@@ -36,14 +36,14 @@ class ColourScale:
 
     def rgb(self, values: NDArray[Any]) -> NDArray[np.uint8]:
         """[..., 3] the colours of ``values`` [...] [m]; grey where not finite."""
-        known = np.isfinite(values)
-        shown = np.clip(np.where(known, values, self.low).astype(np.float64), self.low, self.high)
+        finite = np.isfinite(values)
+        shown = np.clip(np.where(finite, values, self.low).astype(np.float64), self.low, self.high)
         low, high = self.low, self.high
         if self.logarithmic:
             shown, low, high = np.log(shown), np.log(low), np.log(high)
         index = (shown - low) / (high - low) * 255
         colours = colour_table(self.colour_map)[np.rint(index).astype(np.intp)]
-        return np.where(known[..., None], colours, np.uint8(INVALID_GREY))
+        return np.where(finite[..., None], colours, np.uint8(INVALID_GREY))
 
 
 @cache
@@ -55,13 +55,13 @@ def colour_table(name: str) -> NDArray[np.uint8]:
 
 
 def require_matplotlib() -> Any:
-    """The matplotlib package, without pyplot and so without global state. Raises ImportError: it is missing; names the
-    extra that brings it."""
+    """The matplotlib package, without pyplot and its global state. Raises ImportError: it is missing; the message names
+    the extra to install."""
     return optional("matplotlib", "pictures need matplotlib", "'ufmstar-torch[viz]'")
 
 
 def plain(text: str) -> str:
-    """Text for matplotlib as it stands: a pair of dollar signs would make a formula of what lies between."""
+    """Text for matplotlib with escaped dollar signs: a pair of them would enclose a formula."""
     return text.replace("$", r"\$")
 
 
@@ -78,7 +78,7 @@ def known_where(condition: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[n
 
 
 def striped(rgb: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A picture [h, w, 3] with diagonal grey stripes over the pixels ``where`` [h, w]: a third of them."""
+    """A picture [h, w, 3] with diagonal grey stripes over a third of the pixels ``where`` [h, w]."""
     third = max(2, len(rgb) // 110)
     across = np.add.outer(np.arange(where.shape[0]), np.arange(where.shape[1])) // third % 3 == 0
     return np.where((where & across)[..., None], np.uint8(INVALID_GREY), rgb)
@@ -89,12 +89,12 @@ def robust_range(maps: Iterable[NDArray[Any]], *, from_zero: bool) -> tuple[floa
 
     ``from_zero`` starts the range at 0, as for a sigma or an error.
     """
-    kept = [values[np.isfinite(values)] for values in maps]
-    pixels = np.concatenate(kept) if kept else np.zeros(0)
+    finite = [values[np.isfinite(values)] for values in maps]
+    pixels = np.concatenate(finite) if finite else np.zeros(0)
     if pixels.size == 0:
         return 0.0, 1.0
     low, high = (float(x) for x in np.percentile(pixels, PERCENTILES))
     if from_zero:
         low = 0.0
-    # One value everywhere, as a disagreement of 0 in the first frame, still needs a range to draw.
+    # A constant map, as a disagreement of 0 in the first frame, still needs a range.
     return (low, high) if high > low else (low, low + max(1e-3, 1e-3 * abs(low)))

@@ -1,7 +1,7 @@
 """A run's result for other programs: depth and sigma, a cloud of points, the trajectory, or ``transforms.json``.
 
-All of it is below OUT/export. Depth and sigma are the posterior's where the run has one; a pixel that is not valid, or
-whose sigma is beyond a limit, is left out.
+The files are below OUT/export. Depth and sigma are the posterior's if the run has one. Pixels that are not valid, or
+whose sigma exceeds a limit, are left out.
 """
 
 from __future__ import annotations
@@ -26,10 +26,9 @@ from ufmstar_torch.eval.sequences.intrinsics import pinhole_values
 from ufmstar_torch.eval.sequences.own_output import RECORDS, read_records
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS
 
-# [m] A smaller sigma gives a point no more weight, as no depth is known better.
-_LEAST_SIGMA = 1e-3
+_LEAST_SIGMA = 1e-3  # [m] lower limit of sigma in a point's weight
 _HALF = 2**20  # a voxel's number on an axis is within +- this, so that three fit into 64 bits
-_FOLD = 4_000_000  # points that are held until they are merged
+_FOLD = 4_000_000  # number of points in memory before they are merged
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,25 +48,23 @@ class RunFrame:
     image_intrinsics: NDArray[np.float64] | None = None  # [3, 3] of the image [px]
 
     def at_image(self) -> RunFrame:
-        """The frame with maps at the pixels of its image, NaN where they do not show what the image shows; itself
-        without an image."""
+        """The frame with maps at the pixels of its image, NaN outside the maps; unchanged without an image."""
         if self.image is None or self.image_intrinsics is None:
             return self
         K, size = self.image_intrinsics, (self.image.shape[0], self.image.shape[1])
         depth, sigma = (resample_nearest(values, self.intrinsics, K, size) for values in (self.depth, self.sigma))
-        known = depth > 0
-        return replace(self, intrinsics=K, depth=known_where(known, depth), sigma=known_where(known, sigma))
+        valid = depth > 0
+        return replace(self, intrinsics=K, depth=known_where(valid, depth), sigma=known_where(valid, sigma))
 
     def points(self) -> tuple[NDArray[np.float64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """[P, 3] the points of the pixels that are kept, in the camera's axes [m], and these pixels' rows and
-        columns."""
+        """[P, 3] points in the camera's axes [m] of the pixels with a depth, and these pixels' rows and columns."""
         v, u = np.nonzero(np.isfinite(self.depth))
         return points_of(u, v, self.depth[v, u], self.intrinsics), (v, u)
 
 
 def gated_frames(out: Path, max_sigma: float, max_relative_sigma: float) -> Iterator[RunFrame]:
-    """The finished frames of a run. Pixels of a larger sigma [m], or a larger one as a share of the depth, are left
-    out. Raises ValueError: no run's folder, or one without a finished frame."""
+    """The finished frames of a run, without pixels whose sigma exceeds ``max_sigma`` [m], or ``max_relative_sigma`` as
+    a share of the depth. Raises ValueError: ``out`` is no run's folder, or has no finished frame."""
     if not (out / RECORDS).is_file():
         raise ValueError(f"{out} is no output of `ufmstar run`: it has no {RECORDS}")
     records = read_records((out / RECORDS).read_bytes(), out / RECORDS)
@@ -83,14 +80,14 @@ def _gated(out: Path, record: Mapping[str, Any], max_sigma: float, max_relative_
     depth, variance = maps[f"{prefix}depth"], maps[f"{prefix}variance"]
     with np.errstate(invalid="ignore"):
         sigma = np.sqrt(variance)
-        kept = maps["valid"] & (depth > 0) & np.isfinite(depth)
-        kept &= (sigma <= max_sigma) & (sigma <= max_relative_sigma * depth)
+        mask = maps["valid"] & (depth > 0) & np.isfinite(depth)
+        mask &= (sigma <= max_sigma) & (sigma <= max_relative_sigma * depth)
     about = (record["name"], record["index"], record.get("timestamp"), maps["T_world_cam"], maps["intrinsics"])
-    return RunFrame(*about, known_where(kept, depth), known_where(kept, sigma), maps.get("anchors"), record)
+    return RunFrame(*about, known_where(mask, depth), known_where(mask, sigma), maps.get("anchors"), record)
 
 
 def with_images(frames: Iterator[RunFrame], sequence: FrameSequence) -> Iterator[RunFrame]:
-    """The frames with the images of their recording, where they can be read."""
+    """The frames with the images of their recording, if these can be read."""
     for frame in frames:
         if frame.index < len(sequence) and sequence.names[frame.index] == frame.name:
             with suppress(FrameError):
@@ -111,7 +108,7 @@ def export_depth(frames: Iterator[RunFrame], out: Path) -> str:
 
 
 def export_trajectory(frames: Iterator[RunFrame], out: Path) -> str:
-    """Lines "time tx ty tz qx qy qz qw", the time [s] or, without one, the frame's number."""
+    """Lines "time tx ty tz qx qy qz qw", with the time [s] or, without one, the frame's index."""
     from scipy.spatial.transform import Rotation
 
     lines = ["# time tx ty tz qx qy qz qw, camera-to-world [m]"]
@@ -127,8 +124,8 @@ def export_trajectory(frames: Iterator[RunFrame], out: Path) -> str:
 def export_cloud(frames: Iterator[RunFrame], out: Path, voxel: float) -> str:
     """cloud.ply: x y z and sigma [m], and red green blue where images can be read.
 
-    A point is the mean of the pixels in a voxel of that side [m], weighted by 1/sigma^2. Its sigma is
-    sqrt(n / sum 1/sigma^2): a network's views err alike, so that it does not shrink with their number n.
+    A point is the mean of the pixels in a voxel with side ``voxel`` [m], weighted by 1/sigma^2. Its sigma is
+    sqrt(n / sum 1/sigma^2), which does not shrink with the number n of pixels, because their errors are correlated.
     """
     keys, sums = np.zeros(0, np.int64), np.zeros((0, 8))
     waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
@@ -152,8 +149,8 @@ def export_cloud(frames: Iterator[RunFrame], out: Path, voxel: float) -> str:
 
 
 def export_transforms(frames: Iterator[RunFrame], out: Path) -> str:
-    """transforms.json with images as they are, and depth and sigma at their pixels (16 bits, 0 = left out). Frames
-    whose image cannot be read are left out."""
+    """transforms.json with unchanged images, and depth and sigma at their pixels (16 bits, 0 = left out). Frames whose
+    image cannot be read are left out."""
     import cv2
 
     folder, unit, listed = export_folder(out, "transforms"), None, []
@@ -180,7 +177,7 @@ def export_transforms(frames: Iterator[RunFrame], out: Path) -> str:
 
 
 def run_settings(out: Path) -> dict[str, Any]:
-    """The options with which a run was started, by name. Raises ValueError: its summary cannot be read."""
+    """The options of a run, by name. Raises ValueError: its summary cannot be read."""
     try:
         return dict(json.loads((out / "summary.json").read_text(encoding="utf-8"))["settings"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
@@ -188,13 +185,13 @@ def run_settings(out: Path) -> dict[str, Any]:
 
 
 def points_of(u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any], K: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[P, 3] in the camera's axes [m] of pixels u, v [px] with a depth [m]."""
+    """[P, 3] points in the camera's axes [m] of pixels u, v [px] with a depth [m]."""
     z, y = depth.astype(np.float64), (v - K[1, 2]) / K[1, 1]
     return np.stack([(u - K[0, 2] - K[0, 1] * y) / K[0, 0] * z, y * z, z], axis=-1)
 
 
 def _voxels(frame: RunFrame, voxel: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """[P] the number of each pixel's voxel, and [P, 8] its weight w, w x, w y, w z, w r, w g, w b, and 1."""
+    """[P] the key of each pixel's voxel, and [P, 8] its weight w, w x, w y, w z, w r, w g, w b, and 1."""
     in_camera, (v, u) = frame.points()
     sigma, K, T = np.maximum(frame.sigma[v, u], _LEAST_SIGMA), frame.intrinsics, frame.T_world_cam
     points = in_camera @ T[:3, :3].T + T[:3, 3]

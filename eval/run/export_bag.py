@@ -1,7 +1,7 @@
-"""A run's result as a ROS 2 bag (mcap), written with rosbags: what RViz, a costmap or ``open_sequence`` reads.
+"""A run's result as a ROS 2 bag (mcap), written with rosbags, for RViz, a costmap or ``open_sequence``.
 
-Frames: tf has ``camera`` (optical axes) in ``world``. Images, depth and sigma show the same pixels, the image's;
-without images, those of the depth maps. A pixel that is left out is NaN (REP 118).
+Frames: tf has ``camera`` (optical axes) in ``world``. Images, depth and sigma have the pixels of the image, or of the
+depth maps without images. A pixel that is left out is NaN (REP 118).
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _FLOAT32 = 7  # of sensor_msgs/PointField
 
 
 def export_bag(frames: Iterator[RunFrame], out: Path) -> str:
-    """OUT/export/bag: of each frame the image (where the recording can be read), camera info, depth and sigma (32FC1,
-    [m]), its points in the camera's axes with their variance [m^2], and the camera's pose in tf. An earlier bag is
-    replaced when the new one is whole. Raises ModuleNotFoundError: rosbags is not installed; ValueError: a frame's time
-    is not within ROS's 0 to 2^31 s, or the bag's place is not a folder."""
+    """Write OUT/export/bag. Each frame has the image (if the recording can be read), camera info, depth and sigma
+    (32FC1, [m]), points in the camera's axes with their variance [m^2], and the camera's pose in tf. An earlier bag is
+    replaced when the new one is complete. Raises ModuleNotFoundError: rosbags is not installed; ValueError: a frame's
+    time is not within ROS's 0 to 2^31 s, or the bag's path is not a folder."""
     how = ("ROS bags need rosbags", "'ufmstar-torch[recordings]'")
     rosbag2, stores = optional("rosbags.rosbag2", *how), optional("rosbags.typesys", *how)
     folder = export_folder(out) / "bag"
@@ -47,7 +47,7 @@ def export_bag(frames: Iterator[RunFrame], out: Path) -> str:
 
 
 def _write_bag(rosbag2: Any, ros: _Messages, folder: Path, frames: Iterator[RunFrame]) -> int:
-    """Write the bag into a new folder; the number of frames."""
+    """Write the bag into a new folder. Returns the number of frames."""
     count = 0
     with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
@@ -80,7 +80,7 @@ def _of_frame(ros: _Messages, stamp: int, frame: RunFrame) -> dict[str, Any]:
 
 
 class _Messages:
-    """ROS 2's messages of arrays."""
+    """Makes ROS 2's messages from arrays."""
 
     def __init__(self, store: Any) -> None:
         self.store = store

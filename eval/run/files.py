@@ -1,4 +1,4 @@
-"""Strict JSON, and the files that are complete or absent (``ufmstar_torch.atomic``)."""
+"""Strict JSON, and atomic writing of files (``ufmstar_torch.atomic``)."""
 
 from __future__ import annotations
 

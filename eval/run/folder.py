@@ -22,10 +22,10 @@ from ufmstar_torch.stateful import flat
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 
-_SHOWN = 5  # differences that a message names
+_SHOWN = 5  # number of differences in a message
 _POLL_SECONDS = 0.02
 _UNFINISHED = "not finished"
-# Of a file system without locks.
+# Error codes of a file system without locks.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 Manifest = Mapping[str, Any]
@@ -42,20 +42,20 @@ class FolderKind:
     program: str  # as "ufmstar run"; the manifest contains it
     noun: str  # for messages: "run", "evaluation", "training", "demo"
     manifest: str  # path of the manifest below the folder
-    files: tuple[str, ...]  # glob patterns of the files and folders of earlier work, but for the manifest
-    # of the manifest and the files beside it; None = such work cannot be continued, and a summary replaces the manifest
-    # at the end.
+    files: tuple[str, ...]  # glob patterns of the files and folders of earlier work, without the manifest
+    # Format of the manifest and the other files; None = work cannot be resumed, and a summary replaces the manifest at
+    # the end.
     format: int | None = None
     lock: str | None = None  # path of the lock file below the folder; None = no lock
     wait: float = 0.0  # longest time [s] to wait for the lock
     parts: tuple[str, ...] = ()  # glob patterns of the locks of processes that work on parts
     allowed: tuple[str, ...] = ()  # entries that may exist in a folder before its manifest does
-    # glob patterns below the folder of temporary files of a killed process.
+    # Glob patterns below the folder of temporary files of a killed process.
     temporary: tuple[str, ...] = (".*.tmp",)
-    # of (a manifest, another one): the values of the first that must not change.
+    # (manifest, other manifest) -> the values of the first that must not change.
     identity: Callable[[Manifest, Manifest], Manifest] = lambda manifest, _: manifest["identity"]
-    # of (the manifest in the folder, the new one): the manifest from then on.
-    merge: Callable[[Manifest, Manifest], Manifest] = lambda then, _: then
+    # (manifest in the folder, new manifest) -> the manifest to write.
+    merge: Callable[[Manifest, Manifest], Manifest] = lambda earlier, _: earlier
 
     def read_manifest(self, out: Path) -> dict[str, Any]:
         """The manifest of a folder. Raises FolderError: it is damaged, or of another program or format."""
@@ -71,19 +71,19 @@ class FolderKind:
             raise FolderError(text) from error
 
     def earlier(self, out: Path, *, resume: bool, overwrite: bool) -> bool:
-        """Return whether the folder contains earlier work of the program. Raises FolderError: it is a file, contains
-        files of other programs, or contains earlier work and neither option is set."""
+        """True if the folder contains earlier work of the program. Raises FolderError: ``out`` is a file, or contains
+        files of other programs, or earlier work while neither option is set."""
         if out.exists() and not out.is_dir():
             raise FolderError(f"--out {out} is a file, expected a folder")
-        known, state = (out / self.manifest).is_file(), ""
-        if known and self.format is None:
+        ours, state = (out / self.manifest).is_file(), ""
+        if ours and self.format is None:
             try:
                 content = json.loads((out / self.manifest).read_text(encoding="utf-8"))
             except (OSError, ValueError, RecursionError):
                 content = None
-            known = isinstance(content, dict) and content.get("program") == self.program
-            state = content.get("state", "") if known else ""
-        if not known:
+            ours = isinstance(content, dict) and content.get("program") == self.program
+            state = content.get("state", "") if ours else ""
+        if not ours:
             if out.is_dir() and any(self._foreign(out)):
                 raise FolderError(f"--out {out} holds files of someone else: choose an empty or a new folder")
             return False
@@ -94,21 +94,21 @@ class FolderKind:
 
     def clear(self, out: Path) -> None:
         """Remove the files of earlier work, by their names. Raises FolderError: a process works on a part of it."""
-        with ExitStack() as held:
+        with ExitStack() as locks:
             for path in [path for pattern in self.parts for path in out.glob(pattern)]:
                 if (lock := hold(path)) is None:
                     raise FolderError(f"--out {out}: another process is working there now ({path.name})")
-                held.callback(lock.release)
+                locks.callback(lock.release)
             for path in [path for pattern in self.files for path in out.glob(pattern)]:
                 shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
     def _foreign(self, out: Path) -> list[Path]:
-        """Entries beside those of a process that was killed before it wrote the manifest."""
+        """Entries other than those of a process that was killed before it wrote the manifest."""
         manifest = out / self.manifest
-        own = {manifest, manifest.parent, *(out / name for name in self.allowed)}
-        own |= set() if self.lock is None else {out / self.lock}
+        expected = {manifest, manifest.parent, *(out / name for name in self.allowed)}
+        expected |= set() if self.lock is None else {out / self.lock}
         entries = [path for folder in {out, manifest.parent} if folder.is_dir() for path in folder.iterdir()]
-        return [path for path in entries if path not in own and not path.name.startswith(f".{manifest.name}.")]
+        return [path for path in entries if path not in expected and not path.name.startswith(f".{manifest.name}.")]
 
 
 @contextmanager
@@ -120,26 +120,26 @@ def output_folder(
     Args:
         out: created if missing.
         kind: of the folder.
-        content: of the manifest, beside program and format.
+        content: of the manifest, without program and format.
 
     Yields:
-        True if the folder contains earlier work that continues.
+        True if the folder contains earlier work to continue.
 
     Raises:
-        FolderError: as :meth:`FolderKind.earlier`; or the earlier work was started with other values (the message
-            names them), or another process holds the folder.
+        FolderError: as :meth:`FolderKind.earlier`; or the earlier work has other values (the message names them), or
+            another process holds the folder's lock.
         OSError: the folder cannot be made or locked.
     """
     kind.earlier(out, resume=resume, overwrite=overwrite)
     (out / kind.manifest).parent.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as held:
+    with ExitStack() as locks:
         if kind.lock is not None:
             lock = hold(out / kind.lock, wait=kind.wait)
             if lock is None:
                 for_long = f" for over {kind.wait:g} s" if kind.wait else ""
                 raise FolderError(f"--out {out}: another {kind.noun} is writing there now{for_long}")
-            held.callback(lock.release)
-        # Checked again: another process may have made the folder while this one waited.
+            locks.callback(lock.release)
+        # Check again, because another process may have created the folder while this one waited.
         resumed = kind.earlier(out, resume=resume, overwrite=overwrite) and resume
         for pattern in kind.temporary:
             remove_temporaries(out.glob(pattern))
@@ -159,8 +159,8 @@ def output_folder(
 
 
 def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
-    """Hold a lock file until it is released or the process ends, however that happens; None where another process, or
-    an earlier call, holds it for more than ``wait`` [s]. Raises OSError: the file cannot be opened or locked."""
+    """Lock a file until the lock is released or the process ends in any way. None if another process, or an earlier
+    call, holds it for more than ``wait`` [s]. Raises OSError: the file cannot be opened or locked."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(path, thread_local=False, fallback_to_soft=False)
@@ -177,9 +177,9 @@ def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
     return lock
 
 
-def differences(then: Manifest, now: Manifest) -> str:
-    """The difference between two nested mappings of plain values, by dotted names; "" if nothing does."""
-    before, after = flat(then), flat(now)
+def differences(old: Manifest, new: Manifest) -> str:
+    """The differences between two nested mappings of plain values, by dotted names; "" if they are equal."""
+    before, after = flat(old), flat(new)
     changed = [key for key in sorted(before.keys() | after.keys()) if before.get(key) != after.get(key)]
     text = "; ".join(f"{key} was {_short(before.get(key))}, now {_short(after.get(key))}" for key in changed[:_SHOWN])
     return text + (f" and {len(changed) - _SHOWN} more" if len(changed) > _SHOWN else "")

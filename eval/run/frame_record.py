@@ -19,12 +19,12 @@ _MAPS = (
     "posterior_depth", "posterior_variance", "posterior_inlier_variance", "posterior_outlier",
 )  # fmt: skip
 _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured", "single_view")
-# [m] A sigma below it claims more than any depth network can measure.
+# [m] No depth network is more accurate than this sigma.
 NEAR_ZERO = 1e-3
 
 
 def frame_arrays(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]:
-    """The arrays that are written of a frame, by name: maps, pose, intrinsics and anchors (``writers``)."""
+    """The arrays of a frame's file, by name: maps, pose, intrinsics and anchors (``writers``)."""
     maps = {name: value for name in _MAPS if (value := getattr(row, name)) is not None}
     arrays = {name: value.cpu().numpy().astype(np.float32, copy=False) for name, value in maps.items()}
     arrays |= {"valid": row.valid.cpu().numpy(), "T_world_cam": row.T_world_cam, "intrinsics": row.intrinsics}
@@ -37,7 +37,7 @@ def frame_arrays(frame: Frame | None, row: RowResult) -> dict[str, NDArray[Any]]
 
 def frame_record(result: FrameResult, key: str, writing: float, saving: float) -> dict[str, Any]:
     """The line of frames.jsonl of a frame: state, figures and times [ms] of the row ``key``, or why it was skipped.
-    ``writing`` and ``saving`` are the times of its files and of the checkpoint before [ms]."""
+    ``writing`` and ``saving`` are the times to write its files and the previous checkpoint [ms]."""
     about: dict[str, Any] = {"index": result.index, "name": result.name}
     if result.frame is not None and result.frame.timestamp is not None:
         about["timestamp"] = result.frame.timestamp
@@ -70,8 +70,8 @@ def _figures(row: RowResult) -> dict[str, Any]:
 
 
 def _times(result: FrameResult, row: RowResult, writing: float, saving: float) -> dict[str, float]:
-    """Times by stage [ms]; stages overlap. "prepare" is the prediction's time without the network's. "save" is the
-    previous frame's, and "cycle" the time since the previous frame."""
+    """Times by stage [ms]; stages overlap. "prepare" is the prediction's time without the network's, "save" the
+    previous frame's, "cycle" the time since the previous frame."""
     ms = result.ms
     return {
         "read": ms["read"],
@@ -88,9 +88,9 @@ def _times(result: FrameResult, row: RowResult, writing: float, saving: float) -
 def _anchor_figures(row: RowResult) -> dict[str, Any]:
     """The frame's counts of anchors, and the means of B [m^2] and of r; {} without anchors.
 
-    ``tracked`` corners were followed from the frame before (of a map of landmarks: all), ``found`` of them triangulated
-    (in view); ``usable`` lie on a pixel with a depth, and ``used`` agree with others. ``without`` is the reason where
-    none is used, ``confidence`` whether the network's was used.
+    ``tracked``: corners tracked from the previous frame (for a map of landmarks: all); ``found``: of these,
+    triangulated ones (in view); ``usable``: of these, on a pixel with a depth; ``used``: of these, consistent with
+    others. ``without``: why no anchor is used; ``confidence``: True if the network's confidence was used.
     """
     landmarks, statistics = row.landmarks, row.statistics
     if landmarks is None or statistics is None or row.anchored is None or row.bias is None:

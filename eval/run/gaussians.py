@@ -1,8 +1,8 @@
 """The mixture as files: splat attributes (binary PLY) for viewers, npz for programs.
 
-Positions are in the frame of the mixture (the first camera: x right, y down, z forward), or in the
-world where ``T_world_first`` is given. Lengths in metres. PLY stores float32, as its viewers expect:
-sub-millimetre up to kilometres from the origin.
+Positions are in the frame of the mixture (the first camera: x right, y down, z forward), or in the world with
+``T_world_first``. Lengths are in metres. PLY stores float32, as viewers expect: sub-millimetre up to kilometres from
+the origin.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.mixture import GaussianMixture
 
-# Below this standard deviation [m] an axis is drawn as if it had it: log(0) has no place in a file, and
-# a viewer divides by the axes. A micrometre is far below any depth.
+# Lower limit of the standard deviation of an axis [m], because files store its logarithm and viewers divide by it.
 SIGMA_FLOOR = 1e-6
 # The constant spherical harmonic: viewers show the colour 1/2 + SH_DC f_dc.
 SH_DC = 0.5 / np.sqrt(np.pi)
@@ -33,13 +32,13 @@ _TYPES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
 
 
 def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> int:
-    """Write the occupied components of the first stream as Gaussian splats, atomically; their number.
+    """Write the occupied components of the first stream as Gaussian splats, atomically. Returns their number.
 
-    Attributes are in the order and with the meaning that 3D Gaussian splatting viewers expect: x y z [m], nx ny nz (the
-    shortest axis), f_dc_0..2 (colour), opacity (logit), scale_0..2 = ln sigma [ln m], rot_0..3 = unit quaternion w x y
-    z, so that Sigma = R diag(exp(scale))^2 R^T. Behind them our own: weight [px], disagreement [m^2], count. The colour
-    is sqrt(disagreement) in magma from 0 to its 99th percentile, which the header states; grey where one view alone saw
-    it. ``T_world_first`` [4, 4] or [1, 4, 4] leads from the mixture's frame to the world; None = stay there.
+    The first attributes are those of 3D Gaussian splatting viewers: x y z [m], nx ny nz (the shortest axis), f_dc_0..2
+    (colour), opacity (logit), scale_0..2 = ln sigma [ln m], rot_0..3 = unit quaternion w x y z, so that
+    Sigma = R diag(exp(scale))^2 R^T. The last ones are weight [px], disagreement [m^2] and count. The colour is
+    sqrt(disagreement) in magma from 0 to its 99th percentile, which the header states; components seen from one view
+    are grey. ``T_world_first`` [4, 4] or [1, 4, 4] maps the mixture's frame to the world; None = keep the frame.
     """
     parts = Components(mixture, T_world_first)
     quaternion = Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True)
@@ -53,8 +52,8 @@ def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_fir
 
 
 def write_mixture_npz(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> None:
-    """Write all streams exactly, atomically: the fields of ``GaussianMixture``, and ``T_world_first`` ([B, 4, 4] or
-    [4, 4]) in float64. Slots behind the last occupied one are left out."""
+    """Write all streams without loss, atomically: the fields of ``GaussianMixture``, and ``T_world_first`` ([B, 4, 4]
+    or [4, 4]) in float64. Slots after the last occupied one are omitted."""
     used = int(mixture.valid.any(0).nonzero().max()) + 1 if bool(mixture.valid.any()) else 0
     fields = {name: value[:, :used].detach().cpu().numpy() for name, value in mixture.tensors().items()}
     if T_world_first is not None:
@@ -63,9 +62,10 @@ def write_mixture_npz(path: str | Path, mixture: GaussianMixture, *, T_world_fir
 
 
 class Components:
-    """The occupied components of the first stream in float64, in the frame asked for: mean [K, 3] [m]; axes [K, 3, 3],
-    rotations whose columns are the principal axes, shortest first; sigma [K, 3], standard deviations along them [m];
-    weight, disagreement, count [K]; colour [K, 3] uint8, and the legend that explains it."""
+    """The occupied components of the first stream in float64, in the world or in the mixture's frame (without
+    ``T_world_first``): mean [K, 3] [m]; axes [K, 3, 3], rotations whose columns are the principal axes, shortest first;
+    sigma [K, 3], standard deviations along them [m]; weight, disagreement, count [K]; colour [K, 3] uint8 and its
+    legend."""
 
     def __init__(self, mixture: GaussianMixture, T_world_first: Tensor | None) -> None:
         used = mixture.valid[0]

@@ -33,8 +33,8 @@ from ufmstar_torch.ufmstar import UfMStar
 class Checkpoint:
     """The state of a run after a frame."""
 
-    position: int = 0  # number of frames handled, skipped ones included
-    unit: float | None = None  # of the depth PNGs [m per count]; None: no frame is written yet
+    position: int = 0  # number of processed frames, skipped ones included
+    unit: float | None = None  # of the depth PNGs [m per count]; None before the first frame
     state: dict[str, Tensor] = field(default_factory=dict)  # of the run's row: UfM*, alternation, tracks
     metrics: dict[str, dict[str, Tensor]] = field(default_factory=dict)  # sums of the metrics, by name
     # {"first", "frames", "seconds"} of every start of the program.
@@ -45,27 +45,27 @@ class Checkpoint:
 class RunJob:
     """A run: its sequence, network and settings."""
 
-    sequence: FrameSequence  # the posed frames
-    indices: range  # which of them, in order
-    source: DepthSource  # of the depth
+    sequence: FrameSequence  # with poses
+    indices: range  # of the frames, in order
+    source: DepthSource  # of depth
     config: UfMStarConfig  # of UfM*
     device: torch.device  # of the networks; UfM* runs on the CPU, which for one stream is faster than a GPU
-    settings: Mapping[str, Any]  # everything the user chose, as plain values, for the summary
+    settings: Mapping[str, Any]  # the user's options, as plain values, for the summary
     recalibration: Recalibration | None = None  # of the variance
-    every: bool = False  # all members predict on every image, instead of one in turn
-    video: bool = True  # whether to make preview.mp4
-    sheet: bool = True  # whether to make contact_sheet.png
+    every: bool = False  # True if all members predict on every image, instead of alternating
+    video: bool = True  # True to make preview.mp4
+    sheet: bool = True  # True to make contact_sheet.png
     landmarks: str | LandmarkSource = CORNERS  # "corners", "dense" or a map of landmarks; for ``config.anchors``
-    scale: NetworkScale | None = None  # of the poses, where it is the network's own; anchors then show shape alone
+    scale: NetworkScale | None = None  # of the poses, if it is the network's; anchors then correct shape alone
 
     @cached_property
     def corners(self) -> list[FollowedCorners]:
-        """Corners tracked over some of the frames."""
+        """Corners tracked over some frames."""
         return track_corners(self.sequence, self.indices)
 
     @cached_property
     def image_fit(self) -> ImageFit | None:
-        """The fit of poses and intrinsics to the images; None where no corner could be followed."""
+        """The fit of poses and intrinsics to the images; None if no corner could be tracked."""
         return image_fit(self.sequence, self.corners)
 
     def metrics(self, checkpoint: Checkpoint) -> RunMetrics:
@@ -96,7 +96,7 @@ class RunJob:
         return {**self.source.identity, **anchors}
 
     def identity(self) -> dict[str, Any]:
-        """Plain values on which the results depend. A run is only continued with the same ones."""
+        """Plain values on which the results depend. A run is only continued with equal values."""
         sequence, part = self.sequence, tuple(self.sequence.entries[index] for index in self.indices)
         return {
             "sequence": {
@@ -115,7 +115,7 @@ class RunJob:
         }
 
     def _first_frame(self) -> str | None:
-        """A digest of the first frame's pixels, which other data under the same names would not have."""
+        """A digest of the first frame's pixels, which detects other data with the same names."""
         try:
             frame = self.sequence[self.indices[0]]
         except FrameError:

@@ -1,4 +1,4 @@
-"""Versions, hardware, load and devices, as results record them."""
+"""Versions, hardware, load and devices for the record of results."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-# Distributions by the name under which a report lists them.
+# Distributions by their name in a report.
 _PACKAGES = {"ufmstar_torch": "ufmstar-torch", "torch": "torch", "numba": "numba", "numpy": "numpy"}
 _PACKAGES |= {"torchvision": "torchvision", "llvmlite": "llvmlite", "onnxruntime": "onnxruntime"}
-# Settings of the environment that change how long a parallel loop takes, above all beside other work.
+# Environment variables that change the time of parallel loops, especially under other load.
 _ENVIRONMENT = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER")
 
 
@@ -27,7 +27,7 @@ def versions() -> dict[str, str | None]:
 
 
 def hardware() -> dict[str, Any]:
-    """The processor, how many of its cores this process may use, and the system."""
+    """The processor, the number of cores of this process, and the system."""
     return {
         "cpu": cpu_model(),
         "cores": available_cores(),
@@ -45,20 +45,20 @@ def available_cores() -> int:
 
 
 def share_threads() -> None:
-    """Limit the threads of torch, ONNX Runtime and the kernels to one fewer than the cores: one is left for the threads
-    that read and write frames."""
+    """Limit the threads of torch, ONNX Runtime and the kernels to one fewer than the cores, which leaves one core for
+    the threads that read and write frames."""
     import torch
 
     torch.set_num_threads(max(1, min(torch.get_num_threads(), available_cores() - 1)))
 
 
 def load_average() -> float | None:
-    """Mean number of running or waiting processes over the last minute; None where the system does not report it."""
+    """Mean number of running or waiting processes over the last minute; None if the system does not report it."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
 
 
 def cpu_model() -> str:
-    """The processor's name from /proc/cpuinfo, elsewhere from the platform module."""
+    """The processor's name from /proc/cpuinfo, or else from the platform module."""
     information = Path("/proc/cpuinfo")
     if information.exists():
         for line in information.read_text().splitlines():

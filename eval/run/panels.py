@@ -1,4 +1,4 @@
-"""Pictures in rows with words at the left, captions above and colour bars below: every sheet and strip is one grid."""
+"""Grids of pictures with text at the left, captions above and colour bars below, for all sheets and strips."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _GAP, _MARGIN, _CAPTION, _BAR, _BARS, _TITLE = 0.06, 0.08, 0.2, 0.1, 0.62, 0.34
 
 
 class Panel(NamedTuple):
-    """One picture [h, w, 3] uint8 with a caption above; None leaves a place with the words ``absent``."""
+    """One picture [h, w, 3] uint8 with a caption above; None shows the text ``absent`` instead."""
 
     rgb: NDArray[np.uint8] | None
     caption: str = ""
@@ -60,11 +60,11 @@ def draw_grid(
     words: float = 1.5,
 ) -> None:
     """Draw the rows below each other and write the picture (PNG), atomically. ``aspect`` is height by width of a
-    picture, ``cell`` and ``words`` the widths of a picture and of the words at the left [in]."""
+    picture, ``cell`` and ``words`` the widths of a picture and of the text at the left [in]."""
     names = [break_name(row.title, max(8, int(12 * words))) for row in rows]
     named = [0.16 * (name.count("\n") + 1) + 0.05 for name in names]
     heads = [_CAPTION if any(panel.caption for panel in row.panels) else 0.0 for row in rows]
-    # Pictures of a driving car are flatter than the words beside them.
+    # Wide pictures, as of a driving car, are flatter than the text at their left.
     tall = [max(cell * aspect, above + 0.145 * len(row.lines)) for above, row in zip(named, rows, strict=True)]
     step = cell + _GAP
     width = _MARGIN + words + max(len(row.panels) for row in rows) * step - _GAP + _MARGIN
@@ -104,24 +104,24 @@ def new_sheet(width: float, height: float, title: str) -> Any:
 
 
 def say(figure: Any, x: float, y: float, words: str, **how: Any) -> None:
-    """Words at a place of a sheet [in]."""
+    """Draw text at a position of a sheet [in]."""
     figure.text(x, y, colours.plain(words), transform=figure.dpi_scale_trans, **how)
 
 
 def axes_at(figure: Any, left: float, bottom: float, width: float, height: float) -> Any:
-    """Axes at a place of a sheet [in]."""
+    """Axes at a position of a sheet [in]."""
     wide, high = figure.get_size_inches()
     return figure.add_axes((left / wide, bottom / high, width / wide, height / high))
 
 
 def break_name(name: str, letters: int) -> str:
-    """The name on as many lines as it needs, broken behind hyphens, underscores and blanks where it can be."""
+    """The name on lines of at most ``letters``, broken after hyphens, underscores and blanks if possible."""
     lines, rest = [], name
     while len(rest) > letters:
-        at = max(rest.rfind(mark, 1, letters) for mark in "-_ ")
-        at = letters - 1 if at < 1 else at
-        lines.append(rest[: at + 1].rstrip())
-        rest = rest[at + 1 :]
+        end = max(rest.rfind(mark, 1, letters) for mark in "-_ ")
+        end = letters - 1 if end < 1 else end
+        lines.append(rest[: end + 1].rstrip())
+        rest = rest[end + 1 :]
     return "\n".join([*lines, rest])
 
 
@@ -136,7 +136,7 @@ def _draw_panel(axes: Any, panel: Panel) -> None:
 
 
 def draw_bar(axes: Any, bar: Bar) -> None:
-    """A horizontal colour bar with its label in the axes; an arrow at each end but 0, beyond which nothing lies."""
+    """Draw a horizontal colour bar with its label in the axes, with an arrow at each end unless it is 0."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm, Normalize
     from matplotlib.ticker import LogLocator, MaxNLocator, StrMethodFormatter
@@ -160,7 +160,7 @@ def draw_bar(axes: Any, bar: Bar) -> None:
 
 # ---- the contact sheet: image | depth | sigma | error, one row per frame ----
 
-# The maps of a frame, in the order of their columns: the label, and the scale that several of them share.
+# The maps of a frame, in the order of their columns: label, and name of their shared scale.
 MAPS = {
     "depth": ("depth", "depth"),
     "posterior": ("posterior", "depth"),
@@ -175,10 +175,10 @@ DECADES = 2  # range of the logarithmic scale of errors: a linear one would show
 
 @dataclass(frozen=True, eq=False)
 class FramePanel:
-    """One frame to be shown: its image [H, W, 3] uint8 RGB of any size, and its maps [h, w] [m], NaN where unknown.
+    """One displayed frame: its image [H, W, 3] uint8 RGB of any size, and its maps [h, w] [m], NaN where unknown.
 
-    ``maps`` has names of ``MAPS``, "depth" and "sigma" always, and "measured", the share of the disagreement that rests
-    on two views or more, which stripes sigma. ``note`` ("K = 31") stands beside the name.
+    ``maps`` has names of ``MAPS``, "depth" and "sigma" always, and "measured", the share of the disagreement from two
+    views or more, which draws stripes on sigma. ``note`` ("K = 31") is next to the name.
     """
 
     name: str
@@ -209,23 +209,25 @@ class MapColumn(NamedTuple):
 
 
 def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:
-    """The columns right of the image, of all maps that some panel has, on scales that fit all panels: depths from their
-    1st to their 99th percentile; sigmas and errors on one logarithmic scale up to the largest of their 99th
-    percentiles, so that a sigma as large as the error has its colour."""
-    of = {name: [panel.maps[name] for panel in panels if name in panel.maps] for name in MAPS}
-    depth = colours.robust_range([*of["depth"], *of["posterior"]], from_zero=False)
-    lengths = [of[name] for name in ("sigma", "error", "posterior_sigma", "posterior_error") if of[name]]
+    """The columns right of the image, one per map in any panel, with scales for all panels: depths from their 1st to
+    their 99th percentile; sigmas and errors share a logarithmic scale up to the largest of their 99th percentiles, so
+    that equal sigma and error have the same colour."""
+    maps_by_name = {name: [panel.maps[name] for panel in panels if name in panel.maps] for name in MAPS}
+    depth = colours.robust_range([*maps_by_name["depth"], *maps_by_name["posterior"]], from_zero=False)
+    lengths = [
+        maps_by_name[name] for name in ("sigma", "error", "posterior_sigma", "posterior_error") if maps_by_name[name]
+    ]
     high = max(colours.robust_range(maps, from_zero=True)[1] for maps in lengths)
     length = ColourScale(high / 10**DECADES, high, colours.ERROR_MAP, logarithmic=True)
     scales = {"depth": ColourScale(*depth, colours.DEPTH_MAP), "length": length}
-    return [MapColumn(label, scales[scale], name) for name, (label, scale) in MAPS.items() if of[name]]
+    return [MapColumn(label, scales[scale], name) for name, (label, scale) in MAPS.items() if maps_by_name[name]]
 
 
 def contact_sheet(
     panels: Sequence[FramePanel], path: str | Path, *, title: str = "", columns: Sequence[MapColumn] | None = None
 ) -> None:
-    """Draw the frames below each other and write the picture (PNG), atomically; neighbouring ``columns`` (None: of all
-    maps) of one scale share a colour bar. Raises ImportError: matplotlib is missing."""
+    """Draw the frames below each other and write the picture (PNG), atomically. Adjacent ``columns`` (None = all maps)
+    with the same scale share a colour bar. Raises ImportError: matplotlib is missing."""
     colours.require_matplotlib()
     columns = map_columns(panels) if columns is None else columns
     absent = ["no ground truth" if column.field == "error" else "none" for column in columns]

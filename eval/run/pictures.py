@@ -1,7 +1,7 @@
 """Pictures of a run: contact sheet and preview video.
 
-A run's pictures are drawn from its finished frames on disk, so that their scales fit the whole run, and a run that was
-stopped and continued gets the same ones.
+A run's pictures are drawn from its finished frames on disk. Their scales therefore fit the whole run, and a resumed run
+has the same pictures.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from ufmstar_torch.eval.sequences.intrinsics import pinhole
 
 SHEET = "contact_sheet.png"
 SHEET_ROWS, POSTERIOR_ROWS, SCALE_FRAMES = 6, 3, 12
-# Without timestamps; and the range in which a recording's own rate is kept.
+# Rate of videos without timestamps, and range of rates with them.
 DEFAULT_FPS, FPS_RANGE = 10.0, (2.0, 30.0)
 
 
 @dataclass(frozen=True, eq=False)
 class FinishedRun:
-    """The finished frames of a run in the folder ``out``: their sequence, their lines of frames.jsonl in order, and
-    whether there is a ground truth that the prediction can differ from."""
+    """The finished frames of a run in the folder ``out``: their sequence, and their lines of frames.jsonl in order.
+    ``with_error``: True if there is ground truth other than the prediction itself."""
 
     out: Path
     frames: FrameSequence
@@ -44,14 +44,14 @@ class FinishedRun:
     with_error: bool
 
     def panel(self, number: int) -> FramePanel:
-        """FinishedRun frame ``number``, with square pixels, and the image cut to what the prediction shows."""
+        """Finished frame ``number`` with square pixels, and its image cropped to the prediction's field of view."""
         record = self.records[number]
         stored = read_frame(frame_file(self.out, record["name"]))
         K, size = pinhole(*record["intrinsics"]), (record["size"][0], record["size"][1])
         K_square, size_square = square_pixels(K, size)
         try:
             frame: Frame | None = self.frames[record["index"]]
-        except FrameError:  # it can be read no more
+        except FrameError:  # the recording can no longer be read
             frame = None
         maps = {"depth": stored["depth"], "sigma": np.sqrt(stored["variance"]), "measured": stored["measured"]}
         note = f"K = {record['components']}"
@@ -80,14 +80,14 @@ class FinishedRun:
     def fps(self) -> float:
         """Frames per second of the recording, for the video."""
         times = [self.frames.entries[record["index"]].timestamp for record in self.records]
-        known = np.array([time for time in times if time is not None])
-        if len(known) < 2 or len(known) < len(times) or not np.median(np.diff(known)) > 0:
+        stamps = np.array([time for time in times if time is not None])
+        if len(stamps) < 2 or len(stamps) < len(times) or not np.median(np.diff(stamps)) > 0:
             return DEFAULT_FPS
-        return float(np.clip(1 / np.median(np.diff(known)), *FPS_RANGE))
+        return float(np.clip(1 / np.median(np.diff(stamps)), *FPS_RANGE))
 
 
 def panel_of(name: str, note: str, frame: Frame, row: RowResult) -> FramePanel:
-    """The image of a frame and a row's maps of it: depth, sigma and, with ground truth, the absolute error."""
+    """The image of a frame and a row's maps: depth, sigma and, with ground truth, the absolute error."""
     assert frame.image is not None
     assert row.variance is not None
     maps = {"depth": row.depth.float().numpy(), "sigma": row.variance.float().sqrt().numpy()}
@@ -106,16 +106,17 @@ def common_columns(finished: FinishedRun) -> list[MapColumn]:
 
 
 def draw_sheet(finished: FinishedRun, columns: Sequence[MapColumn], title: str) -> None:
-    """Write contact_sheet.png: frames spread over the run, the last one included. The first is not, unless it is the
-    only one: it was compared with nothing."""
-    wide = "posterior" in finished.records[-1]  # before and after
+    """Write contact_sheet.png: frames spread over the run, the last one included. The first frame has no other view and
+    is excluded unless it is the only one."""
+    wide = "posterior" in finished.records[-1]
     numbers = finished.spread((POSTERIOR_ROWS if wide else SHEET_ROWS) + 1)
     panels = [finished.panel(number) for number in numbers[1:] or numbers]
     contact_sheet(panels, finished.out / SHEET, title=title, columns=columns)
 
 
 def draw_video(finished: FinishedRun, columns: Sequence[MapColumn]) -> Iterator[int]:
-    """Write preview.mp4 frame by frame; yields how many are done, so that the caller can report and stop."""
+    """Write preview.mp4 frame by frame. Yields the number of finished frames, so that the caller can report and
+    stop."""
     with write_video(finished.out / "preview.mp4", finished.fps()) as add:
         for number in range(len(finished.records)):
             add(preview_frame(finished.panel(number), columns))
@@ -123,8 +124,8 @@ def draw_video(finished: FinishedRun, columns: Sequence[MapColumn]) -> Iterator[
 
 
 def square_pixels(K: NDArray, size: Size) -> tuple[NDArray, Size]:
-    """K [3, 3] and (h, w) of the same view with fx = fy, not smaller than it is: networks that take squares of a wide
-    image predict maps that look squeezed."""
+    """K [3, 3] and (h, w) of the same view, enlarged to fx = fy. Networks with square inputs predict squeezed maps of
+    wide images."""
     f = max(K[0, 0], K[1, 1])
     new = (round(size[0] * f / K[1, 1]), round(size[1] * f / K[0, 0]))
     return resize_intrinsics(torch.from_numpy(K), size, new).numpy(), new
@@ -140,11 +141,11 @@ def field_of_view(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: 
 
 
 def absolute_error(depth: NDArray[Any], truth: NDArray[Any]) -> NDArray[np.float32]:
-    """[h, w] |depth - truth| [m], NaN where there is no truth (0)."""
+    """[h, w] |depth - truth| [m], NaN without ground truth (0)."""
     return known_where(truth > 0, np.abs(depth - truth))
 
 
-HEAD = 22  # [px] of the words above the pictures
+HEAD = 22  # [px] height of the text above the pictures
 
 
 def preview_frame(panel: FramePanel, columns: Sequence[MapColumn]) -> NDArray[np.uint8]:
@@ -159,7 +160,7 @@ def preview_frame(panel: FramePanel, columns: Sequence[MapColumn]) -> NDArray[np
     for words, picture in [(panel.name, panel.image), *((_words(column), column.rgb(panel)) for column in columns)]:
         cell = np.full((HEAD + cell_height, cell_width, 3), 255, np.uint8)
         if picture is not None:
-            # Maps keep their pixels, since blending would invent colours between valid and invalid.
+            # Nearest neighbour for maps: blending would add colours between valid and invalid.
             kind = cv2.INTER_NEAREST if cells else cv2.INTER_LINEAR
             cell[HEAD:] = cv2.resize(picture, (cell_width, cell_height), interpolation=kind)
         cv2.putText(cell, words, (2, HEAD - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (26, 26, 26), 1, cv2.LINE_AA)
@@ -169,29 +170,29 @@ def preview_frame(panel: FramePanel, columns: Sequence[MapColumn]) -> NDArray[np
 
 
 def _words(column: MapColumn) -> str:
-    """The name of a map and the ends of its scale, in letters that OpenCV draws."""
+    """The name of a map and the ends of its scale, in ASCII for OpenCV."""
     return f"{column.field.replace('_', ' ')} {column.scale.low:.2g}-{column.scale.high:.2g} m"
 
 
 @contextmanager
 def write_video(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
-    """Write an H.264 mp4, ``fps`` frames per second; the value appends a frame [H, W, 3] uint8 RGB, H and W even and
-    the same for all. The file takes its name when the block ends, also by Ctrl-C or an error, with the frames so far;
-    without one there is no file.
+    """Write an H.264 mp4 with ``fps`` frames per second. Yields a function that appends a frame [H, W, 3] uint8 RGB, H
+    and W even and equal for all frames. When the block ends, also by Ctrl-C or an error, the file with the frames so
+    far is renamed to ``path``; without a frame there is no file.
 
     Raises:
-        ImportError: imageio or imageio-ffmpeg is missing; names the extra that brings it.
-        OSError: ffmpeg stopped, on a full disk, say, or wrote no file.
+        ImportError: imageio or imageio-ffmpeg is missing; the message names the extra to install.
+        OSError: ffmpeg stopped, as on a full disk, or wrote no file.
     """
     if find_spec("imageio_ffmpeg") is None:
         raise ImportError("a video needs imageio-ffmpeg: pip install 'ufmstar-torch[eval]'")
     import imageio.v2
 
-    # ffmpeg goes by the ending, so it comes last here.
+    # ffmpeg chooses the format by the suffix, so the temporary name ends with it.
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.mp4")
-    # yuv420p is what browsers and slide programs play.
-    how: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "macro_block_size": 2, "quality": 7}
-    writer = imageio.v2.get_writer(temporary, format="FFMPEG", fps=fps, ffmpeg_log_level="error", **how)
+    # Browsers and slide programs play yuv420p.
+    encoding: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "macro_block_size": 2, "quality": 7}
+    writer = imageio.v2.get_writer(temporary, format="FFMPEG", fps=fps, ffmpeg_log_level="error", **encoding)
     count = 0
 
     def add(frame: NDArray[np.uint8]) -> None:

@@ -22,12 +22,12 @@ from ufmstar_torch.eval.run.pictures import panel_of
 from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.sample import sample_statistics
 
-# By what images are ranked: V, M, A, E or B, and the map of ``RowResult`` that has it.
+# The quantities for ranking, V, M, A, E and B, and their maps in ``RowResult``.
 PARTS = {
     "total": "variance", "disagreement": "disagreement", "aleatoric": "aleatoric", "epistemic": "epistemic",
     "anchored": "anchored",
 }  # fmt: skip
-_COMPARED = ("total", "disagreement")  # they rest on other views
+_COMPARED = ("total", "disagreement")  # need other views
 _PICTURES = 3  # at each end of the ranking
 _LETTERS = 20  # largest number of letters of a sequence's name next to a picture
 _UNITS = {"mean": "m2", "variance": "m4", "median": "m2", "maximum": "m2"}
@@ -35,7 +35,7 @@ _UNITS = {"mean": "m2", "variance": "m4", "median": "m2", "maximum": "m2"}
 
 @dataclass(frozen=True, eq=False)
 class RankedImage:
-    """An image: its line of scores.csv but for the rank, its score [m^2] (NaN = none), pose [4, 4] and median depth
+    """An image: its line of scores.csv without the rank, its score [m^2] (NaN = none), pose [4, 4] and median depth
     [m]."""
 
     line: dict[str, Any]
@@ -45,15 +45,15 @@ class RankedImage:
 
 
 class ImageScores(FrameSink):
-    """Scores the ``images`` of sequences, one after the other, in the order in which they came.
+    """Scores the ``images`` of sequences, in the order of processing.
 
     Args:
-        by: a name of ``PARTS``, whose mean over the pixels is the score: over the measured ones for V and M where the
-            config has ``unmeasured="nan"``.
-        measured: least share of pixels that two views compared, for an image to be ranked by V or M.
+        by: a name of ``PARTS``, whose mean over the pixels is the score; with ``unmeasured="nan"`` in the config, over
+            the measured pixels for V and M.
+        measured: smallest share of pixels seen in two views for an image to be ranked by V or M.
     """
 
-    sequence = ""  # the present one, as scores.csv names it
+    sequence = ""  # name of the current sequence in scores.csv
 
     def __init__(self, by: str, measured: float) -> None:
         self._by, self._measured = by, measured if by in _COMPARED else 0.0
@@ -68,8 +68,8 @@ class ImageScores(FrameSink):
         parts = {}
         for name, of in PARTS.items():
             if (values := getattr(row, of)) is not None:
-                known = torch.where(row.valid, values, torch.nan).flatten()[None]
-                parts[name] = {key: float(value) for key, value in asdict(sample_statistics(known)).items()}
+                masked = torch.where(row.valid, values, torch.nan).flatten()[None]
+                parts[name] = {key: float(value) for key, value in asdict(sample_statistics(masked)).items()}
         assert row.measured is not None
         share = float((row.measured >= 0.5)[row.valid].float().mean())
         score = parts[self._by]["mean"] if share >= self._measured else float("nan")
@@ -86,7 +86,7 @@ class ImageScores(FrameSink):
                 del self._shown[_PICTURES]
 
     def chosen(self, count: int | None, *, diverse: bool) -> list[int]:
-        """Numbers of the images to label, the first one first (``ufmstar_torch.choose``)."""
+        """Indices of the images to label, in the order of labelling (``ufmstar_torch.choose``)."""
         score = torch.tensor([image.score for image in self.images], dtype=torch.float64)
         count = None if count is None else min(count, len(score))
         if not diverse or bool(score.isnan().all()):
@@ -97,12 +97,12 @@ class ImageScores(FrameSink):
         return choose(score, count, poses=poses, distance=distance, sequences=sequences)
 
     def panels(self) -> Sequence[FramePanel]:
-        """The most certain images and the least certain ones, the latter first."""
+        """The least and the most certain images, from the least certain one on."""
         return [panel for _, _, panel in reversed(self._shown)]
 
 
 def require_part(job: RunJob, by: str) -> None:
-    """Raise a ValueError unless the images can be ranked ``by`` a part: the first readable frame is predicted."""
+    """Raises ValueError: the prediction of the first readable frame has no part to rank ``by``."""
     if by == "anchored" and job.config.anchors is None:
         raise ValueError("--by anchored needs --anchors or --posterior")
     for index in job.indices if by in ("aleatoric", "epistemic") else ():

@@ -1,7 +1,7 @@
-"""Frames in a rerun stream: of a finished run (``export_rerun``), or of one that goes on (``ufmstar live --view``).
+"""Frames in a rerun stream: of a finished run (``export_rerun``) or of a live one (``ufmstar live --view``).
 
-In 3D: the camera with its depth (16 bits), its points coloured by sigma, and its anchors, each with a line to the depth
-of its pixel. Beside it the image, sigma, and plots.
+The 3D view has the camera with its depth (16 bits), its points coloured by sigma, and its anchors, each with a line to
+the depth of its pixel. Other views have the image, sigma, and plots.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.optional import optional
 
 WORLD, CAMERA = "world", "world/camera"
-# Of a finished run, and of one that goes on.
+# Figures of a finished run, and of a live one.
 _PLOTS = (
     "mean_sigma", "mean_disagreement", "mean_network_sigma", "mean_anchored", "mean_bias", "components",
     "latency_ms", "depth_m", "sigma_m", "dropped", "skipped",
 )  # fmt: skip
 _JPEG = 80  # quality
-_POINTS = 4000  # of a frame, coloured by sigma
+_POINTS = 4000  # approximate number of points of a frame
 _LOCAL = "127.0.0.1"
-_OPENING, _SETTLED = 20.0, 1.0  # [s] that a viewer may take until it listens, and until it has failed if it does
+_OPENING, _SETTLED = 20.0, 1.0  # [s] time for a viewer to listen; time after which a listening viewer has not failed
 
 
 def rerun() -> Any:
@@ -47,7 +47,7 @@ def rerun() -> Any:
 
 
 class RerunLog:
-    """Logs frames to a ``rerun.RecordingStream``; the first one chooses the scales of depth and sigma (``scale``)."""
+    """Logs frames to a ``rerun.RecordingStream``. The first frame sets the scales of depth and sigma (``scale``)."""
 
     def __init__(self, stream: Any) -> None:
         self._rr, self._stream = rerun(), stream
@@ -76,9 +76,9 @@ class RerunLog:
         log(f"{CAMERA}/maps/depth", rr.DepthImage(counts, meter=1 / self._unit))
         log(f"{CAMERA}/maps/sigma", rr.Image(self.scale.rgb(frame.sigma)).compress(jpeg_quality=_JPEG))
         points, (v, u) = frame.points()
-        some = slice(None, None, max(1, len(points) // _POINTS))
-        colours = self.scale.rgb(frame.sigma[v, u][some])
-        log(f"{CAMERA}/points", rr.Points3D(points[some], colors=colours, radii=rr.Radius.ui_points(2)))
+        sample = slice(None, None, max(1, len(points) // _POINTS))
+        colours = self.scale.rgb(frame.sigma[v, u][sample])
+        log(f"{CAMERA}/points", rr.Points3D(points[sample], colors=colours, radii=rr.Radius.ui_points(2)))
         if frame.anchors is not None:
             self._add_anchors(frame, frame.anchors)
         for name in _PLOTS:
@@ -86,7 +86,7 @@ class RerunLog:
                 log(f"plots/{name}", rr.Scalars(value))
 
     def _add_anchors(self, frame: RunFrame, anchors: NDArray[np.float32]) -> None:
-        """Anchors [N, 4], and lines from them to the depth of their pixels, coloured by the distance as sigma is."""
+        """Log anchors [N, 4], and lines from them to the depth of their pixels, coloured by length on sigma's scale."""
         rr, K, scale = self._rr, frame.intrinsics, self.scale
         assert scale is not None
         u, v, measured = anchors[:, 0], anchors[:, 1], anchors[:, 2]
@@ -95,9 +95,9 @@ class RerunLog:
         height, width = frame.depth.shape
         column, row = np.rint(u).astype(int).clip(0, width - 1), np.rint(v).astype(int).clip(0, height - 1)
         depth = frame.depth[row, column]
-        known = np.isfinite(depth)
-        lines = np.stack([ends, points_of(u, v, depth, K)], axis=1)[known]
-        colours = scale.rgb(np.abs(depth - measured)[known])
+        valid = np.isfinite(depth)
+        lines = np.stack([ends, points_of(u, v, depth, K)], axis=1)[valid]
+        colours = scale.rgb(np.abs(depth - measured)[valid])
         self._stream.log(f"{CAMERA}/residuals", rr.LineStrips3D(lines, colors=colours))
 
 
@@ -116,8 +116,8 @@ def blueprint() -> Any:
 
 
 def open_viewer() -> tuple[Any, subprocess.Popen[bytes]]:
-    """A stream to a new viewer that listens on this computer alone (rerun's own ``spawn`` listens on every network),
-    and the viewer's process, which stays when this one ends. Raises ModuleNotFoundError: rerun-sdk is not installed;
+    """A stream to a new viewer that listens on this computer alone (rerun's ``spawn`` listens on every network), and
+    the viewer's process, which continues when this one ends. Raises ModuleNotFoundError: rerun-sdk is not installed;
     ConnectionError: the viewer does not start, as without a display."""
     rr = rerun()
     with socket.socket() as free:
@@ -127,9 +127,9 @@ def open_viewer() -> tuple[Any, subprocess.Popen[bytes]]:
     environment = {**os.environ, "RERUN_APP_ONLY": "true"}  # as spawn sets it
     quiet: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)  # a pipe would wait for its end
     viewer = subprocess.Popen(words, env=environment, start_new_session=True, **quiet)
-    ready, ends = 0.0, monotonic() + _OPENING
+    ready, deadline = 0.0, monotonic() + _OPENING
     while monotonic() < ready + _SETTLED or not ready:  # without a display it listens before it fails
-        if viewer.poll() is not None or monotonic() > ends:
+        if viewer.poll() is not None or monotonic() > deadline:
             viewer.terminate()
             raise ConnectionError("rerun's viewer does not start: is there a display?")
         ready = ready or (monotonic() if _listens(port) else 0.0)
@@ -148,8 +148,8 @@ def _listens(port: int) -> bool:
 
 
 def export_rerun(frames: Iterator[RunFrame], out: Path) -> str:
-    """OUT/export/run.rrd; an earlier one is replaced when the new one is whole. Raises ModuleNotFoundError: rerun-sdk
-    is not installed."""
+    """Write OUT/export/run.rrd. An earlier file is replaced when the new one is complete. Raises ModuleNotFoundError:
+    rerun-sdk is not installed."""
     rr, count = rerun(), 0
     file = export_folder(out) / "run.rrd"
     with TemporaryDirectory(dir=file.parent, prefix=".rrd") as new:

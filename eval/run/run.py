@@ -1,6 +1,6 @@
-"""``run``: a sequence through a depth source and UfM*, onto disk.
+"""``run``: processes a sequence with a depth source and UfM*, and writes the results.
 
-A frame's files are complete or absent, and an interrupted run continues with the same results.
+A frame's files are complete or absent. An interrupted run continues with the same results.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ def run(
     progress: Show = lambda _: None,
     stop: Stop = lambda: False,
 ) -> dict[str, Any]:
-    """Run a job and leave its frames, pictures, mixture and summary in a folder; the content of summary.json.
+    """Run a job and write its frames, pictures, mixture and summary to a folder. Returns the content of summary.json.
 
-    KeyboardInterrupt and OSError (a full disk) end the run in order: finished frames stay, and the summary
-    states the reason. A frame that cannot be read, or whose pose or intrinsics are unusable, is skipped and counted.
+    After KeyboardInterrupt and OSError (a full disk) finished frames stay, and the summary states the reason. A frame
+    that cannot be read, or whose pose or intrinsics are unusable, is skipped and counted.
 
     ``progress`` is called at the start of each stage and after every frame, ``stop`` before every frame: True ends the
-    run as KeyboardInterrupt does.
+    run like KeyboardInterrupt.
 
     Raises:
         FolderError: the folder cannot be used (``output_folder``).
         OSError: the summary cannot be written.
-        Exception: whatever else the network or UfM* raise, after the summary was written.
+        Exception: any other error of the network or UfM*, after the summary was written.
     """
     path, identity = Path(out), {"identity": job.identity()}
     how = {"resume": resume, "overwrite": overwrite}
@@ -72,7 +72,7 @@ def run(
 
 
 def _frames(folder: RunFolder, progress: Show, stop: Stop) -> None:
-    """The frames that are left."""
+    """Process the remaining frames."""
     job = folder.job
     warm_up_job(job, progress)
     row, position = job.row(folder.checkpoint), folder.checkpoint.position
@@ -82,7 +82,7 @@ def _frames(folder: RunFolder, progress: Show, stop: Stop) -> None:
 
 
 def warm_up_job(job: RunJob, progress: Show) -> None:
-    """Compile what a job needs before its first frame."""
+    """Compile a job's kernels before its first frame."""
     dense = job.config.anchors is not None and job.landmarks == DENSE
     warm_up_command(job.config, progress, dense=dense)
 
@@ -106,7 +106,7 @@ def _counts(folder: RunFolder) -> str:
 
 
 def _outputs(folder: RunFolder, progress: Show, stop: Stop) -> dict[str, str | None]:
-    """Mixture and pictures of all finished frames: by file, None if made, else why not."""
+    """Write the mixture and pictures of all finished frames. Returns by file None, or why it was not made."""
     job = folder.job
     done = [record for record in folder.records if record["state"] == "done"]
     if not done:
@@ -129,7 +129,7 @@ def _outputs(folder: RunFolder, progress: Show, stop: Stop) -> dict[str, str | N
                 raise Stopped
         if job.video:
             made["preview.mp4"] = None
-    except ImportError as error:  # an optional package; the frames are what a run is for
+    except ImportError as error:  # an optional package is missing; the frames are complete
         expected = {"contact_sheet.png": job.sheet, "preview.mp4": job.video}
         made |= {name: str(error) for name, requested in expected.items() if requested and name not in made}
     return made

@@ -2,7 +2,7 @@
 
 ```
 OUT/frames.jsonl       one line per frame, in order: pose, intrinsics, counts, means, times; or why it was skipped
-OUT/resume/run.json    what the run was started with
+OUT/resume/run.json    the run's inputs
 OUT/resume/state.pt    the checkpoint, replaced every few seconds and at the end
 OUT/resume/lock        locked during a run
 ```
@@ -46,12 +46,12 @@ RUN = FolderKind(
 
 
 class RunFolder(FrameSink):
-    """The output folder of a new or ``resumed`` job, a sink that writes every frame; for use with ``with``.
+    """The output folder of a new or ``resumed`` job: a sink that writes every frame, and a context manager.
 
     Attributes:
         checkpoint: the state after the last finished frame; on disk it may be some seconds older.
-        records: the lines of frames.jsonl up to there.
-        metrics: of the frames up to there; a sink before this one.
+        records: the lines of frames.jsonl up to that frame.
+        metrics: of the frames up to that frame; a sink that must precede this one.
 
     Raises:
         FolderError: the checkpoint cannot be read.
@@ -78,7 +78,7 @@ class RunFolder(FrameSink):
         self._earlier, self._first, self._started = list(self.checkpoint.sessions), stream.position, monotonic()
 
     def take(self, result: FrameResult) -> None:
-        """Write and record a frame, and store the checkpoint if the last one is old. Raises OSError."""
+        """Write and record a frame, and store the checkpoint if the stored one is old. Raises OSError."""
         started, unit, name = perf_counter(), self.checkpoint.unit, result.name
         if (row := result.rows.get(UFM)) is not None:
             arrays = frame_arrays(result.frame, row)
@@ -92,7 +92,7 @@ class RunFolder(FrameSink):
         checkpoint = Checkpoint(result.number + 1, unit, dict(result.state[UFM]), sums, sessions)
         with (self.path / RECORDS).open("ab") as file:
             file.write(line)
-        # Through JSON, so that this run and one that is continued compute with the same numbers.
+        # Through JSON, so that this run and a resumed one use the same numbers.
         self.records.append(json.loads(line))
         self.checkpoint = checkpoint
         if monotonic() - self._stored_at >= CHECKPOINT_EVERY:
@@ -108,7 +108,7 @@ class RunFolder(FrameSink):
         if self._stored is self.checkpoint:
             return
         checkpoint = self.checkpoint
-        sums = {name: {key: pack(value) for key, value in own.items()} for name, own in checkpoint.metrics.items()}
+        sums = {name: {key: pack(value) for key, value in state.items()} for name, state in checkpoint.metrics.items()}
         content = {**vars(checkpoint), "metrics": sums}
         write_atomic(self.path / "resume" / "state.pt", lambda file: torch.save(content, file))
         self._stored, self._stored_at = checkpoint, monotonic()
@@ -126,7 +126,7 @@ def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:
     try:
         with file.open("rb") as opened:
             stored = read_tensors(opened, "it")
-        sums = {name: {key: unpack(v) for key, v in own.items()} for name, own in stored.pop("metrics").items()}
+        sums = {name: {key: unpack(v) for key, v in state.items()} for name, state in stored.pop("metrics").items()}
         checkpoint = Checkpoint(metrics=sums, **stored)
         content = b"".join(lines.read_bytes().splitlines(keepends=True)[: checkpoint.position])
         records = read_records(content, lines)

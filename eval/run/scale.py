@@ -1,4 +1,4 @@
-"""The unit of poses from structure from motion, by a depth network's own scale (``--scale-from network``)."""
+"""The unit of poses from structure from motion, by a depth network's scale (``--scale-from network``)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.prediction import DepthPrediction
 
 _MOST_FRAMES, _FEWEST_FRAMES = 24, 3
-_FEWEST_LANDMARKS = 10  # of a frame that counts
+_FEWEST_LANDMARKS = 10  # smallest number of landmarks of a frame that is used
 _NO_SCALE = (
     "sequence {name!r}: the unit of its poses is not known, which structure from motion cannot measure. Give "
     "--pose-scale M (metres per unit), make it with `ufmstar poses --length A B METRES` (or --trajectory), or accept "
@@ -22,8 +22,8 @@ _NO_SCALE = (
 
 @dataclass(frozen=True)
 class NetworkScale:
-    """``metres`` per unit of the poses, as far as a network predicts landmarks to be: the median over ``frames`` of
-    their median d / z, d [m] the predicted depth and z a landmark's. ``spread`` is half the range of the middle 68 % of
+    """``metres`` per unit of the poses by a network's depth of landmarks: the median over ``frames`` of their median
+    d / z, with the predicted depth d [m] and a landmark's depth z. ``spread`` is half the range of the middle 68 % of
     the frames' medians, as a share of ``metres``."""
 
     metres: float
@@ -32,14 +32,14 @@ class NetworkScale:
 
 
 def require_metric(sequence: FrameSequence) -> None:
-    """Raises ValueError where the unit of the poses is not known; the message names the options that help."""
+    """Raises ValueError: the unit of the poses is unknown; the message names the options that help."""
     if not sequence.metric:
         raise ValueError(_NO_SCALE.format(name=sequence.name))
 
 
 def network_scale(sequence: FrameSequence, source: DepthSource, indices: range) -> NetworkScale:
     """The scale of a COLMAP model's poses by the depths of a source, on at most 24 of the frames ``indices``. Raises
-    ValueError: the poses are metric, or are no COLMAP model's; or fewer than three frames see ten landmarks each."""
+    ValueError: the poses are metric or not a COLMAP model's, or fewer than three frames have ten landmarks each."""
     if sequence.metric or sequence.folder is None or sequence.layout != "colmap":
         raise ValueError(
             "--scale-from network is for COLMAP models whose scale is not known, which have landmarks to compare with"
@@ -62,13 +62,13 @@ def network_scale(sequence: FrameSequence, source: DepthSource, indices: range) 
             f"--scale-from network: {len(medians)} frames see {_FEWEST_LANDMARKS} landmarks of the model, at least "
             f"{_FEWEST_FRAMES} are needed"
         )
-    metres = float(f"{np.median(medians):.4g}")  # the same in a continued run, whatever the last bits of a network
+    metres = float(f"{np.median(medians):.4g}")  # rounded, to be equal in a resumed run despite a network's last bits
     low, high = np.percentile(medians, [16, 84])
     return NetworkScale(metres, float(high - low) / 2 / metres, len(medians))
 
 
 def _ratios(points: np.ndarray, T_world_cam: np.ndarray, prediction: DepthPrediction) -> np.ndarray:
-    """[M] predicted depth over landmark's, of those in the map."""
+    """[M] predicted depth over the landmark's depth, for landmarks in the map."""
     T_cam_world = np.linalg.inv(T_world_cam)
     in_camera = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
     in_camera = in_camera[in_camera[:, 2] > 0]
@@ -76,6 +76,6 @@ def _ratios(points: np.ndarray, T_world_cam: np.ndarray, prediction: DepthPredic
     pixel = np.rint((in_camera @ K.T)[:, :2] / in_camera[:, 2:])
     inside = ((pixel >= 0) & (pixel < depth.shape[::-1])).all(axis=1)
     column, row = pixel[inside].astype(int).T
-    found, z = depth[row, column], in_camera[inside, 2]
-    usable = np.isfinite(found) & (found > 0)
-    return np.asarray(found[usable] / z[usable])
+    predicted, z = depth[row, column], in_camera[inside, 2]
+    usable = np.isfinite(predicted) & (predicted > 0)
+    return np.asarray(predicted[usable] / z[usable])

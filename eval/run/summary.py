@@ -1,4 +1,4 @@
-"""The data of a run's summary.json: results, where they come from, settings and versions."""
+"""The data of a run's summary.json: results, provenance, settings and versions."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "s
 def write_summary(
     folder: RunFolder, state: str, reason: str, outputs: Mapping[str, str | None] | None = None
 ) -> dict[str, Any]:
-    """Write summary.json from the run's records and sums, and return its content as plain values. ``outputs`` has for
-    each file None if it exists, or why it does not. Raises OSError: the file cannot be written."""
+    """Write summary.json from the run's records and sums, and return its content as plain values. ``outputs`` has by
+    file None, or why the file was not made. Raises OSError: the summary cannot be written."""
     job, checkpoint, records = folder.job, folder.checkpoint, folder.records
     done = [record for record in records if record["state"] == "done"]
     figures = job.metrics(checkpoint).figures()
@@ -69,7 +69,7 @@ def write_summary(
 
 
 def _depth_fit(folder: RunFolder, done: Records) -> DepthFit | None:
-    """The maps of finished frames beside the depth of corners tracked in their images."""
+    """Compare the maps of finished frames with the depth of corners tracked in their images."""
     records, sequence = {record["index"]: record for record in done}, folder.job.sequence
 
     def depth_at(index: int, pixel: np.ndarray) -> np.ndarray | None:
@@ -88,7 +88,7 @@ def _depth_fit(folder: RunFolder, done: Records) -> DepthFit | None:
 
 
 def _warnings(job: RunJob, depth: DepthFit | None, done: Records) -> list[str]:
-    """Likely mistakes in what the run was given, each in a line."""
+    """Likely mistakes in the run's input, one line each."""
     fits = [fit.problem for fit in (job.image_fit, depth) if fit is not None]
     without_depth = len(job.sequence.without_depth) == len(job.sequence)
     if done:
@@ -121,7 +121,7 @@ def _sequence(sequence: FrameSequence) -> dict[str, Any]:
 
 
 def _scale(job: RunJob) -> dict[str, Any]:
-    """The origin of the poses' unit, if it is not the recording. A network's error of scale is then in the anchors
+    """The origin of the poses' unit, unless it is the recording. A network's error of scale is then in the anchors
     too."""
     if job.scale is None:
         return {} if job.sequence.pose_scale == 1 else {"scale_from": "--pose-scale"}
@@ -141,16 +141,16 @@ def _frames(records: Records, selected: int) -> dict[str, Any]:
 
 
 def _uncertainty(done: Records) -> dict[str, Any]:
-    """Means over all valid pixels of all frames. With perfect depth, they are the method's floor."""
+    """Means over all valid pixels of all frames. With perfect depth, they are the method's lower bound."""
     pixels = sum(record["valid_pixels"] for record in done)
     return {
         "mean_disagreement": _pixel_mean(done, "mean_disagreement"),
         "mean_sigma": _pixel_mean(done, "mean_sigma"),
         "mean_network_sigma": _pixel_mean(done, "mean_network_sigma"),
         "units": "disagreement m^2, sigma m",
-        # Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component, where the prior is 0.
+        # Share of valid pixels with 0 < sigma < ``NEAR_ZERO``: no component is near, and the prior is 0.
         "near_zero_share": sum(record["near_zero"] for record in done) / pixels if pixels else None,
-        # The valid pixels that no two views compared; their M is ``UfMStarConfig.unmeasured``.
+        # Share of valid pixels not seen in two views; their M is ``UfMStarConfig.unmeasured``.
         "unmeasured_share": sum(record["unmeasured"] for record in done) / pixels if pixels else None,
         "valid_pixels": pixels,
     }
@@ -167,7 +167,7 @@ def _anchors(done: Records) -> dict[str, Any] | None:
     return {
         **means,
         "frames_before_the_first": len(records) if first is None else first,
-        # Without the figures of single frames, which frames.jsonl has.
+        # Reasons without figures of single frames, which are in frames.jsonl.
         "frames_without": dict(Counter(r["without"].partition(":")[0] for r in records if r["without"] is not None)),
         **({"frames_with_confidence": sum(r["confidence"] for r in stated)} if stated else {}),
         "mean_anchored": _pixel_mean(done, "mean_anchored"),
@@ -177,10 +177,10 @@ def _anchors(done: Records) -> dict[str, Any] | None:
 
 
 def _pixel_mean(done: Records, key: str) -> float | None:
-    """Mean over pixels; a frame without a valid pixel has no mean of its own."""
-    known = [(record[key], record["valid_pixels"]) for record in done if record[key] is not None]
-    pixels = sum(count for _, count in known)
-    return sum(mean * count for mean, count in known) / pixels if pixels else None
+    """Mean over pixels; a frame without a valid pixel has no mean."""
+    weighted = [(record[key], record["valid_pixels"]) for record in done if record[key] is not None]
+    pixels = sum(count for _, count in weighted)
+    return sum(mean * count for mean, count in weighted) / pixels if pixels else None
 
 
 def _mixture(done: Records, mixture: GaussianMixture) -> dict[str, Any]:
@@ -197,9 +197,9 @@ def _mixture(done: Records, mixture: GaussianMixture) -> dict[str, Any]:
 
 
 def _time(done: Records, sessions: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Medians by stage; "frame" is the time from a frame to the next, which is shorter than the sum of the stages:
-    frames are read ahead and written behind in threads. The rate is that of the median frame: the first one also loads
-    libraries and compiled kernels."""
+    """Medians by stage. "frame" is the time between two frames, which is shorter than the sum of the stages, because
+    threads read and write frames. The rate is that of the median frame, because the first one also loads libraries and
+    compiled kernels."""
     stages = {stage: [record["ms"][stage] for record in done if stage in record["ms"]] for stage in STAGES}
     total = median(record["ms"]["cycle"] for record in done) if done else None
     return {

@@ -1,12 +1,17 @@
 """The files of every frame of ``ufmstar run``: OUT/frames/NAME.npz, and 16-bit PNGs of depth and sigma.
 
-The npz has depth [m], variance [m^2], disagreement [m^2], measured (the share of the disagreement that rests on two
-views or more) float32 and valid bool, each [H, W]; with anchors also anchored [m^2] (B) and bias (r: depth (1 + r) is
-the depth corrected), with a posterior also posterior_depth [m], posterior_variance [m^2], posterior_outlier (a
-probability) and posterior_inlier_variance [m^2]; T_world_cam [4, 4] camera-to-world [m] and intrinsics [3, 3] of the
-maps [px]; with anchors also anchors [N, 4]: u, v in the maps [px], depth and its standard deviation [m]. depth/NAME.png
-and sigma/NAME.png are the posterior's where there is one; the network's own are in network_depth/ and network_sigma/
-then.
+The npz has
+
+- depth [m], variance [m^2], disagreement [m^2], measured (the share of the disagreement from two views or more) float32
+  and valid bool, each [H, W];
+- with anchors anchored [m^2] (B), bias (r: depth (1 + r) is the corrected depth), and anchors [N, 4]: u, v in the maps
+  [px], depth and its standard deviation [m];
+- with a posterior posterior_depth [m], posterior_variance [m^2], posterior_outlier (a probability) and
+  posterior_inlier_variance [m^2];
+- T_world_cam [4, 4] camera-to-world [m] and intrinsics [3, 3] of the maps [px].
+
+depth/NAME.png and sigma/NAME.png are the posterior's if there is one; network_depth/ and network_sigma/ then have the
+network's.
 """
 
 from __future__ import annotations
@@ -34,15 +39,15 @@ def frame_file(out: Path, name: str) -> Path:
 
 
 def write_frame(file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write one frame's npz, whole or not at all."""
-    # Not compressed: float noise shrinks by a quarter only and takes 40 times as long (224x224: 0.65 MB in 0.6 ms
-    # against 0.50 MB in 27 ms).
+    """Write one frame's npz, atomically."""
+    # Not compressed: that saves a quarter only and takes 40 times as long (224x224: 0.50 MB in 27 ms instead of 0.65 MB
+    # in 0.6 ms).
     write_atomic(file, lambda opened: np.savez(opened, allow_pickle=False, **arrays))
 
 
 def write_pngs(out: Path, name: str, maps: Mapping[str, NDArray[Any]], unit: float | None) -> float:
-    """Write the PNGs of a frame's maps: 0 = not valid; sigma's scale is a tenth of depth's. ``unit`` is the metres per
-    count of depth, one for a whole run; None: it is chosen from this frame. Returns the unit."""
+    """Write the PNGs of a frame's maps (0 = not valid). ``unit`` is the metres per count of depth, equal in a whole
+    run; None = chosen from this frame. Sigma's unit is a tenth of it. Returns ``unit``."""
     posterior = "posterior_depth" in maps
     for source, folder in (("posterior_", ""), ("", "network_")) if posterior else (("", ""),):
         depth = np.where(maps["valid"], maps[f"{source}depth"], np.nan)
@@ -62,26 +67,26 @@ def read_frame(path: str | Path) -> dict[str, NDArray[Any]]:
     return read_npz_whole(path)
 
 
-# Metres per count that an export may choose from, finest first: up to 65.5 m, 256 m (KITTI's), 655 m, 6.6 km.
+# Metres per count, finest first, with ranges of 65.5 m, 256 m (KITTI's), 655 m and 6.6 km.
 DEPTH_UNITS = (0.001, 1 / 256, 0.01, 0.1)
 FULL = 65535
 PNG_LEVEL = 1  # zlib's: level 6 takes 3-5 times as long for 10 % less
 
 
 def fitting_unit(depth: NDArray[Any]) -> float:
-    """The finest of ``DEPTH_UNITS`` whose range is twice the 99th percentile of the depths [m]: later frames may look
-    farther, and a sky at 10 km would cost all resolution. Without a depth: the finest."""
+    """The finest of ``DEPTH_UNITS`` whose range is at least twice the 99th percentile of the depths [m], because depths
+    of later frames may be larger; a maximum would be dominated by a sky at 10 km. Without a depth: the finest."""
     finite = depth[np.isfinite(depth)]
     far = 2 * float(np.percentile(finite, 99)) if finite.size else 0.0
     return next((unit for unit in DEPTH_UNITS if far <= FULL * unit), DEPTH_UNITS[-1])
 
 
 def encode_length_png(values: NDArray[Any], unit: float, quantity: str) -> bytes:
-    """Lengths [H, W] [m] as a 16-bit PNG with its scale ``unit`` [m per count] as text; the file's content.
+    """The content of a 16-bit PNG of lengths [H, W] [m], with the scale ``unit`` [m per count] as text.
 
-    count = round(value / unit), 0 = not finite or negative. A value below half a unit becomes 1, so that it is not
-    taken for none; one beyond the range becomes 65535. Text keys: ``depth_scale`` = metres per count (also for
-    sigma: it is a depth's), ``unit``, ``quantity``, ``invalid``, ``saturated`` = number of values beyond the range.
+    count = round(value / unit), 0 = not finite or negative. A value below half a unit becomes 1, because 0 means none;
+    a value beyond the range becomes 65535. Text keys: ``depth_scale`` = metres per count (also for sigma), ``unit``,
+    ``quantity``, ``invalid``, ``saturated`` = number of values beyond the range.
     """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo

@@ -1,4 +1,4 @@
-"""Dataset readers: posed frames from the layouts that the field uses, or from any images and poses."""
+"""Dataset readers: posed frames from common layouts, or from any images and poses."""
 
 from __future__ import annotations
 

@@ -42,8 +42,8 @@ def _root(path: Path) -> Path | None:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens the low-resolution images of a video. Raises ValueError: a malformed file (named), a file that is not
-    called by its time, or no usable frame."""
+    """Open the low-resolution images of a video. Raises ValueError: a malformed file (named), a file whose name is not
+    its time, or no usable frame."""
     root = _root(path)
     assert root is not None
     images, cameras = list_files(root / _IMAGES), list_files(root / _CAMERAS, _PINCAM)
@@ -64,7 +64,7 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def _times(files: list[Path]) -> np.ndarray:
-    """[N] of files VIDEO_TIME [s]."""
+    """[N] times of files VIDEO_TIME [s]."""
     try:
         return np.array([float(file.stem.rpartition("_")[2]) for file in files])
     except ValueError as error:
@@ -81,7 +81,7 @@ def _lens(file: Path) -> Lens:
 
 
 def _trajectory(file: Path) -> Trajectory:
-    """Camera-to-world. Raises ValueError: the lines have not 7 numbers."""
+    """The camera-to-world trajectory. Raises ValueError: lines do not have 7 numbers."""
     table = read_matrix(file)
     if table.ndim != 2 or table.shape[1] != 7:
         raise ValueError(f"{file}: expected lines of 7 numbers: time [s], rotation vector [rad], translation [m]")

@@ -37,17 +37,17 @@ def assemble(
 
     Args:
         layout: name of the layout.
-        path: of the sequence; a relative ``options.trajectory`` is looked for there first.
-        frames: all that are on disk, in order.
-        lenses: the camera, or one by frame name; None: ``options.intrinsics`` and ``size`` are given.
+        path: of the sequence; a relative ``options.trajectory`` is searched there first.
+        frames: all frames on disk, in order.
+        lenses: the camera, or cameras by frame name; None = use ``options.intrinsics`` and ``size``.
         options: ``trajectory``, ``fps``, ``intrinsics``, ``depth_intrinsics`` and ``distortion`` replace the layout's.
-        name: of the sequence; None: that of the path.
-        size: (H, W) of the images where they may be resized; None: the lenses'.
-        read_poses: reads the layout's trajectory; None: the frames have poses.
-        K_depth: [3, 3] of the camera of the depth maps [px]; None: they show what the images show.
-        depth_size: (H, W) of the depth maps; None: of the first that can be read.
-        posed: whether poses are known.
-        metric: whether the layout's poses are in metres; those of ``options.trajectory`` are.
+        name: of the sequence; None = that of the path.
+        size: (H, W) of the images, which may have been resized; None = the lenses'.
+        read_poses: reads the layout's trajectory; None = the frames have poses.
+        K_depth: [3, 3] intrinsics of the depth maps [px]; None = they have the images' field of view.
+        depth_size: (H, W) of the depth maps; None = that of the first readable one.
+        posed: True if poses are known.
+        metric: True if the layout's poses are in metres; those of ``options.trajectory`` are.
 
     Raises:
         FileNotFoundError: no such trajectory.
@@ -81,8 +81,8 @@ def assemble(
 
 
 def undistort(sequence: FrameSequence, lens_of: Callable[[Entry], Lens], several: bool) -> FrameSequence:
-    """The sequence without the distortion of its lenses (``several``: more than one), also in depth maps that have no
-    camera of their own. Raises ValueError: no lens has these coefficients."""
+    """The sequence without the distortion of its lenses (``several``: more than one), also in depth maps without
+    separate intrinsics. Raises ValueError: no lens has these coefficients."""
     depth_size, registered = sequence.depth_size, sequence.depth_intrinsics is None
 
     def K_depth(lens: Lens) -> np.ndarray | None:
@@ -102,7 +102,7 @@ def undistort(sequence: FrameSequence, lens_of: Callable[[Entry], Lens], several
 
 
 def _lens(calibrated: Lens | None, size: Size | None, options: Options) -> Lens:
-    """The camera of images of a ``size``, by the options where they have one."""
+    """The camera of images of a ``size``; the options override it."""
     if options.intrinsics is None:
         assert calibrated is not None
         lens = calibrated if size is None else calibrated.resized(size)

@@ -1,8 +1,8 @@
 """Poses and depth maps of other programs, attached to the images of a sequence.
 
 A pose (ORB-SLAM3, BundleFusion, COLMAP; TUM or KITTI format) belongs to an image by its time, by its frame number, or,
-where the file has neither, by its position in the file. A map belongs to an image by its name. What has no partner is
-skipped and counted; nothing is moved to the next image.
+if the file has neither, by its position in the file. A map belongs to an image by its name. Frames without a partner
+are skipped and counted; a pose or map is never shifted to the next image.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from ufmstar_torch.trajectory import Trajectory, interpolate_pose
 
 # Integer timestamps as file names: EuRoC and ROS write nanoseconds, some cameras microseconds [units/s].
 _NANOSECONDS_ABOVE, _MICROSECONDS_ABOVE = 1e17, 1e14
-# [units/s] What a trajectory's times may be in, beside seconds, where only then they meet the images'.
+# [units/s] Units of a trajectory's times other than seconds, used if the times in seconds do not overlap the images'.
 _UNITS = (1e9, 1e6, 1e3)
-# [s] No trajectory has its poses closer together.
+# [s] Smallest step between two poses of a trajectory.
 _MIN_STEP = 1e-3
-# [1] Share of images (or poses) with a partner from which on whole numbers are taken for frame numbers.
+# [1] Smallest share of images (or poses) with a partner for whole numbers to be frame numbers.
 _MOST = 0.5
 
-# [4, 4] of a frame that gets its pose from a trajectory.
+# [4, 4] placeholder for a frame's pose from a trajectory.
 UNKNOWN = np.full((4, 4), np.nan)
 
 
@@ -38,13 +38,13 @@ def attach(frames: Sequence[Entry | Skipped], trajectory: Trajectory, options: O
     """All frames on disk, in order, with the poses (camera-to-world) of a trajectory; those without a pose are skipped.
 
     Without timestamps in the trajectory, pose i belongs to the i-th image. With them, the pose is interpolated at the
-    image's time. Whole numbers that are those in the images' names (``frame-000012``) are frame numbers, unless ``fps``
-    is given. Timestamps in nanoseconds (ORB-SLAM3), microseconds or milliseconds are recognised by meeting the images'
-    times only then.
+    image's time. Whole numbers equal to those in the images' names (``frame-000012``) are frame numbers, unless ``fps``
+    is set. Timestamps in nanoseconds (ORB-SLAM3), microseconds or milliseconds are detected if they overlap the images'
+    times only in that unit.
 
     Raises:
-        ValueError: more or fewer poses than images; the images' times are not known; no image has a pose (both time
-            ranges are given).
+        ValueError: more or fewer poses than images; the images' times are unknown; no image has a pose (the message has
+            both time ranges).
     """
     if all(isinstance(frame, Skipped) for frame in frames):
         return list(frames)
@@ -63,7 +63,7 @@ def attach(frames: Sequence[Entry | Skipped], trajectory: Trajectory, options: O
 
 
 def number_times(frames: Sequence[Entry | Skipped], fps: float | None) -> Sequence[Entry | Skipped]:
-    """The frames with the times number / ``fps``, by the numbers in their names or else counted; as they are without
+    """The frames with the times number / ``fps``, by the number in the name or else in the sequence; unchanged without
     ``fps``."""
     if fps is None:
         return frames
@@ -78,8 +78,8 @@ def number_times(frames: Sequence[Entry | Skipped], fps: float | None) -> Sequen
 def frame_of_files(
     name: str, image: Path | None, pose: Path | None, load_depth: Loader | None, options: Options
 ) -> Entry | Skipped:
-    """A frame with a pose file of its own, which is not read where ``options.trajectory`` replaces it; skipped where
-    the image or the pose is missing (None). Raises ValueError: a malformed pose file."""
+    """A frame with a separate pose file, which is not read if ``options.trajectory`` replaces it; skipped if the image
+    or the pose is missing (None). Raises ValueError: a malformed pose file."""
     if pose is None and options.trajectory is None:
         return Skipped(name, "missing pose file")
     T_world_cam = UNKNOWN if pose is None or options.trajectory is not None else read_pose(pose)
@@ -93,7 +93,7 @@ def frame_of_image(
     T_world_cam: np.ndarray = UNKNOWN,
     timestamp: float | None = None,
 ) -> Entry | Skipped:
-    """A frame of an image file; skipped where that is missing."""
+    """A frame of an image file; skipped if that is missing."""
     if image is None or not image.is_file():
         return Skipped(name, "missing image file")
     return Entry(name, T_world_cam, partial(read_color, image), load_depth, timestamp)
@@ -102,7 +102,7 @@ def frame_of_image(
 def _poses(
     frames: Sequence[Entry | Skipped], times: np.ndarray | None, trajectory: Trajectory, options: Options
 ) -> list[np.ndarray | None]:
-    """The pose [4, 4] of each image, None where the trajectory has none."""
+    """The pose [4, 4] of each image, None if the trajectory has none."""
     if trajectory.timestamps is None:
         if len(trajectory) != len(frames):
             counts = f"{len(trajectory)} poses for {len(frames)} images"
@@ -126,8 +126,9 @@ def _in_one_unit(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times of images and poses in the same unit, seconds or frame numbers.
 
-    For ``stamps`` to be frame numbers, most timed images must have a pose each, since 0, 1, 2, ... could be seconds as
-    well; of images without times, or with times that do not meet the trajectory's, most images or most poses.
+    ``stamps`` are frame numbers if most timed images have a pose with their number, because 0, 1, 2, ... could also be
+    seconds. For images without times, or with times that do not overlap the trajectory's, most images or most poses
+    must have a partner.
     """
     numbers = frame_numbers(names) if fps is None and bool((stamps == np.floor(stamps)).all()) else None
     of_images = of_poses = 0.0
@@ -150,7 +151,7 @@ def _in_one_unit(
 
 
 def frame_numbers(names: Sequence[str]) -> np.ndarray | None:
-    """[N] the one whole number in each name, ``frame-000012`` being 12; None where a name has none or several."""
+    """[N] the whole number in each name, 12 in ``frame-000012``; None if a name has none or several."""
     result = [re.findall(r"\d+", name) for name in names]
     if not result or any(len(groups) != 1 for groups in result):
         return None
@@ -158,7 +159,7 @@ def frame_numbers(names: Sequence[str]) -> np.ndarray | None:
 
 
 def stem_times(names: Sequence[str]) -> np.ndarray | None:
-    """[N] names as timestamps [s], also those in nanoseconds or microseconds; None where one is no number."""
+    """[N] names as timestamps [s], also those in nanoseconds or microseconds; None if a name is no number."""
     try:
         times = np.array([float(name) for name in names])
     except ValueError:
@@ -173,9 +174,9 @@ def _meet(first: np.ndarray, second: np.ndarray) -> bool:
 
 
 def pair_by_name(names: Sequence[str], files: Iterable[Path]) -> dict[str, Path]:
-    """The file of each frame name, where there is one: their stems are equal, or else all numbers in them
-    (``frame-000012.color`` and ``000012_depth``; leading zeros do not count, decimals do). Numbers that occur twice
-    among the files or among the names pair nothing."""
+    """The files by frame name: their stems are equal, or else all numbers in them (``frame-000012.color`` and
+    ``000012_depth``; leading zeros are ignored, decimals are not). Numbers that occur twice in the files or in the
+    names are not paired."""
     files = list(files)
     by_stem = {file.stem: file for file in files}
     file_of = _unique({file: _numbers(file.stem) for file in files})
@@ -185,7 +186,7 @@ def pair_by_name(names: Sequence[str], files: Iterable[Path]) -> dict[str, Path]
 
 
 def pair_depth(names: Sequence[str], folder: Path) -> dict[str, Path]:
-    """The depth map in a folder of each frame name, where there is one; ValueError where no map has a partner."""
+    """The depth maps of a folder by frame name. Raises ValueError: no map has a partner."""
     files = list_files(folder, DEPTH_SUFFIXES)
     pairs = pair_by_name(names, files)
     if files and not pairs:
@@ -194,13 +195,13 @@ def pair_depth(names: Sequence[str], folder: Path) -> dict[str, Path]:
 
 
 def _numbers(stem: str) -> tuple[int | str, ...]:
-    """Digit groups by value; those behind a decimal point as text, since 1.05 is not 1.5."""
+    """Digit groups by value; those after a decimal point as text, because 1.05 is not 1.5."""
     groups = re.findall(r"((?<=\d)\.)?(\d+)", stem)
     return tuple(digits if point else int(digits) for point, digits in groups)
 
 
 def _unique(numbers_of: dict) -> dict:
-    """The inverse of a mapping, without the keys () and those that several items share."""
+    """The inverse of a mapping, without the value () and values shared by several items."""
     inverse: dict = {}
     for item, key in numbers_of.items():
         inverse.setdefault(key, []).append(item)

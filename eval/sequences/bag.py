@@ -1,8 +1,8 @@
 """ROS 1 bags and ROS 2 bags (db3, mcap), through rosbags: images, camera info, depth, and poses of a topic or of tf.
 
-A PoseStamped without more is the camera's own pose (its optical frame); an Odometry is its ``child_frame_id``'s, from
-where tf leads to the image's frame. Opening reads every chosen message once, for its time; images are decoded later.
-Messages are of ROS's own types, so that no definition in the file is compiled.
+A PoseStamped is the pose of the camera (its optical frame); an Odometry is the pose of its ``child_frame_id``, which tf
+connects to the image's frame. Opening reads every message of the chosen topics once, for its time; images are decoded
+later. Messages have ROS's standard types, so no definition in the file is compiled.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _POSES = (_ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWit
 _TYPES = (_IMAGE, _COMPRESSED, _INFO, _TF, *_POSES)
 _OLD_NAMES = {"tf/msg/tfMessage": _TF}
 _NANOSECOND = 1e-9
-# What rosbags raises for damaged files, beside its own errors.
+# Errors of rosbags for damaged files, besides its own classes.
 _BROKEN = (
     *(OSError, EOFError, LookupError, AssertionError, ArithmeticError, AttributeError, RuntimeError, TypeError),
     *(ValueError, MemoryError, struct.error),
@@ -50,8 +50,8 @@ def _module(name: str) -> Any:
     return optional(name, "ROS bags need rosbags", "'ufmstar-torch[recordings]'")
 
 
-class Place(NamedTuple):
-    """A message in a bag: its topic, when it was received [ns], and which one of that moment it is."""
+class MessageKey(NamedTuple):
+    """Identifies a message in a bag: topic, time of reception [ns], and index among messages of that time."""
 
     topic: str
     received: int
@@ -59,7 +59,7 @@ class Place(NamedTuple):
 
 
 class Bag:
-    """A bag that is opened when it is first read; a worker process opens its own. Raises FrameError: it cannot be
+    """A bag that is opened at the first read, separately in each worker process. Raises FrameError: it cannot be
     read."""
 
     def __init__(self, path: Path) -> None:
@@ -69,13 +69,12 @@ class Bag:
 
     @property
     def topics(self) -> dict[str, str]:
-        """The types of the topics that have a message, by name."""
+        """The types of the topics with messages, by name."""
         with self._opened() as reader:
             return {c.topic: _OLD_NAMES.get(c.msgtype, c.msgtype) for c in reader.connections if c.msgcount}
 
-    def messages(self, topics: Iterable[str], *when: int) -> Iterator[tuple[Place, Any]]:
-        """The messages of topics in the order in which they were received, those of [start, stop) [ns] where that is
-        given."""
+    def messages(self, topics: Iterable[str], *when: int) -> Iterator[tuple[MessageKey, Any]]:
+        """The messages of topics in the order of reception, those in [start, stop) [ns] if ``when`` has both."""
         types, wanted = self.topics, set(topics)
         last: dict[str, tuple[int, int]] = {}
         with self._opened() as reader:
@@ -85,24 +84,30 @@ class Bag:
                 before, number = last.get(connection.topic, (-1, 0))
                 number = number + 1 if before == received else 0
                 last[connection.topic] = (received, number)
-                yield Place(connection.topic, received, number), decode(raw, types[connection.topic])
+                yield MessageKey(connection.topic, received, number), decode(raw, types[connection.topic])
 
-    def read(self, place: Place) -> Any:
-        """One message."""
-        for found, message in self.messages([place.topic], place.received, place.received + 1):
-            if found == place:
+    def read(self, key: MessageKey) -> Any:
+        """Read one message."""
+        for found, message in self.messages([key.topic], key.received, key.received + 1):
+            if found == key:
                 return message
-        raise FrameError(self.path, f"the message of {place.topic} at {place.received} ns is missing")
+        raise FrameError(self.path, f"the message of {key.topic} at {key.received} ns is missing")
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
-        own = [_module(f"rosbags.{name}").ReaderError for name in ("rosbag1", "rosbag2")]
+        reader_errors = [_module(f"rosbags.{name}").ReaderError for name in ("rosbag1", "rosbag2")]
         zstd = _module("rosbags.rosbag2.storage_mcap").zstd
         try:
             if self._reader is None:
                 self._open()
             yield self._reader
-        except (*own, _module("rosbags.serde").SerdeError, zstd.ZstdError, _module("apsw").Error, *_BROKEN) as error:
+        except (
+            *reader_errors,
+            _module("rosbags.serde").SerdeError,
+            zstd.ZstdError,
+            _module("apsw").Error,
+            *_BROKEN,
+        ) as error:
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             raise FrameError(self.path, f"the bag cannot be read: {reason}") from error
 
@@ -121,7 +126,7 @@ class Bag:
 
 
 class _Topics(NamedTuple):
-    """The chosen topics, "" where there is none, and the frame that a pose's topic names behind "="."""
+    """The chosen topics, "" = none, and the frame after "=" in the option of the pose's topic."""
 
     image: str
     info: str
@@ -131,7 +136,7 @@ class _Topics(NamedTuple):
 
 
 def detect(path: Path) -> bool:
-    """True if the path is a bag, or a folder that holds one."""
+    """True if the path is a bag, or a folder with one."""
     return _bag_path(path) is not None
 
 
@@ -145,10 +150,9 @@ def _bag_path(path: Path) -> Path | None:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens the images of one camera, called by their number; times are the headers', or where those are 0, when a
-    message was received. ``options.topics`` chooses where there are several. Raises ModuleNotFoundError: rosbags is not
-    installed; ValueError: a damaged bag, topics that are missing or not unique (listed), or a camera that is not
-    calibrated."""
+    """Open the images of one camera, named by their number. Times are the headers', or the times of reception if those
+    are 0. ``options.topics`` chooses among several. Raises ModuleNotFoundError: rosbags is not installed; ValueError: a
+    damaged bag, topics that are missing or not unique (listed), or a camera without calibration."""
     file = _bag_path(path)
     assert file is not None
     bag = Bag(file)
@@ -158,9 +162,9 @@ def read(path: Path, options: Options) -> FrameSequence:
     except FrameError as error:
         raise ValueError(error) from error
     entries: list[Entry | Skipped] = []
-    stamps, depth_stamps = (np.array([time for time, _ in places]) for places in (content.images, content.depths))
+    stamps, depth_stamps = (np.array([time for time, _ in keyed]) for keyed in (content.images, content.depths))
     paired = associate(stamps, depth_stamps, options.max_time_difference)
-    for number, (time, place) in enumerate(content.images):
+    for number, (time, key) in enumerate(content.images):
         load_depth = None
         if number in paired:
             load_depth = partial(_decoded, ros.depth, bag, content.depths[paired[number]][1], options.truth_scale)
@@ -169,7 +173,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         if T is None:
             entries.append(Skipped(name, f"no pose within {options.max_pose_gap:g} s around the image"))
         else:
-            entries.append(Entry(name, T, partial(_decoded, ros.colour, bag, place), load_depth, time))
+            entries.append(Entry(name, T, partial(_decoded, ros.colour, bag, key), load_depth, time))
     size = None
     if content.lens is None:
         if not content.images:
@@ -179,12 +183,12 @@ def read(path: Path, options: Options) -> FrameSequence:
     return assemble("bag", path, entries, content.lens, options, name=path.resolve().stem, size=size)
 
 
-def _decoded(decode: Callable[..., np.ndarray], bag: Bag, place: Place, *how: Any) -> np.ndarray:
-    return decode(bag.read(place), *how, bag.path)
+def _decoded(decode: Callable[..., np.ndarray], bag: Bag, key: MessageKey, *how: Any) -> np.ndarray:
+    return decode(bag.read(key), *how, bag.path)
 
 
 def _choose(bag: Bag, options: Options) -> _Topics:
-    """The topics by type, ``options.topics`` first. Raises ValueError: missing or not unique."""
+    """Choose the topics by type, ``options.topics`` first. Raises ValueError: a topic is missing or not unique."""
     types = bag.topics
     named = dict(word.partition("=")[::2] for word in options.topics or ())
     unknown = [name for name in named if types.get(name) not in _TYPES]
@@ -208,19 +212,19 @@ def _choose(bag: Bag, options: Options) -> _Topics:
     if not image:
         raise ValueError(f"{bag.path} has no topic of colour images, but {_listing(types)}")
     infos = [name for name, kind in types.items() if kind == _INFO]
-    beside = [name for name in infos if name.rsplit("/", 1)[0] in (image.rsplit("/", 1)[0], image.rsplit("/", 2)[0])]
-    info = "" if options.intrinsics is not None else one("the camera info", beside or infos)
+    siblings = [name for name in infos if name.rsplit("/", 1)[0] in (image.rsplit("/", 1)[0], image.rsplit("/", 2)[0])]
+    info = "" if options.intrinsics is not None else one("the camera info", siblings or infos)
     if not info and options.intrinsics is None:
         raise ValueError(f"{bag.path} has no camera info: pass intrinsics")
     same_view = [name for name, frame in depths.items() if frame == images[image]]
-    so_called = [name for name in same_view if name in named or "depth" in name.lower()]  # not a map of sigma
-    predicted = [name for name in so_called if name.rsplit("/", 1)[0] + "/sigma" in depths and name not in named]
+    depth_named = [name for name in same_view if name in named or "depth" in name.lower()]  # not a map of sigma
+    predicted = [name for name in depth_named if name.rsplit("/", 1)[0] + "/sigma" in depths and name not in named]
     if predicted:
         LOGGER.warning("%s: no ground truth: %s is a prediction, with a sigma beside it", bag.path, predicted[0])
         same_view = [name for name in same_view if name in named]
         depths = {name: depths[name] for name in same_view}
-        so_called = [name for name in so_called if name not in predicted]
-    depth = one("the depth", so_called or same_view)
+        depth_named = [name for name in depth_named if name not in predicted]
+    depth = one("the depth", depth_named or same_view)
     other = [name for name in named if name in depths and name not in same_view]
     if other:
         view = f"({depths[other[0]]!r}, not {images[image]!r})"
@@ -244,30 +248,30 @@ def _listing(types: dict[str, str]) -> str:
 
 
 class _Content:
-    """The content of the chosen topics, found in one pass: times [s] and places of images and depth maps, the camera,
-    and poses."""
+    """The content of the chosen topics, read in one pass: times [s] and keys of images and depth maps, the camera, and
+    poses."""
 
     def __init__(self, bag: Bag, topics: _Topics) -> None:
         self.bag, self.topics = bag, topics
         self.lens: Lens | None = None
-        self.images: list[tuple[float, Place]] = []
-        self.depths: list[tuple[float, Place]] = []
+        self.images: list[tuple[float, MessageKey]] = []
+        self.depths: list[tuple[float, MessageKey]] = []
         self._tree, self._body, self._camera, samples = ros.FrameTree(), "", "", list[ros.Sample]()
         tf = [name for name, kind in bag.topics.items() if kind == _TF]
-        for place, message in bag.messages({*filter(None, topics[:4]), *tf}):
-            if place.topic in tf:
+        for key, message in bag.messages({*filter(None, topics[:4]), *tf}):
+            if key.topic in tf:
                 for transform in message.transforms:
-                    self._tree.add(_stamp(transform, place), transform)
-            elif place.topic == topics.pose:
+                    self._tree.add(_stamp(transform, key), transform)
+            elif key.topic == topics.pose:
                 pose = message.pose if message.__msgtype__ == _POSES[1] else message.pose.pose
-                samples.append(ros.sample(_stamp(message, place), pose.position, pose.orientation))
+                samples.append(ros.sample(_stamp(message, key), pose.position, pose.orientation))
                 self._body = ros.frame_name(getattr(message, "child_frame_id", ""))
-            elif place.topic == topics.info:
+            elif key.topic == topics.info:
                 self._add_lens(message)
-            elif place.topic == topics.depth:
-                self.depths.append((_stamp(message, place), place))
+            elif key.topic == topics.depth:
+                self.depths.append((_stamp(message, key), key))
             else:
-                self.images.append((_stamp(message, place), place))
+                self.images.append((_stamp(message, key), key))
                 self._camera = ros.frame_name(message.header.frame_id)
         self._trajectory = ros.trajectory(samples) if samples else None
         self._prepare()
@@ -280,7 +284,7 @@ class _Content:
         self.lens = lens
 
     def _prepare(self) -> None:
-        """Find the frames between which poses lead. Raises ValueError: nothing connects them, or nothing moves."""
+        """Find the frame of the poses. Raises ValueError: tf does not connect it with the camera, or nothing moves."""
         topics, chain = self.topics, self._tree.chain(self._camera)
         if not topics.pose:
             return
@@ -299,7 +303,7 @@ class _Content:
             raise ValueError(f"{self.bag.path}: tf does not connect {what}; {remedy}")
 
     def pose(self, time: float, max_gap: float) -> np.ndarray | None:
-        """[4, 4] camera-to-world at ``time`` [s]; None where there is none."""
+        """[4, 4] camera-to-world at ``time`` [s], or None."""
         T_body_camera = self._tree.between(self._camera, self._body, time, max_gap)
         if self._trajectory is None or T_body_camera is None:
             return T_body_camera
@@ -307,7 +311,7 @@ class _Content:
         return None if T_world_body is None else T_world_body @ T_body_camera
 
 
-def _stamp(message: Any, place: Place) -> float:
-    """[s] of a message's header, or when it was received."""
+def _stamp(message: Any, key: MessageKey) -> float:
+    """Time of a message's header, or of its reception [s]."""
     stamp = message.header.stamp
-    return stamp.sec + stamp.nanosec * _NANOSECOND or place.received * _NANOSECOND
+    return stamp.sec + stamp.nanosec * _NANOSECOND or key.received * _NANOSECOND

@@ -1,8 +1,8 @@
-"""COLMAP: ``sparse/0/{cameras,images,points3D}.{bin,txt}`` beside ``images/``, of any number of cameras.
+"""COLMAP: ``sparse/0/{cameras,images,points3D}.{bin,txt}`` next to ``images/``, of any number of cameras.
 
-Poses are world-to-camera in a unit of their own: metres only where ``ufmstar poses`` wrote so (``poses.json``), or with
-``pose_scale``. The first pixel's centre is (0.5, 0.5) there. Depth maps may lie in ``depth/``. The files are read here,
-not by pycolmap, which accepts truncated cameras and does not return from truncated images.
+Poses are world-to-camera in an arbitrary unit; they are in metres only if ``poses.json`` of ``ufmstar poses`` has a
+scale, or with ``pose_scale``. COLMAP's first pixel has its centre at (0.5, 0.5). Depth maps may be in ``depth/``. This
+module reads the files, because pycolmap accepts truncated cameras and does not return from truncated images.
 https://colmap.github.io/format.html
 """
 
@@ -29,8 +29,8 @@ from ufmstar_torch.eval.sequences.poses import numbered_lines, poses_from_column
 
 LOOKED_FOR = "cameras and images (.bin or .txt) in sparse/0/, sparse/ or the folder itself"
 SCALE_FILE, MODEL = "poses.json", "sparse/0"
-# By COLMAP's number: name, and of its parameters how many are focal lengths and how many distortion coefficients; the
-# others are the principal point. Models without a number of coefficients are not OpenCV's.
+# By COLMAP's number: name, number of focal lengths, and number of distortion coefficients (None = no model of OpenCV);
+# the other parameters are the principal point.
 _MODELS: tuple[tuple[str, int, int | None], ...] = (
     *(("SIMPLE_PINHOLE", 1, 0), ("PINHOLE", 2, 0), ("SIMPLE_RADIAL", 1, 1), ("RADIAL", 1, 2), ("OPENCV", 2, 4)),
     *(("OPENCV_FISHEYE", 2, 4), ("FULL_OPENCV", 2, 8), ("FOV", 2, None), ("SIMPLE_RADIAL_FISHEYE", 1, 1)),
@@ -49,13 +49,13 @@ class _View(NamedTuple):
 
 
 def detect(path: Path) -> bool:
-    """True if a model lies in the folder."""
+    """True if the folder contains a model."""
     return _model_folder(path) is not None
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a model's images in the order of their names. ``images`` and ``depth`` name other folders than ``images/``
-    and ``depth/``; times come from ``rgb.txt`` beside the images. Raises ValueError: a file is truncated or malformed
+    """Open a model's images in the order of their names. ``images`` and ``truth`` name other folders than ``images/``
+    and ``depth/``; times come from ``rgb.txt`` next to the images. Raises ValueError: a file is truncated or malformed
     (named), a camera model that is not OpenCV's, or no usable frame."""
     model = _model_folder(path)
     assert model is not None
@@ -82,8 +82,8 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def read_landmarks(path: Path) -> dict[str, np.ndarray]:
-    """The triangulated points [N, 3] that each frame sees, by its name, in the axes and unit of the model's poses.
-    Raises ValueError: no model there, or a file is truncated or malformed."""
+    """By frame name, the triangulated points [N, 3] that the frame sees, in the axes and unit of the model's poses.
+    Raises ValueError: the folder has no model, or a file is truncated or malformed."""
     model = _model_folder(path)
     if model is None:
         raise ValueError(f"{path} holds no COLMAP model: looked for {LOOKED_FOR}")
@@ -106,7 +106,7 @@ def _file(model: Path, part: str) -> Path:
 
 
 def _frame_name(view: _View) -> str:
-    """The image's name without ending; its folders become part of it."""
+    """The image's name without suffix; "/" becomes "__"."""
     return str(Path(view.name).with_suffix("")).strip("/").replace("/", "__")
 
 
@@ -117,18 +117,18 @@ def _metric(root: Path) -> bool:
 
 
 def _pose(view: _View, model: Path) -> np.ndarray:
-    """[4, 4] camera-to-world, NaN where it is not finite."""
+    """[4, 4] camera-to-world, NaN if it is not finite."""
     qw, *quaternion = view.pose[:4]
     values = np.array([[*view.pose[4:], *quaternion, qw]])
     return np.asarray(np.linalg.inv(poses_from_columns(values, [f"{model}: image {view.name!r}"])[0]))
 
 
 def _lens(file: Path, model: str, size: tuple[int, int], values: tuple[float, ...]) -> Lens:
-    """A camera of (W, H) ``size``. Raises ValueError: a model that OpenCV does not have, or other parameters."""
+    """A camera of (W, H) ``size``. Raises ValueError: a model that OpenCV does not have, or wrong parameters."""
     focal, count = next(((f, c) for name, f, c in _MODELS if name == model), (0, None))
     if count is None:
-        known = ", ".join(name for name, _, c in _MODELS if c is not None)
-        raise ValueError(f"{file}: camera model {model[:60]!r} is none of {known}: let COLMAP undistort the images")
+        supported = ", ".join(name for name, _, c in _MODELS if c is not None)
+        raise ValueError(f"{file}: camera model {model[:60]!r} is none of {supported}: let COLMAP undistort the images")
     if len(values) != focal + 2 + count or not np.isfinite(values).all() or min(size) < 1:
         raise ValueError(f"{file}: a camera {model} has {focal + 2 + count} finite parameters and a size, got {values}")
     (fx, fy), (cx, cy) = (values[0], values[focal - 1]), values[focal : focal + 2]
@@ -139,7 +139,8 @@ def _lens(file: Path, model: str, size: tuple[int, int], values: tuple[float, ..
 
 
 def _values_of(file: Path) -> Callable[[str], tuple[Any, ...]]:
-    """The next values of a binary file, by a format of ``struct``. Raises ValueError: the file ends before them."""
+    """A function that reads the next values of a binary file by a format of ``struct``. It raises ValueError: the file
+    ends before them."""
     stored = BytesIO(file.read_bytes())
 
     def take(form: str) -> tuple[Any, ...]:
@@ -184,7 +185,7 @@ def _views(file: Path) -> Iterator[_View]:
 
 def _views_of_text(file: Path) -> Iterator[_View]:
     lines = list(_lines(file))
-    lines += [(0, [])] * (len(lines) % 2)  # the last image's points, where it has none
+    lines += [(0, [])] * (len(lines) % 2)  # an empty line of points for the last image
     for (number, words), (below, points) in zip(lines[::2], lines[1::2], strict=True):
         if not words and not points:
             continue
@@ -217,12 +218,12 @@ def _points(file: Path) -> dict[int, np.ndarray]:
 
 
 def _lines(file: Path) -> Iterator[tuple[int, list[str]]]:
-    """Numbers from 1 and words of the lines that are no comments, empty ones included."""
+    """Numbers (from 1) and words of the lines without comments, empty lines included."""
     return ((number, text.split()) for number, text in numbered_lines(file) if not text.startswith("#"))
 
 
 def _numbers(words: list[str], file: Path, line: int, whole: int) -> list[float]:
-    """The first ``whole`` ones are there, and below 2^53."""
+    """Words as numbers. Raises ValueError: a word is no number, or the first ``whole`` ones are missing or >= 2^53."""
     try:
         values = [float(word) for word in words]
         if len(values) < whole or not all(abs(value) < 2**53 for value in values[:whole]):

@@ -17,17 +17,17 @@ _VARIANCE_SUFFIXES = (".npy", ".npz", ".exr", ".tif", ".tiff")
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """Predicted depth of a sequence's frames, decoded lazily: ``maps[i]`` belongs to frame i; without variance files
-    there is no variance. The scale [m per unit] is that of :class:`DepthFolder`."""
+    """Predicted depth of a sequence's frames, decoded lazily: ``maps[i]`` belongs to frame i. The scale [m per unit] is
+    that of :class:`DepthFolder`."""
 
     depth_files: tuple[Path, ...]
     variance_files: tuple[Path, ...] = ()
     scale: float | None = None
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Depth [H, W] float32 [m] (0 = invalid) and variance [H, W] float32 [m^2], or None without one. Where the
-        variance is negative or not finite, both are 0. Raises FrameError: a file cannot be decoded, or the two differ
-        in size."""
+        """Depth [H, W] float32 [m] (0 = invalid) and variance [H, W] float32 [m^2], or None without variance files.
+        Where the variance is negative or not finite, both are 0. Raises FrameError: a file cannot be decoded, or the
+        two differ in size."""
         depth = read_depth(self.depth_files[index], self.scale)
         if not self.variance_files:
             return depth, None
@@ -44,13 +44,13 @@ class DepthFolder:
 
     Args:
         path: the folder.
-        scale: metres per unit. None: a PNG names it in its text ``depth_scale``, the others are in metres.
-        variance: folder of variance maps [m^2] as npy, npz, EXR or float TIFF. It may be ``path`` itself,
-            where npz files hold the keys ``depth`` and ``variance``.
+        scale: metres per unit. None = by the text ``depth_scale`` of a PNG; other formats are in metres.
+        variance: folder of variance maps [m^2] as npy, npz, EXR or float TIFF. It may be ``path`` if npz files have the
+            keys ``depth`` and ``variance``.
 
     Raises:
         NotADirectoryError: a folder does not exist.
-        ValueError: no map, maps of several formats, integers whose scale is not known.
+        ValueError: no map, maps of several formats, or integers of unknown scale.
     """
 
     def __init__(self, path: str | Path, scale: float | None = None, variance: str | Path | None = None) -> None:
@@ -71,9 +71,9 @@ class DepthFolder:
     def for_frames(
         self, names: Sequence[str], names_on_disk: Sequence[str] = (), selected: Sequence[str] | None = None
     ) -> DepthMaps:
-        """The maps of a sequence's frames (of those ``selected``, in order): by stem, or by the numbers in the names,
-        or else in sorted order, which counts on as many maps as ``names`` (the frames'), ``names_on_disk`` (with those
-        that the sequence skips) or ``selected`` has. Raises ValueError: some frames have no map (they are listed)."""
+        """The maps of a sequence's frames (of ``selected`` ones, in order): by stem, or by the numbers in the names, or
+        else in sorted order if the number of maps is that of ``names_on_disk`` (skipped frames included), ``names`` or
+        ``selected``. Raises ValueError: some frames have no map (they are listed)."""
         expected = names if selected is None else selected
         orders = (names_on_disk or names, names, expected)
         depth = _paired(self.files, expected, orders)
@@ -101,7 +101,7 @@ def _paired(files: list[Path], names: Sequence[str], orders: Sequence[Sequence[s
         if order is None:
             shown = ", ".join(missing[:10]) + (", ..." if len(missing) > 10 else "")
             folder, first = files[0].parent, files[0].name
-            found = f"its {len(files)} files are named {first}, ..., and there are not as many as frames"
-            raise ValueError(f"{folder}: no map for {len(missing)} of {len(names)} frames ({shown}); {found}")
+            files_text = f"its {len(files)} files are named {first}, ..., and there are not as many as frames"
+            raise ValueError(f"{folder}: no map for {len(missing)} of {len(names)} frames ({shown}); {files_text}")
         pairs = dict(zip(order, files, strict=True))
     return tuple(pairs[name] for name in names)

@@ -1,7 +1,8 @@
 """EuRoC and other recordings in ASL's layout (TUM-VI): ``mav0/cam0/{data.csv, sensor.yaml, data/}``.
 
-Poses are those of ``mav0/state_groundtruth_estimate0`` (or ``mocap0``, ``vicon0``, ``leica0`` with an orientation), of
-the body, moved to the camera by both sensors' ``T_BS`` and interpolated at the images' times. Images are undistorted.
+Poses are those of the body in ``mav0/state_groundtruth_estimate0`` (or ``mocap0``, ``vicon0``, ``leica0`` with an
+orientation), moved to the camera by both sensors' ``T_BS`` and interpolated at the images' times. Images are
+undistorted.
 https://projects.asl.ethz.ch/datasets/kmavvisualinertialdatasets
 """
 
@@ -33,13 +34,13 @@ _LARGEST_YAML, _DEEPEST_YAML = 100_000, 8  # [bytes], [levels]
 
 
 def detect(path: Path) -> bool:
-    """True if a camera's folder is there."""
+    """True if the path contains a camera's folder."""
     return _camera_folder(path) is not None
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens the recording of one camera; ``path`` may be the folder of another one than ``cam0``. Raises ValueError: a
-    malformed file (named), no ground truth and no ``trajectory``, or no usable frame."""
+    """Open the recording of one camera; ``path`` may be the folder of a camera other than ``cam0``. Raises ValueError:
+    a malformed file (named), no ground truth and no ``trajectory``, or no usable frame."""
     folder = _camera_folder(path)
     assert folder is not None
     images, frames = [], []
@@ -60,7 +61,7 @@ def _camera_folder(path: Path) -> Path | None:
 
 
 def _trajectory(camera: Path) -> Trajectory:
-    """The camera's poses. Raises ValueError: no ground truth with an orientation lies beside it."""
+    """The camera's poses. Raises ValueError: there is no ground truth with an orientation next to its folder."""
     truth = next((camera.parent / name for name in _TRUTHS if (camera.parent / name / "data.csv").is_file()), None)
     if truth is None:
         raise ValueError(f"{camera.parent}: none of {', '.join(_TRUTHS)} holds poses; pass trajectory")
@@ -77,7 +78,7 @@ def _trajectory(camera: Path) -> Trajectory:
 
 
 def _extrinsics(file: Path) -> np.ndarray:
-    """T_BS [4, 4] of a sensor's file: points of the sensor in the body's frame [m]; the identity where it has none."""
+    """T_BS [4, 4] of a sensor's file: sensor to body [m]; the identity if the file has none."""
     value = _yaml(file).get("T_BS", np.eye(4).tolist())
     try:
         T = np.array(value["data"] if isinstance(value, Mapping) else value, dtype=np.float64).reshape(4, 4)
@@ -108,8 +109,8 @@ def _yaml(file: Path) -> dict[str, Any]:
     expected = f"a sensor's YAML of names and values without aliases, below {_LARGEST_YAML:,} bytes"
     raw, depth = file.read_bytes()[: _LARGEST_YAML + 1], 0
     try:
-        text = raw.decode().removeprefix("%YAML:1.0")  # as OpenCV writes it, which is no directive of YAML
-        # Aliases of aliases would become gigabytes where they are printed or made an array; deep nesting takes minutes.
+        text = raw.decode().removeprefix("%YAML:1.0")  # OpenCV's first line, which is no directive of YAML
+        # Nested aliases can expand to gigabytes when they are printed or converted; deep nesting takes minutes.
         for event in yaml.parse(text):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if len(raw) > _LARGEST_YAML or depth > _DEEPEST_YAML or isinstance(event, yaml.AliasEvent):

@@ -1,4 +1,4 @@
-"""Posed frames and the sequence that yields them: what every dataset reader returns.
+"""Posed frames and the sequence of them that every dataset reader returns.
 
 Poses are camera-to-world (``T_world_cam``), camera axes x right, y down, z forward [m]; intrinsics are
 in pixels with the centre of the first pixel at (0, 0).
@@ -19,7 +19,7 @@ from ufmstar_torch.frame import CENTRE_RANGE
 Loader = Callable[[], np.ndarray]
 Size = tuple[int, int]
 
-# A map of so many pixels takes 1 GiB in double precision: more is a slip of the keyboard.
+# Largest image; its map takes 1 GiB in double precision.
 _MAX_PIXELS = 2**27
 
 
@@ -37,10 +37,10 @@ def parse_size(text: str | None, option: str = "--size") -> Size | None:
 
 class FrameError(Exception):
     """A file (or frame) ``path`` is missing, truncated, corrupt, or not of the sequence's size: ``reason``. Callers may
-    count such frames and go on (:meth:`FrameSequence.readable` does)."""
+    count such frames and continue (as :meth:`FrameSequence.readable`)."""
 
     def __init__(self, path: str | Path, reason: str) -> None:
-        super().__init__(str(path), reason)  # both in args, so that it survives pickling by a worker
+        super().__init__(str(path), reason)  # both in args, so that a worker can pickle it
         self.path = Path(path)
         self.reason = reason
 
@@ -58,13 +58,13 @@ class Frame:
     depth: np.ndarray | None  # [Hd, Wd] float32 along z [m], 0 = invalid
     T_world_cam: np.ndarray  # [4, 4] float64 camera-to-world [m]
     intrinsics: np.ndarray  # [3, 3] float64 of the image [px]
-    depth_intrinsics: np.ndarray | None = None  # [3, 3] of the depth map; None: those of the image hold for it
+    depth_intrinsics: np.ndarray | None = None  # [3, 3] of the depth map [px]; None = those of the image
     timestamp: float | None = None  # [s]
 
 
 @dataclass(frozen=True)
 class Skipped:
-    """A frame on disk that the sequence leaves out, and why (known when the sequence was opened)."""
+    """A frame on disk that the sequence excludes, and the reason, known at opening."""
 
     name: str
     reason: str
@@ -72,15 +72,15 @@ class Skipped:
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """A frame before it is decoded: ``load_image`` and ``load_depth`` return what :class:`Frame` holds. One whose pose
-    is not finite is skipped and counted."""
+    """A frame before decoding: ``load_image`` and ``load_depth`` return the arrays of :class:`Frame`. A frame whose
+    pose is not finite is skipped and counted."""
 
     name: str
     T_world_cam: np.ndarray
     load_image: Loader | None
     load_depth: Loader | None = None
     timestamp: float | None = None
-    # Its own camera, where a sequence has several or one that zooms; None: the sequence's.
+    # The frame's camera if a sequence has several cameras or zooms; None = the sequence's.
     intrinsics: np.ndarray | None = None
     depth_intrinsics: np.ndarray | None = None
     image_size: Size | None = None
@@ -91,20 +91,20 @@ class FrameSequence:
     """Posed frames, decoded lazily. Build one with :func:`make_sequence`."""
 
     name: str
-    layout: str  # which reader opened it
+    layout: str  # name of its reader
     entries: tuple[Entry, ...]  # the frames with a usable pose, in order
     intrinsics: np.ndarray  # [3, 3] of the images [px]
     image_size: Size | None = None  # (H, W) of the images; an image of another size raises FrameError
-    depth_intrinsics: np.ndarray | None = None  # [3, 3] of the depth maps [px], where they differ from ``intrinsics``
-    depth_size: Size | None = None  # (H, W) of the depth maps, None where there are none
-    skipped: tuple[Skipped, ...] = ()  # the frames left out
+    depth_intrinsics: np.ndarray | None = None  # [3, 3] of the depth maps [px], if they differ from ``intrinsics``
+    depth_size: Size | None = None  # (H, W) of the depth maps, None = no depth maps
+    skipped: tuple[Skipped, ...] = ()  # the excluded frames
     names_on_disk: tuple[str, ...] = ()  # every frame's name in order, skipped ones included
-    # Whether poses are known. Without, they are all the identity and mean nothing: single images, on which a network
-    # can be judged but nothing that compares views.
+    # True if poses are known. Otherwise all are the identity: single images, on which networks can be evaluated, but no
+    # method that compares views.
     posed: bool = True
-    folder: Path | None = None  # where it lies; None where it is no recording
-    metric: bool = True  # False: the unit of the poses is not known, as of structure from motion
-    pose_scale: float = 1.0  # by which the recording's positions were multiplied [m per unit]
+    folder: Path | None = None  # of the recording; None for other sources
+    metric: bool = True  # False if the unit of the poses is unknown, as with structure from motion
+    pose_scale: float = 1.0  # factor of the recording's positions [m per unit]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -113,7 +113,7 @@ class FrameSequence:
 
     @property
     def without_depth(self) -> tuple[str, ...]:
-        """Names of the frames that have a pose but no depth map."""
+        """Names of the frames with a pose but without a depth map."""
         return tuple(entry.name for entry in self.entries if entry.load_depth is None)
 
     def changed(self, change: Callable[[Entry], Entry]) -> FrameSequence:
@@ -124,8 +124,8 @@ class FrameSequence:
         return len(self.entries)
 
     def __getitem__(self, index: int) -> Frame:
-        """Decodes one frame (negative indices count from the end). Raises FrameError: a file is missing, cannot be
-        decoded, or has not the sequence's size."""
+        """Decode one frame (negative indices count from the end). Raises FrameError: a file is missing, cannot be
+        decoded, or does not have the sequence's size."""
         entry = self.entries[index]
         K_depth = self.depth_intrinsics if entry.depth_intrinsics is None else entry.depth_intrinsics
         return Frame(
@@ -140,15 +140,15 @@ class FrameSequence:
         )
 
     def intrinsics_of(self, entry: Entry) -> np.ndarray:
-        """[3, 3] of an entry's image [px]: its own, or the sequence's."""
+        """[3, 3] intrinsics of an entry's image [px]: the entry's, or the sequence's."""
         return self.intrinsics if entry.intrinsics is None else entry.intrinsics
 
     def __iter__(self) -> Iterator[Frame]:
-        """All frames in order; the first that cannot be decoded raises :class:`FrameError`."""
+        """All frames in order. Raises FrameError: a frame cannot be decoded."""
         return (self[index] for index in range(len(self)))
 
     def readable(self, on_error: Callable[[FrameError], None]) -> Iterator[Frame]:
-        """The frames that can be decoded, in order; each other one's error is handed to ``on_error``."""
+        """The frames that can be decoded, in order; ``on_error`` gets the errors of the others."""
         for index in range(len(self)):
             try:
                 frame = self[index]
@@ -170,9 +170,9 @@ def make_sequence(
     posed: bool = True,
     metric: bool = True,
 ) -> FrameSequence:
-    """Sorts frames into usable and skipped and checks that the intrinsics fit the sizes (H, W); ``posed`` and
-    ``metric`` as there. Raises ValueError: no frame is usable (the reasons are counted); two frames share a name; the
-    intrinsics are malformed or belong to another image size."""
+    """Divide frames into usable and skipped ones, and check that the intrinsics fit the sizes (H, W). ``posed`` and
+    ``metric``: see :class:`FrameSequence`. Raises ValueError: no frame is usable (the message counts the reasons); two
+    frames share a name; the intrinsics are malformed or belong to another image size."""
     names, entries, skipped = list[str](), list[Entry](), list[Skipped]()
     for frame in frames:
         names.append(frame.name)
@@ -199,7 +199,7 @@ def make_sequence(
 
 
 def in_memory(sequence: FrameSequence, progress: Callable[[int], object] = lambda _: None) -> FrameSequence:
-    """The sequence with all frames decoded now and kept; ``progress`` gets the number of decoded frames. Raises
+    """The sequence with all frames decoded and in memory; ``progress`` gets the number of decoded frames. Raises
     FrameError: a frame cannot be decoded."""
     entries = []
     for frame, entry in zip(sequence, sequence.entries, strict=True):
@@ -211,7 +211,7 @@ def in_memory(sequence: FrameSequence, progress: Callable[[int], object] = lambd
 
 
 def parse_slice(text: str | None) -> slice:
-    """START:STOP:STEP as a slice of frames, any part of it left out. Raises ValueError: another form, or a step below
+    """START:STOP:STEP as a slice of frames; each part is optional. Raises ValueError: another form, or a step below
     1."""
     parts = (text or ":").split(":")
     try:
@@ -224,7 +224,7 @@ def parse_slice(text: str | None) -> slice:
 
 
 def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:
-    """Raises ValueError unless K [3, 3] is a pinhole matrix whose centre lies well inside ``size`` (H, W)."""
+    """Raises ValueError unless K [3, 3] is a pinhole matrix whose centre is well inside ``size`` (H, W)."""
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
         raise ValueError(f"{argument} must be a finite 3x3 matrix with positive focal lengths, got {K.tolist()}")
     if np.abs(K[2] - [0, 0, 1]).max() > 1e-9 or abs(K[1, 0]) > 1e-9:
@@ -235,7 +235,7 @@ def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:
 
 
 def fits(K: np.ndarray, size: Size) -> bool:
-    """True if K's principal point lies where a camera with images of ``size`` (H, W) can have it."""
+    """True if K's principal point is plausible for images of ``size`` (H, W)."""
     low, high = CENTRE_RANGE
     return bool(low < K[0, 2] / size[1] < high and low < K[1, 2] / size[0] < high)
 

@@ -1,8 +1,8 @@
 """Any posed images: a folder or a video, a trajectory, intrinsics, and optionally depth maps.
 
-Looked for in the sequence's folder (each can be given instead): images in one of ``images image rgb color
-frames`` or in the folder itself, or one video file; a trajectory ``poses.txt trajectory.txt groundtruth.txt
-...``; intrinsics ``K.txt intrinsics.txt ...``; depth maps in ``depth``.
+The reader searches the sequence's folder (options override each): images in one of ``images image rgb color frames`` or
+in the folder itself, or one video file; a trajectory ``poses.txt trajectory.txt groundtruth.txt ...``; intrinsics
+``K.txt intrinsics.txt ...``; depth maps in ``depth``.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ LOOKED_FOR = (
 
 
 def detect(path: Path) -> bool:
-    """True if images and a trajectory lie where this reader looks for them."""
+    """True if this reader finds images and a trajectory."""
     if path.is_file():
         return path.suffix.lower() in VIDEO_SUFFIXES
     has_trajectory = any((path / name).is_file() for name in TRAJECTORIES)
@@ -54,33 +54,34 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens images or a video with a trajectory.
+    """Open images or a video with a trajectory.
 
-    Without timestamps in the trajectory, pose i belongs to the i-th image (numbers sorted by value).
-    With them, an image's time is, in this order: its line in ``rgb.txt`` beside the images or their folder;
-    index / ``fps``; its timestamp in a video's container; its name as a number [s, or us or ns if as large]; each plus
-    ``time_offset``. The pose is interpolated as for TUM RGB-D.
-    Depth maps belong to the image with the same stem or the same numbers in their names, or else, where
-    their names are timestamps too, to the nearest within ``max_time_difference``, one-to-one.
+    Without timestamps in the trajectory, pose i belongs to the i-th image (numbers sorted by value). With them, an
+    image's time is, in this order: its line in ``rgb.txt`` next to the images or their folder; index / ``fps``; its
+    timestamp in a video's container; its name as a number [s, or us or ns if large]; plus ``time_offset``. The pose is
+    interpolated as for TUM RGB-D.
+
+    Depth maps belong to the image with the same stem or the same numbers in the name. If there are none and the names
+    are timestamps, they belong to the nearest image within ``max_time_difference``, one-to-one.
     """
     root = path if path.is_dir() else path.parent
     images, size = open_images(path, options)
-    read_poses = partial(read_trajectory, _given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
+    read_poses = partial(read_trajectory, _named_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
     frames = _with_depth(images, root, options, options.truth_scale)
-    # Of a generic sequence, ``fps`` counts images, whatever their names.
+    # In a generic sequence, ``fps`` counts images, not numbers in their names.
     counted = replace(options, trajectory=None)
     return assemble("generic", path, frames, _lens(root, options, size), counted, size=size, read_poses=read_poses)
 
 
 def has_images_and_depth(path: Path) -> bool:
-    """True if a folder has a folder of images and one of depth maps where :func:`open_unposed` looks for them."""
+    """True if :func:`open_unposed` finds a folder of images and one of depth maps."""
     return path.is_dir() and all(any((path / name).is_dir() for name in names) for names in (IMAGES, DEPTHS))
 
 
 def open_unposed(path: Path, options: Options) -> FrameSequence:
-    """Opens images with depth maps for uses that need no poses, such as training: a sequence with ``posed`` False.
-    Images without a depth map are skipped. Without ``truth_scale``, maps beside TUM's ``depth.txt`` are in 1/5000 m.
-    Raises ValueError: images, depth maps or intrinsics are not found, or no depth map fits an image."""
+    """Open images with depth maps for uses without poses, such as training: a sequence with ``posed`` False. Images
+    without a depth map are skipped. Without ``truth_scale``, maps next to TUM's ``depth.txt`` are in 1/5000 m. Raises
+    ValueError: images, depth maps or intrinsics are not found, or no depth map fits an image."""
     options.reject("unposed", "trajectory", "T_color_depth")
     if not has_images_and_depth(path):
         raise ValueError(f"{path} must hold one of {', '.join(IMAGES)} and one of {', '.join(DEPTHS)}")
@@ -97,15 +98,15 @@ def open_unposed(path: Path, options: Options) -> FrameSequence:
 
 
 def _lens(root: Path, options: Options, size: Size) -> Lens | None:
-    """Read the camera from a file beside the images, unless the options name one."""
+    """Read the camera from a file next to the images; None if the options have intrinsics."""
     if options.intrinsics is not None:
         return None
-    return Lens.of(read_intrinsics(_given_or_found(root, None, INTRINSICS, "intrinsics")), size)
+    return Lens.of(read_intrinsics(_named_or_found(root, None, INTRINSICS, "intrinsics")), size)
 
 
 def open_images(path: Path, options: Options) -> tuple[list[Entry], Size]:
-    """The images without poses and depth, with their times where they are known, and their (H, W). Raises ValueError:
-    no images, or none that can be read."""
+    """The images without poses and depth, with their times if known, and their (H, W). Raises ValueError: no images, or
+    none that can be read."""
     source = path
     if options.images is not None:
         source = resolve(path, options.images)
@@ -125,12 +126,12 @@ def open_images(path: Path, options: Options) -> tuple[list[Entry], Size]:
     size = first_image_size(files)
     if size is None:
         raise ValueError(f"{source} holds no image that can be read ({', '.join(IMAGE_SUFFIXES)})")
-    known = listed_times(source, files)
-    if known is None and options.fps is not None:
-        known = np.arange(len(files)) / options.fps
-    elif known is None:
-        known = stem_times([file.stem for file in files])
-    stamps = [None] * len(files) if known is None else known.tolist()
+    file_times = listed_times(source, files)
+    if file_times is None and options.fps is not None:
+        file_times = np.arange(len(files)) / options.fps
+    elif file_times is None:
+        file_times = stem_times([file.stem for file in files])
+    stamps = [None] * len(files) if file_times is None else file_times.tolist()
     images = [Entry(f.stem, UNKNOWN, partial(read_color, f), None, t) for f, t in zip(files, stamps, strict=True)]
     return images, size
 
@@ -142,8 +143,8 @@ def _image_sources(path: Path) -> list[Path]:
 
 
 def listed_times(folder: Path, files: list[Path]) -> np.ndarray | None:
-    """Timestamps [N] [s] of images by the ``rgb.txt`` beside them or their folder; None without one. Raises ValueError:
-    it has none of an image."""
+    """Timestamps [N] [s] of images by the ``rgb.txt`` next to them or their folder; None without one. Raises
+    ValueError: it has no timestamp of an image."""
     listing = next((f / "rgb.txt" for f in (folder, folder.parent) if (f / "rgb.txt").is_file()), None)
     if listing is None:
         return None
@@ -162,7 +163,7 @@ def depth_folder(root: Path, inside: Path, options: Options) -> Path | None:
 
 
 def _with_depth(images: list[Entry], root: Path, options: Options, scale: float | None) -> list[Entry]:
-    """The images with their depth maps, in ``scale`` [m per unit], where they have one."""
+    """The images with their depth maps, if any, in ``scale`` [m per unit]."""
     folder = depth_folder(root, root, options)
     files = {} if folder is None else _depth_files(folder, images, options)
     return [replace(image, load_depth=depth_loader(files.get(image.name), scale)) for image in images]
@@ -177,15 +178,15 @@ def _depth_files(folder: Path, images: list[Entry], options: Options) -> dict[st
         depth_times = stem_times([file.stem for file in files])
         if depth_times is None or None in times:
             raise
-        near = associate(np.array(times), depth_times, options.max_time_difference)
-        if not near:
+        pairs = associate(np.array(times), depth_times, options.max_time_difference)
+        if not pairs:
             raise
-        return {names[i]: files[j] for i, j in near.items()}
+        return {names[i]: files[j] for i, j in pairs.items()}
 
 
-def _given_or_found(root: Path, given: str | Path | None, names: tuple[str, ...], option: str) -> Path:
-    if given is not None:
-        return resolve(root, given)
+def _named_or_found(root: Path, override: str | Path | None, names: tuple[str, ...], option: str) -> Path:
+    if override is not None:
+        return resolve(root, override)
     result = [root / name for name in names if (root / name).is_file()]
     if len(result) != 1:
         listing = f"found {[file.name for file in result]}" if result else f"looked for {', '.join(names)}"

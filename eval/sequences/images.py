@@ -1,8 +1,8 @@
 """Decoding of colour images and depth maps; every file that cannot be decoded raises ``FrameError``.
 
-PNGs of 8-bit RGB are decoded by kornia_rs, in a third of Pillow's time; everything else by Pillow,
-which raises on truncated files, where OpenCV returns what it got. Pixels are taken as stored (an EXIF orientation is
-not applied: intrinsics hold for the stored pixels).
+PNGs of 8-bit RGB are decoded by kornia_rs, in a third of Pillow's time; all other files by Pillow, which raises errors
+for truncated files, while OpenCV returns partial images. An EXIF orientation is not applied, because intrinsics are
+those of the stored pixels.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ufmstar_torch.optional import optional
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
-# Pillow's plugins raise these for broken files, beside OSError (SyntaxError: bad PNG chunk).
+# Errors of Pillow's plugins for broken files (SyntaxError: bad PNG chunk).
 _BROKEN_IMAGE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 # Key of a PNG's text chunk: metres per unit of its 16-bit values.
 SCALE_KEY = "depth_scale"
@@ -36,13 +36,13 @@ _DEPTH_NAMES = ("Z", "depth", "V", "Y", "R")
 
 
 def read_color(path: str | Path, content: bytes | None = None) -> np.ndarray:
-    """An 8-bit image as [H, W, 3] uint8 RGB (grey is repeated, alpha dropped), of a file or of the ``content`` of one.
-    Raises FrameError: missing, truncated, corrupt, or not an 8-bit image."""
+    """An 8-bit image of a file, or of its ``content``, as [H, W, 3] uint8 RGB (grey is repeated, alpha dropped). Raises
+    FrameError: missing, truncated, corrupt, or not an 8-bit image."""
     if content is None and (plain := _plain_png(Path(path))) is not None:
         return plain
     try:
         with Image.open(path if content is None else BytesIO(content)) as image:
-            if image.mode[0] in "IF":  # Pillow would clip these at 255 without a word
+            if image.mode[0] in "IF":  # Pillow would silently clip these at 255
                 raise FrameError(path, f"expected an 8-bit colour or grey image, got mode {image.mode}")
             return np.array(image.convert("RGB"))
     except _BROKEN_IMAGE as error:
@@ -55,9 +55,9 @@ def read_depth(path: str | Path, scale: float | None = None, *, default_scale: f
 
     Args:
         path: of the file.
-        scale: metres per unit of the stored values. None: floats are metres; integers are in the unit that a PNG's text
-            ``depth_scale`` names, or else in ``default_scale``.
-        default_scale: metres per unit of integers without another indication.
+        scale: metres per unit of the stored values. None = floats are metres, integers have the unit in a PNG's text
+            ``depth_scale``, or else ``default_scale``.
+        default_scale: default metres per unit of integers.
 
     Raises:
         FrameError: missing, truncated, corrupt, or not a depth map (8-bit, several channels).
@@ -69,8 +69,8 @@ def read_depth(path: str | Path, scale: float | None = None, *, default_scale: f
 
 
 def read_map(path: str | Path, key: str) -> tuple[np.ndarray, float | None]:
-    """A one-channel map [H, W] as stored, and the metres per unit that a PNG's text names (or None); ``key`` is the
-    array of an npz that holds several. Raises FrameError: as :func:`read_depth`."""
+    """The stored one-channel map [H, W], and the metres per unit in a PNG's text (or None). ``key`` is the array's name
+    in an npz with several arrays. Raises FrameError: as :func:`read_depth`."""
     path = Path(path)
     suffix = path.suffix.lower()
     scale = None
@@ -93,7 +93,7 @@ def read_map(path: str | Path, key: str) -> tuple[np.ndarray, float | None]:
 
 
 def image_tensor(frame: Frame) -> torch.Tensor:
-    """The frame's image [1, 3, H, W] uint8 RGB, as a network's ``preprocess`` takes it. Raises FrameError: the frame
+    """The frame's image [1, 3, H, W] uint8 RGB, the input of a network's ``preprocess``. Raises FrameError: the frame
     has no image."""
     if frame.image is None:
         raise FrameError(frame.name, "no image")
@@ -101,7 +101,7 @@ def image_tensor(frame: Frame) -> torch.Tensor:
 
 
 def image_size(path: str | Path) -> Size:
-    """(H, W) from an image's header; FrameError where even that cannot be read."""
+    """(H, W) from an image's header. Raises FrameError: the header cannot be read."""
     try:
         with Image.open(path) as image:
             return image.height, image.width
@@ -110,15 +110,15 @@ def image_size(path: str | Path) -> Size:
 
 
 def first_image_size(paths: Iterable[Path]) -> Size | None:
-    """(H, W) of the first image whose header can be read; None where there is none."""
+    """(H, W) of the first image whose header can be read, or None."""
     for path in paths:
-        with suppress(FrameError):  # raised again, and counted, when that frame is asked for
+        with suppress(FrameError):  # raised again, and counted, when that frame is read
             return image_size(path)
     return None
 
 
 def first_depth_size(frames: Iterable[Entry | Skipped]) -> Size | None:
-    """(H, W) of the first depth map that can be loaded; None where none can."""
+    """(H, W) of the first depth map that can be loaded, or None."""
     for frame in frames:
         if isinstance(frame, Entry) and frame.load_depth is not None:
             with suppress(FrameError):  # as above
@@ -128,8 +128,8 @@ def first_depth_size(frames: Iterable[Entry | Skipped]) -> Size | None:
 
 
 def list_files(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
-    """The folder's files with one of the suffixes, numbers in names sorted by value (2 before 10). Links whose file is
-    missing are among them, so that their frames are skipped and counted."""
+    """The folder's files with one of the suffixes, numbers in names sorted by value (2 before 10). Broken links are
+    included, so that their frames are skipped and counted."""
     named = (path for path in folder.iterdir() if path.suffix.lower() in suffixes)
     return sorted((p for p in named if p.is_file() or (p.is_symlink() and not p.exists())), key=natural_key)
 
@@ -141,7 +141,7 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
 
 
 def depth_loader(path: Path | None, scale: float | None, default_scale: float = _MILLIMETRE) -> Loader | None:
-    """The loader that :class:`Entry` keeps for a depth file (None stays None)."""
+    """The loader of a depth file for :class:`Entry`; None for None."""
     return None if path is None else partial(read_depth, path, scale, default_scale=default_scale)
 
 
@@ -152,18 +152,18 @@ def within(load: Loader, most: float) -> np.ndarray:
 
 
 def check_scale(depth_scale: float | None) -> None:
-    """Raises ValueError unless metres per unit is a positive number of at most 1, or None."""
+    """Raises ValueError: metres per unit is neither None nor in (0, 1]."""
     if depth_scale is not None and not 0 < depth_scale <= 1:
         raise ValueError(f"depth_scale is in metres per unit (0.001: millimetres, 1/5000: TUM), got {depth_scale}")
 
 
 def positive(depth: np.ndarray) -> np.ndarray:
-    """A depth map of float32 with 0 for what is not finite or not positive."""
+    """A depth map of float32 with 0 for values that are not finite or not positive."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
 def _plain_png(path: Path) -> np.ndarray | None:
-    """The pixels of a PNG of 8-bit RGB; None of another file and of a damaged one, both of which are Pillow's."""
+    """The pixels of a PNG of 8-bit RGB; None for other or damaged files, which Pillow decodes or rejects."""
     if path.suffix.lower() != ".png" or not path.is_file():
         return None
     with path.open("rb") as file:
@@ -176,7 +176,7 @@ def _plain_png(path: Path) -> np.ndarray | None:
     try:
         return np.asarray(io.read_image_png_u8(str(path), "rgb"))
     except Exception as error:
-        # kornia_rs has no exception class of its own: it raises a bare Exception for a file that it cannot decode.
+        # kornia_rs raises a plain Exception for a file that it cannot decode.
         if type(error) is not Exception:
             raise
         return None
@@ -193,11 +193,11 @@ def _from_image(path: Path) -> tuple[np.ndarray, float | None]:
 
 
 def _read_exr(path: Path) -> np.ndarray:
-    """The depth channel of an OpenEXR file as [H, W] float32, values as stored: the only channel, or the first one
-    called Z, depth, V, Y or R (after a layer prefix)."""
+    """The stored depth channel of an OpenEXR file as [H, W] float32: the only channel, or the first one named Z, depth,
+    V, Y or R (after a layer prefix)."""
     OpenEXR = optional("OpenEXR", "EXR files need OpenEXR", "'ufmstar-torch[eval]'")
     try:
-        with redirect_stdout(StringIO()):  # the library prints a remark on damaged files
+        with redirect_stdout(StringIO()):  # the library prints messages for damaged files
             parts = OpenEXR.File(str(path), separate_channels=True).parts
         if not parts:
             raise ValueError("no pixels can be decoded")

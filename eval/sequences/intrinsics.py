@@ -1,4 +1,4 @@
-"""Intrinsics from the forms in which users have them, and their scaling to another image size."""
+"""Intrinsics from files and numbers, and their scaling to another image size."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.sequences.frame import Size
 from ufmstar_torch.eval.sequences.poses import read_matrix
 
-# A file's path, a matrix [3, 3] (or [4, 4], as ScanNet writes it), or the numbers fx, fy, cx, cy [px].
+# A file's path, a matrix [3, 3] (or ScanNet's [4, 4]), or the numbers fx, fy, cx, cy [px].
 IntrinsicsLike = str | Path | np.ndarray | Sequence[float]
 
 # Sizes whose aspect ratios differ by more than this were cropped, not resized.
@@ -36,8 +36,8 @@ def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
 
 
 def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | None:
-    """Words of a command line as :func:`read_intrinsics` takes them: a file, or fx, fy, cx, cy [px]; None for no words.
-    Raises ValueError: neither, or no such file; the message names ``option``."""
+    """Words of a command line as the argument of :func:`read_intrinsics`: a file, or fx, fy, cx, cy [px]; None for no
+    words. Raises ValueError: another form, or no such file; the message names ``option``."""
     if len(words) == 1 and not Path(words[0]).is_file():
         raise ValueError(f"{option}: no such file: {words[0]}")
     if len(words) <= 1:
@@ -59,14 +59,16 @@ def pinhole_values(K: np.ndarray) -> tuple[float, float, float, float]:
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
-def camera_matrix(given: IntrinsicsLike | None, known: np.ndarray, known_size: Size, size: Size | None) -> np.ndarray:
-    """K [3, 3] of images of ``size``: the ``given`` one, or the layout's own of ``known_size``, scaled."""
-    return scale_intrinsics(known, known_size, size) if given is None else read_intrinsics(given)
+def camera_matrix(
+    override: IntrinsicsLike | None, native: np.ndarray, native_size: Size, size: Size | None
+) -> np.ndarray:
+    """K [3, 3] of images of ``size``: the ``override``, or the layout's ``native`` one of ``native_size``, scaled."""
+    return scale_intrinsics(native, native_size, size) if override is None else read_intrinsics(override)
 
 
 def scale_intrinsics(K: np.ndarray, old: Size | None, new: Size | None) -> np.ndarray:
-    """K [3, 3] of images (H, W) ``old`` after they were resized to ``new``; as it is where a size is not known. Raises
-    ValueError: the aspect ratios differ, so that the images were not only resized."""
+    """K [3, 3] of images (H, W) ``old`` after a resize to ``new``; unchanged if a size is unknown. Raises ValueError:
+    the aspect ratios differ, so the images were not only resized."""
     if old is None or new is None or old == new:
         return K.copy()
     if abs((new[1] / new[0]) / (old[1] / old[0]) - 1) > _ASPECT_TOLERANCE:

@@ -2,16 +2,16 @@
 
 ``data_2d_raw/DRIVE/image_00/data_rect/NNNNNNNNNN.png`` (or image_01), ``data_poses/DRIVE/cam0_to_world.txt`` (the
 rectified camera 00) or ``poses.txt`` (the car), by frame number, ``calibration/``, and
-``data_3d_raw/DRIVE/velodyne_points/data/*.bin``. Frames without a pose, where the car stood still, are skipped.
-image_02 and image_03 are fisheye cameras, which a pinhole model does not describe.
+``data_3d_raw/DRIVE/velodyne_points/data/*.bin``. Frames without a pose, while the car did not move, are skipped.
+image_02 and image_03 are fisheye cameras, which do not fit a pinhole model.
 https://www.cvlibs.net/datasets/kitti-360/documentation.php
 
 Calibration: ``perspective.txt`` has for each camera NN of the stereo pair ``P_rect_NN`` (3x4), ``R_rect_NN`` (3x3, from
-the camera as it is mounted to the rectified one) and ``S_rect_NN`` (width, height); ``calib_cam_to_pose.txt`` has the
-mounted cameras in the car (``image_NN:`` and 3x4 numbers), ``calib_cam_to_velo.txt`` camera 00 as mounted in the laser.
+the mounted to the rectified camera) and ``S_rect_NN`` (width, height); ``calib_cam_to_pose.txt`` has the poses of the
+mounted cameras in the car (``image_NN:`` and 3x4 numbers), ``calib_cam_to_velo.txt`` that of camera 00 in the laser.
 
 Laser: a scan is ``f32`` x y z (forward, left, up [m]) and reflectance. The head turns clockwise, seen from above, and
-looks forward at the scan's time: a point at azimuth a was measured a / 2 pi of a turn earlier, from elsewhere.
+points forward at the scan's time: a point at azimuth a was measured a / 2 pi of a turn earlier, from another position.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _CAMERA = re.compile(r"image_0\d")
 _SCALE = 1 / 256  # [m] per unit of 16-bit depth maps, as KITTI's
 _LASER = "calib_cam_to_velo.txt"
 _COLUMNS = 4
-_MIN_RANGE = 2.0  # [m] nearer returns are the car's own roof
+_MIN_RANGE = 2.0  # [m] nearer returns are the car's roof
 
 
 def detect(path: Path) -> bool:
@@ -55,16 +55,16 @@ def detect(path: Path) -> bool:
 
 
 def parts(root: Path) -> list[Path]:
-    """The drives of a root that have rectified images, sorted; a drive or camera itself."""
+    """The drives of a root with rectified images, sorted; for a drive or camera the path itself."""
     if not (root / _RAW).is_dir():
         return [root]
     return sorted(d for d in (root / _RAW).iterdir() if any((d / camera / "data_rect").is_dir() for camera in _CAMERAS))
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a drive: ``path`` is the root (with the option ``drive``, unless there is only one), or the drive's folder
-    (its first rectified camera), or the camera's. Depth comes from the folder ``depth`` (16 bits, 1/256 m), or else
-    from the laser: the frame's own scan, unrolled, and those of ``scans`` frames before and after it. Raises
+    """Open a drive: ``path`` is the root (with the option ``drive``, unless there is only one), or the drive's folder
+    (its first rectified camera), or the camera's. Depth comes from the folder ``truth`` (16 bits, 1/256 m), or else
+    from the laser: the frame's scan, unrolled, and those of ``scans`` frames before and after it. Raises
     FileNotFoundError: no poses or calibration; ValueError: no or several drives fit, a fisheye camera, malformed
     files."""
     folder = _camera(_drive(path, options.drive))
@@ -105,18 +105,18 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def _camera(path: Path) -> Path | None:
-    """The camera's folder, ROOT/data_2d_raw/DRIVE/image_0N, that a folder below ``data_2d_raw`` means."""
+    """The camera's folder, ROOT/data_2d_raw/DRIVE/image_0N, of a folder below ``data_2d_raw``, or None."""
     path = Path(os.path.abspath(path))
     if path.name in ("data_rect", "data_rgb"):
         path = path.parent
     if path.parent.name == _RAW:
-        have = [camera for camera in _CAMERAS if (path / camera / "data_rect").is_dir()]
-        path = path / (have or sorted(p.name for p in path.glob("image_0?")) or _CAMERAS)[0]
+        rectified = [camera for camera in _CAMERAS if (path / camera / "data_rect").is_dir()]
+        path = path / (rectified or sorted(p.name for p in path.glob("image_0?")) or _CAMERAS)[0]
     return path if _CAMERA.fullmatch(path.name) and path.parents[1].name == _RAW else None
 
 
 def _drive(path: Path, drive: str | int | None) -> Path:
-    """The folder of the drive that ``path`` and the option mean; ValueError where none or several fit."""
+    """The folder of the drive of ``path`` and the option. Raises ValueError: none or several fit."""
     if not (path / _RAW).is_dir():
         if drive is not None:
             raise ValueError(f"drive goes with the dataset's root, which holds {_RAW}; {path} does not")
@@ -124,13 +124,13 @@ def _drive(path: Path, drive: str | int | None) -> Path:
     number = rf"drive_0*{int(drive)}(?!\d)" if drive is not None and str(drive).isdecimal() else "$^"
     fitting = [d for d in parts(path) if drive is None or str(drive) == d.name or re.search(number, d.name)]
     if len(fitting) != 1:
-        known = [d.name for d in parts(path)]
-        raise ValueError(f"{path}: drive must name one of {known}, by name or number: {drive!r}")
+        drives = [d.name for d in parts(path)]
+        raise ValueError(f"{path}: drive must name one of {drives}, by name or number: {drive!r}")
     return fitting[0]
 
 
 def _times(path: Path, numbers: list[int]) -> Sequence[float | None]:
-    """Times of the frames [s since 1970], of lines ``2013-05-28 08:46:02.904546304``; None if not known."""
+    """Times of the frames [s since 1970], from lines ``2013-05-28 08:46:02.904546304``; None = unknown."""
     lines = [text for _, text in numbered_lines(path)] if path.is_file() else []
     if max(numbers) >= len(lines):
         return [None] * len(numbers)
@@ -158,7 +158,7 @@ def _poses(root: Path, drive: str, camera: str) -> dict[int, np.ndarray]:
 def _with_laser(
     sequence: FrameSequence, root: Path, drive: str, camera: str, poses: dict[int, np.ndarray], options: Options
 ) -> FrameSequence:
-    """The sequence with depth from the laser, for the frames that have a scan."""
+    """The sequence with depth from the laser, for frames with a scan."""
     folder, calibration = root / "data_3d_raw" / drive / "velodyne_points" / "data", root / "calibration"
     if not folder.is_dir() or not (calibration / _LASER).is_file():
         return sequence
@@ -179,32 +179,32 @@ def _with_laser(
 
 @dataclass(frozen=True, eq=False)
 class _Laser:
-    """The scans of a drive, as one of its cameras sees them."""
+    """The scans of a drive in one of its cameras."""
 
     scans: dict[int, Path]  # by frame number
     poses: dict[int, np.ndarray]  # [4, 4] T_world_cam by frame number, finite ones
     T_cam_laser: np.ndarray  # [4, 4]
     K: np.ndarray  # [3, 3] of the camera [px]
     size: Size  # of its images
-    beside: int  # so many scans before and after a frame are added to its own
+    neighbours: int  # number of scans before and after a frame that are added to the frame's scan
 
     def sees(self, number: int) -> bool:
         """True if a frame has a scan and a pose."""
         return number in self.scans and number in self.poses
 
     def depth(self, number: int) -> np.ndarray:
-        """[H, W] float32 [m] of a frame: each pixel takes the nearest point that falls on it, 0 = none."""
+        """[H, W] float32 [m] of a frame: the nearest point in each pixel, 0 = none."""
         points = []
-        for other in filter(self.sees, range(number - self.beside, number + self.beside + 1)):
-            own, T_laser_before = read_scan(self.scans[other]), self._turn(other)
+        for other in filter(self.sees, range(number - self.neighbours, number + self.neighbours + 1)):
+            scan, T_laser_before = read_scan(self.scans[other]), self._turn(other)
             if T_laser_before is not None:
-                own = unroll(own, T_laser_before)
+                scan = unroll(scan, T_laser_before)
             T = np.linalg.inv(self.poses[number]) @ self.poses[other] @ self.T_cam_laser
-            points.append(T[:3, :3] @ own + T[:3, 3:])
+            points.append(T[:3, :3] @ scan + T[:3, 3:])
         return project(np.concatenate(points, axis=1), self.K, self.size)
 
     def _turn(self, number: int) -> np.ndarray | None:
-        """[4, 4] from the laser one scan earlier into it at a frame [m]; None where no neighbour has a pose."""
+        """[4, 4] from the laser one scan earlier to the laser at a frame [m]; None if no neighbour has a pose."""
         for before, after in ((number - 1, number), (number, number + 1)):
             if before in self.poses and after in self.poses:
                 motion = np.linalg.inv(self.poses[after]) @ self.poses[before]
@@ -235,7 +235,7 @@ def _T_rect_mounted(calibration: Path, camera: str) -> np.ndarray:
 
 
 def _T_car_rect(calibration: Path, camera: str) -> np.ndarray:
-    """[4, 4] from the rectified camera into the car, whose poses poses.txt holds."""
+    """[4, 4] from the rectified camera into the car, whose poses are in poses.txt."""
     T_car_mounted = _affine(_values(calibration / "calib_cam_to_pose.txt", f"image_{camera}", 12))
     return T_car_mounted @ np.linalg.inv(_T_rect_mounted(calibration, camera))
 
@@ -246,7 +246,7 @@ def _affine(values: np.ndarray) -> np.ndarray:
 
 
 def _values(path: Path, key: str, count: int) -> np.ndarray:
-    """[count] the numbers behind ``key:`` in a calibration file."""
+    """[count] the numbers after ``key:`` in a calibration file."""
     if not path.is_file():
         raise FileNotFoundError(f"KITTI-360's calibration is missing: no file {path}")
     for number, line in numbered_lines(path):
@@ -264,7 +264,7 @@ def _values(path: Path, key: str, count: int) -> np.ndarray:
 
 
 def read_scan(path: Path) -> np.ndarray:
-    """[3, N] float64 points of a scan in the laser's frame [m], without the car's own and those that are not finite.
+    """[3, N] float64 points of a scan in the laser's frame [m], without those on the car and those that are not finite.
     Raises FrameError: the file is missing, or its size is not that of a scan."""
     try:
         values = np.fromfile(path, "<f4")
@@ -278,8 +278,8 @@ def read_scan(path: Path) -> np.ndarray:
 
 
 def unroll(points: np.ndarray, T_laser_before: np.ndarray) -> np.ndarray:
-    """Points [3, N] of one turn as if all had been measured at the scan's time, when the head looks forward. The motion
-    of one turn, ``T_laser_before`` [4, 4], is taken as even (rotation vector and translation)."""
+    """Points [3, N] of one turn, moved to the scan's time, when the head points forward. The motion during the turn,
+    ``T_laser_before`` [4, 4], is assumed to be uniform (rotation vector and translation)."""
     share = np.arctan2(points[1], points[0]) / (2 * np.pi)
     turn = Rotation.from_matrix(T_laser_before[:3, :3]).as_rotvec()
     moved = Rotation.from_rotvec(share[:, None] * turn).apply(points.T).T

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 from ufmstar_torch.eval.sequences.plugins import load_plugins
 
-# Each module has ``detect(path)``, ``read(path, options)`` and LOOKED_FOR, the files that it detects; where a path may
-# hold several sequences, ``parts(path)``.
+# Each module has ``detect(path)``, ``read(path, options)`` and LOOKED_FOR, the files that it detects; if a path may
+# contain several sequences, also ``parts(path)``.
 _MODULES = (
     *("tum", "seven_scenes", "scannet", "sens", "tartanair", "kitti360", "nyu", "colmap", "transforms", "euroc"),
     *("bag", "stray", "arkitscenes", "generic"),
@@ -25,51 +25,51 @@ READERS: dict[str, Any] = {
 def readers(plugin: Sequence[str] = ()) -> dict[str, Any]:
     """The readers by layout, with those of installed packages and of the files ``plugin``. Raises FileNotFoundError,
     ValueError: a plug-in cannot be used, or has the name of a layout."""
-    own = load_plugins(plugin).readers
-    if taken := [name for name in own if name in (*READERS, "auto")]:
-        raise ValueError(f"plug-ins: there is a reader {taken[0]!r} already: give yours another name")
-    return {**READERS, **own}
+    plugged_in = load_plugins(plugin).readers
+    if duplicates := [name for name in plugged_in if name in (*READERS, "auto")]:
+        raise ValueError(f"plug-ins: there is a reader {duplicates[0]!r} already: give yours another name")
+    return {**READERS, **plugged_in}
 
 
 def require_layout(layout: str, plugin: Sequence[str] = ()) -> None:
-    """Raises ValueError: no reader is called so."""
+    """Raises ValueError: no reader has this name."""
     if layout not in (names := ("auto", *readers(plugin))):
         raise ValueError(f"layout must be one of {', '.join(names)}, got {layout!r}")
 
 
 def layout_of(layout: str, path: Path, explicit: bool = False, plugin: Sequence[str] = ()) -> str:
-    """The layout of a name, or for "auto" the one whose files lie in ``path``; ``generic`` where there is none and
-    ``explicit``: the user names the images or the trajectory. Raises ValueError: unknown, none or several fit."""
+    """The named layout, or for "auto" the one that fits ``path``; ``generic`` if none fits and ``explicit`` is True
+    (the user names the images or the trajectory). Raises ValueError: unknown layout, or none or several fit."""
     require_layout(layout, plugin)
-    known = readers(plugin)
+    by_name = readers(plugin)
     if layout != "auto":
-        if layout != "generic" and not known[layout].detect(path):
-            raise ValueError(f"{path} has not the layout {layout!r}: looked for {known[layout].LOOKED_FOR}")
+        if layout != "generic" and not by_name[layout].detect(path):
+            raise ValueError(f"{path} has not the layout {layout!r}: looked for {by_name[layout].LOOKED_FOR}")
         return layout
     fitting = layouts_of(path, plugin) or ["generic"] * explicit
     if len(fitting) > 1:
         raise ValueError(f"{path} fits the layouts {', '.join(fitting)}: pass layout")
     if not fitting:
-        expected = "\n".join(f"  {name}: {reader.LOOKED_FOR}" for name, reader in known.items())
+        expected = "\n".join(f"  {name}: {reader.LOOKED_FOR}" for name, reader in by_name.items())
         inside = sorted(p.name for p in path.iterdir())[:8] if path.is_dir() else [path.name]
         raise ValueError(f"{path} has no known layout. Looked for\n{expected}\nand found {inside}")
     return fitting[0]
 
 
 def layouts_of(path: Path, plugin: Sequence[str] = ()) -> list[str]:
-    """The layouts whose files lie in ``path``, all of them; ``generic`` only where no other fits."""
+    """All layouts that fit ``path``; ``generic`` only if no other fits."""
     fitting = [name for name, reader in readers(plugin).items() if name != "generic" and reader.detect(path)]
     return fitting or (["generic"] if READERS["generic"].detect(path) else [])
 
 
 def parts_of(path: Path, layout: str) -> list[Path]:
-    """The single sequences of a path that has this layout: itself, or folders in it that hold one each."""
+    """The single sequences of a path with this layout: the path, or folders in it with one sequence each."""
     reader: Any = READERS.get(layout)
     return list(reader.parts(path)) if hasattr(reader, "parts") else [path]
 
 
 class Found(NamedTuple):
-    """A sequence on disk, not opened yet: its place below the root, "/" as "__" (unique), and the arguments of
+    """A sequence on disk that is not open: its path below the root with "__" for "/" (unique), and the arguments of
     ``open_sequence``."""
 
     name: str
@@ -78,17 +78,16 @@ class Found(NamedTuple):
 
 
 def find_sequences(root: str | Path, layout: str = "auto", plugin: Sequence[str] = ()) -> list[Found]:
-    """All sequences at most four folders below ``root``, a folder or the file of one, sorted by name; empty where there
-    is none.
+    """All sequences at most four folders below ``root``, sorted by name.
 
-    A folder that is a sequence is not looked into, so that its own folders of images are none. Each folder on disk
-    counts once, whatever links lead to it (a folder before a link to it), so that links in a circle end too. Hidden
-    folders and those that may not be read are left out.
+    A folder that is a sequence is not searched, so that its folders of images are no sequences. Each folder on disk
+    counts once, independent of links to it (a folder before its links), so circular links are no problem. Hidden and
+    unreadable folders are ignored.
 
     Args:
-        root: where.
-        layout: the only layout to look for; "auto": any.
-        plugin: files with readers of one's own.
+        root: a folder, or the file of a sequence.
+        layout: the only layout to search for; "auto" = any.
+        plugin: files with the user's readers.
 
     Raises:
         FileNotFoundError: no such root.
@@ -120,7 +119,7 @@ def find_sequences(root: str | Path, layout: str = "auto", plugin: Sequence[str]
 
 
 def _folders(path: Path) -> list[Path]:
-    """The folders in a folder, links last; none where it may not be read."""
+    """The folders in a folder, links last; [] if it may not be read."""
     try:
         folders = [p for p in path.iterdir() if not p.name.startswith(".") and p.is_dir()] if path.is_dir() else []
     except PermissionError:  # "lost+found" at the top of a disk

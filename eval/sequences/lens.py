@@ -1,4 +1,4 @@
-"""Cameras whose lens distorts: images and depth maps without the distortion, by OpenCV's maps, computed once a camera.
+"""Undistortion of images and depth maps by OpenCV's maps, which are computed once per camera.
 
 Radial-tangential (Brown-Conrady, ``plumb_bob``, ``rational_polynomial``) and fisheye (Kannala-Brandt, ``equidistant``)
 lenses, with OpenCV's coefficients: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4.
@@ -17,23 +17,22 @@ from ufmstar_torch.eval.sequences.frame import Entry, Loader, Size, check_intrin
 from ufmstar_torch.eval.sequences.intrinsics import pinhole, scale_intrinsics
 
 FISHEYE, NONE = "fisheye", "none"
-# The undistorted camera's focal lengths over the lens's: a fisheye of over 120 degrees is cut, so that its middle keeps
-# its resolution; beyond the upper end the coefficients are not those of a lens.
+# Limits of the undistorted focal lengths over the lens's. The lower one crops a fisheye of over 120 degrees, so that
+# its middle keeps its resolution; beyond the upper one the coefficients are not those of a lens.
 _ZOOM = (0.5, 2.0)
 _BORDER_POINTS = 33  # on every side of an image
-_MOST_APART = 2.0  # [px] of a border point and the image of its ray; more where coefficients fold the image
+_MOST_APART = 2.0  # [px] largest reprojection error of a border point; coefficients with more fold the image
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera with the images that its lens made. Raises ValueError: a wrong number of coefficients, or some that are
-    not finite."""
+    """A camera with its distortion. Raises ValueError: a wrong number of coefficients, or some are not finite."""
 
-    # fx, fy, cx, cy [px], the first pixel's centre at (0, 0), and the skew [px], which counts without distortion only.
+    # fx, fy, cx, cy [px], the first pixel's centre at (0, 0), and the skew [px], which is used without distortion only.
     intrinsics: tuple[float, ...]
     size: Size  # (H, W) of its images
     coefficients: tuple[float, ...] = ()  # of the distortion; () = none
-    fisheye: bool = False  # whether they are a fisheye's
+    fisheye: bool = False  # True for a fisheye's coefficients
 
     def __post_init__(self) -> None:
         allowed = (0, 4) if self.fisheye else (0, 4, 5, 8)
@@ -51,8 +50,8 @@ class Lens:
 
     @property
     def K(self) -> np.ndarray:
-        """[3, 3] of the undistorted images [px]: the lens's centre, and its focal lengths times the least factor with
-        which every pixel of the result lies in the image. Raises ValueError: no lens has these coefficients."""
+        """[3, 3] of the undistorted images [px]: the lens's centre, and its focal lengths times the smallest factor for
+        which every pixel of the result is in the image. Raises ValueError: no lens has these coefficients."""
         if not any(self.coefficients):
             return pinhole(*self.intrinsics)
         K = pinhole(*self.intrinsics[:4])
@@ -65,8 +64,8 @@ class Lens:
         return Lens.of(K, size, self.coefficients, self.fisheye)
 
     def see(self, entry: Entry, depth_size: Size | None = None) -> Entry:
-        """The entry of an image of this camera, undistorted. A depth map of ``depth_size`` (H, W) shows the same view,
-        and each pixel of the result is one of its pixels, never a mean; None: the depth is not of this camera."""
+        """The entry of an image of this camera, undistorted. A depth map of ``depth_size`` (H, W) is undistorted by
+        nearest neighbour; None = the depth is not of this camera."""
         image, depth = entry.load_image, entry.load_depth
         if any(self.coefficients):
             image = image and partial(_undistorted, image, self, self.size, False)
@@ -75,8 +74,8 @@ class Lens:
 
 
 def parse_distortion(words: str | Sequence[str | float]) -> tuple[tuple[float, ...], bool]:
-    """Coefficients and whether they are a fisheye's, of ``none``, of numbers, or of ``fisheye`` and numbers. Raises
-    ValueError: another form."""
+    """Coefficients and True for a fisheye, from ``none``, numbers, or ``fisheye`` and numbers. Raises ValueError:
+    another form."""
     listed = [words] if isinstance(words, str) else list(words)
     if listed == [NONE]:
         return (), False
@@ -93,14 +92,14 @@ def _undistorted(load: Loader, lens: Lens, size: Size, nearest: bool) -> np.ndar
 
     array = load()
     if array.shape[:2] != size:
-        return array  # the sequence names the frame and both sizes
-    how = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-    return np.asarray(cv2.remap(array, *_maps(lens, size), how))
+        return array  # the sequence raises an error with the frame and both sizes
+    interpolation = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+    return np.asarray(cv2.remap(array, *_maps(lens, size), interpolation))
 
 
 @lru_cache(maxsize=8)
 def _maps(lens: Lens, size: Size) -> tuple[np.ndarray, np.ndarray]:
-    """For every pixel of the undistorted image its column and row in the lens's, [H, W] float32 each."""
+    """For every pixel of the undistorted image its column and row in the distorted one, [H, W] float32 each."""
     import cv2
 
     K, K_new = (scale_intrinsics(matrix, lens.size, size) for matrix in (pinhole(*lens.intrinsics[:4]), lens.K))
@@ -111,26 +110,26 @@ def _maps(lens: Lens, size: Size) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=8)
 def _zoom(lens: Lens) -> float:
-    """The undistorted focal lengths over the lens's: the least with which the sides of the result lie within the image,
-    but within ``_ZOOM``. Raises ValueError: the distortion cannot be inverted at the image's sides."""
+    """The undistorted focal lengths over the lens's: the smallest factor for which the sides of the result are within
+    the image, at least ``_ZOOM[0]``. Raises ValueError: the distortion cannot be inverted at the image's sides."""
     import cv2
 
     (height, width), (fx, fy, cx, cy) = lens.size, lens.intrinsics[:4]
-    along, one = np.linspace(0, 1, _BORDER_POINTS), np.ones(_BORDER_POINTS)
+    along, ones = np.linspace(0, 1, _BORDER_POINTS), np.ones(_BORDER_POINTS)
     across, down = along * (width - 1), along * (height - 1)
-    sides = ((0 * one, down), (one * (width - 1), down), (across, 0 * one), (across, one * (height - 1)))
+    sides = ((0 * ones, down), (ones * (width - 1), down), (across, 0 * ones), (across, ones * (height - 1)))
     pixels = np.stack([np.concatenate(axis) for axis in zip(*sides, strict=True)], axis=-1)[:, None]
-    K, coefficients, still = pinhole(fx, fy, cx, cy), np.array(lens.coefficients), np.zeros(3)
-    until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+    K, coefficients, identity = pinhole(fx, fy, cx, cy), np.array(lens.coefficients), np.zeros(3)
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-9)
     model: Any = cv2.fisheye if lens.fisheye else cv2
-    rays = model.undistortPoints(pixels, K, coefficients, criteria=until)
-    again, _ = model.projectPoints(cv2.convertPointsToHomogeneous(rays), still, still, K, coefficients)
-    apart = np.abs(again.reshape(-1, 2) - pixels.reshape(-1, 2)).max()
+    rays = model.undistortPoints(pixels, K, coefficients, criteria=criteria)
+    reprojected, _ = model.projectPoints(cv2.convertPointsToHomogeneous(rays), identity, identity, K, coefficients)
+    deviation = np.abs(reprojected.reshape(-1, 2) - pixels.reshape(-1, 2)).max()
     rays = rays.reshape(4, _BORDER_POINTS, 2)
     left, right, top, bottom = -rays[0, :, 0], rays[1, :, 0], -rays[2, :, 1], rays[3, :, 1]
     reach = ((cx, fx, left), (width - 1 - cx, fx, right), (cy, fy, top), (height - 1 - cy, fy, bottom))
     inner = [(extent / focal, float(ray.min())) for extent, focal, ray in reach]
-    if not (apart < _MOST_APART and all(np.isfinite(ray) and ray > 0 for _, ray in inner)):
+    if not (deviation < _MOST_APART and all(np.isfinite(ray) and ray > 0 for _, ray in inner)):
         raise ValueError(f"distortion: no lens has the coefficients {lens.coefficients}: they fold the image's border")
     zoom = max(extent / ray for extent, ray in inner)
     if zoom > _ZOOM[1]:

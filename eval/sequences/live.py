@@ -1,4 +1,4 @@
-"""Images and poses as they come: a recording replayed at its pace, a camera, a folder and a trajectory that grow, and
+"""Live sources of images and poses: a recording replayed at its pace, a camera, a growing folder and trajectory, and
 lines of JSON.
 """
 
@@ -24,8 +24,8 @@ from ufmstar_torch.eval.sequences.images import IMAGE_SUFFIXES, read_color
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS, in_metres, parse_pose, poses_from_columns
 
 _FPS = 30.0  # of a recording without timestamps
-_POLL = 0.01  # [s] between two looks at a folder
-_UNREADABLE = 1.0  # [s] an image that is still being written may take so long
+_POLL = 0.01  # [s] interval of polling a folder
+_UNREADABLE = 1.0  # [s] largest time to write an image
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,19 +35,19 @@ class LiveEvent:
     stamp: float
     image: NDArray[np.uint8] | None = None  # [H, W, 3] RGB
     T_world_cam: NDArray[np.float64] | None = None  # [4, 4] camera-to-world [m]
-    intrinsics: NDArray[np.float64] | None = None  # [3, 3] of the image [px]; None: as given elsewhere
+    intrinsics: NDArray[np.float64] | None = None  # [3, 3] of the image [px]; None = those of the stream
 
 
 class PoseFile:
-    """A text file of poses (``poses.py`` has its formats, those with timestamps) to which lines are added; it need not
-    exist yet. Its poses have a ``convention`` of ``CONVENTIONS``, and positions in units of ``scale`` metres."""
+    """A growing text file of poses in a format with timestamps of ``poses.py``; it may not exist yet. Its poses have a
+    ``convention`` of ``CONVENTIONS``, and positions in units of ``scale`` metres."""
 
     def __init__(self, path: str | Path, convention: str = OURS, scale: float = 1.0) -> None:
         self.path, self._convert, self._scale = Path(path), CONVENTIONS[convention].convert, scale
         self._read, self._line = 0, 0
 
     def new(self) -> Iterator[LiveEvent]:
-        """The poses of the lines that were completed since the last call. Raises ValueError: a line is no pose with a
+        """The poses of lines that were completed since the last call. Raises ValueError: a line is no pose with a
         timestamp."""
         if not self.path.exists():
             return
@@ -58,17 +58,17 @@ class PoseFile:
         self._read += len(complete)
         for line in complete.decode("utf-8", "replace").splitlines():
             self._line += 1
-            if (found := parse_pose(line, f"{self.path}:{self._line}")) is not None:
-                yield LiveEvent(found[0], T_world_cam=in_metres(self._convert(found[1]), self._scale))
+            if (pose := parse_pose(line, f"{self.path}:{self._line}")) is not None:
+                yield LiveEvent(pose[0], T_world_cam=in_metres(self._convert(pose[1]), self._scale))
 
 
 def replay(sequence: FrameSequence, speed: float = 1.0) -> Iterator[LiveEvent]:
-    """A recording's frames with their poses, each when its time has come, without timestamps 30 a second; ``speed`` 2
-    is twice as fast, infinity without waiting. A frame that cannot be decoded is left out."""
+    """Yield a recording's frames with their poses at their times, or at 30 frames/s without timestamps. ``speed`` 2 is
+    twice as fast, infinity does not wait. A frame that cannot be decoded is omitted."""
     stamps = [entry.timestamp for entry in sequence.entries]
-    known = [stamp for stamp in stamps if stamp is not None]
-    timed = len(known) == len(stamps) and all(a < b for a, b in pairwise(known))
-    times = np.array(known) if timed else np.arange(len(sequence)) / _FPS
+    timed_stamps = [stamp for stamp in stamps if stamp is not None]
+    timed = len(timed_stamps) == len(stamps) and all(a < b for a, b in pairwise(timed_stamps))
+    times = np.array(timed_stamps) if timed else np.arange(len(sequence)) / _FPS
     started = time.perf_counter()
     for n, stamp in enumerate(times.tolist()):
         try:
@@ -82,7 +82,7 @@ def replay(sequence: FrameSequence, speed: float = 1.0) -> Iterator[LiveEvent]:
 
 
 def camera(index: int, poses: PoseFile) -> Iterator[LiveEvent]:
-    """The images of a camera of this computer, stamped with the system's clock (``time.time()``), and the poses of a
+    """Yield the images of this computer's camera, stamped by the system's clock (``time.time()``), and the poses of a
     file that another program writes, with stamps of the same clock. Raises OSError: the camera cannot be opened, or
     stops."""
     import cv2
@@ -103,9 +103,9 @@ def camera(index: int, poses: PoseFile) -> Iterator[LiveEvent]:
 def growing_folder(
     folder: str | Path, poses: PoseFile, idle: float = math.inf, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[LiveEvent]:
-    """The images that are added to a folder from now on, in the order of their names, and the poses of a file. A name
-    that is a number is the time of the image ([s], or [ns], [us] as ``stem_times``); of others it is that of the file.
-    Ends after ``idle`` seconds without a new image. Raises FileNotFoundError: no such folder."""
+    """Yield new images of a folder, in the order of their names, and the poses of a file. The time of an image is its
+    name if that is a number ([s], or [ns], [us] as ``stem_times``), else that of the file. Ends after ``idle`` seconds
+    without a new image. Raises FileNotFoundError: no such folder."""
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"no such folder: {folder}")
@@ -124,7 +124,7 @@ def growing_folder(
             except FrameError:
                 if time.time() - written > _UNREADABLE:
                     seen.add(path.name)
-                break  # it is still being written; those after it come later
+                break  # it is still being written; keep the order of images
             seen.add(path.name)
             last, times = clock(), stem_times([path.stem])
             yield LiveEvent(written if times is None else float(times[0]), image)
@@ -136,10 +136,10 @@ def json_lines(
 ) -> Iterator[LiveEvent]:
     """Events from lines such as ``{"stamp": 1.5, "pose": [x, y, z, qx, qy, qz, qw], "image": "a.jpg"}``.
 
-    ``pose`` has 7 numbers, or the 12 or 16 of a matrix (nested or not); ``image`` is a file, or the content of one as
-    ``"data:;base64,..."``; ``intrinsics`` are fx, fy, cx, cy. A line has a stamp and at least one of pose and image.
-    Relative files lie in ``folder``; poses are as those of :class:`PoseFile`. Raises ValueError: a line is something
-    else; names its number.
+    ``pose`` has 7 numbers, or the 12 or 16 of a matrix (nested or not). ``image`` is a file, or its content as
+    ``"data:;base64,..."``. ``intrinsics`` are fx, fy, cx, cy. A line has a stamp and at least one of pose and image.
+    Relative files are in ``folder``; poses are as in :class:`PoseFile`. Raises ValueError: a line has another form; the
+    message has its number.
     """
     convert = CONVENTIONS[convention].convert
     for number, line in enumerate(lines, start=1):
@@ -147,20 +147,20 @@ def json_lines(
             continue
         try:
             try:
-                about = json.loads(line)
+                event = json.loads(line)
             except json.JSONDecodeError:
                 raise ValueError(f"no JSON: {line.strip():.60}") from None
-            if not isinstance(about, dict) or about.keys() - {"stamp", "pose", "image", "intrinsics"}:
+            if not isinstance(event, dict) or event.keys() - {"stamp", "pose", "image", "intrinsics"}:
                 raise ValueError('expected {"stamp": s, "pose": [...], "image": "file", "intrinsics": [...]}')
-            if "stamp" not in about or not about.keys() & {"pose", "image"}:
+            if "stamp" not in event or not event.keys() & {"pose", "image"}:
                 raise ValueError("a stamp and a pose or an image are needed")
-            if not isinstance(stamp := about["stamp"], int | float):
+            if not isinstance(stamp := event["stamp"], int | float):
                 raise ValueError(f"a stamp is a number [s], got {stamp!r:.40}")
             if not math.isfinite(stamp := float(stamp)):
                 raise ValueError(f"stamp must be finite [s], got {stamp}")
-            pose = _pose(about["pose"], convert, scale) if "pose" in about else None
-            image = _image(about["image"], Path(folder)) if "image" in about else None
-            K = None if "intrinsics" not in about else np.array(about["intrinsics"], dtype=np.float64)
+            pose = _pose(event["pose"], convert, scale) if "pose" in event else None
+            image = _image(event["image"], Path(folder)) if "image" in event else None
+            K = None if "intrinsics" not in event else np.array(event["intrinsics"], dtype=np.float64)
         except (ValueError, TypeError, OverflowError, RecursionError, FrameError, binascii.Error) as error:
             raise ValueError(f"line {number}: {error}") from error
         yield LiveEvent(stamp, image, pose, K)

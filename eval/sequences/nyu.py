@@ -1,7 +1,7 @@
 """NYU Depth V2 in FastDepth's layout as an evaluation set: ``train|val/<scene>/*.h5`` with ``rgb`` and ``depth``.
 
 ``rgb`` is uint8 [3, H, W], ``depth`` floating-point [H, W] in metres along the optical axis, registered to ``rgb``;
-0 or not finite = none. The images are single ones: the sequence has ``posed`` False.
+0 or not finite = none. The images are single images without poses: the sequence has ``posed`` False.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def detect(path: Path) -> bool:
 
 
 def parts(path: Path) -> list[Path]:
-    """The part of a root that is for evaluation; a part or scene itself."""
+    """The evaluation part of a root; for a part or scene the path itself."""
     return [path / "val"] if part_files(path / "val") else [path]
 
 
@@ -42,8 +42,8 @@ def part_files(folder: Path) -> list[Path]:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a part, or a scene of it, as a sequence without poses; names are ``SCENE__NUMBER``. Raises ValueError: the
-    images were cropped and ``intrinsics`` are not given, or no file can be read."""
+    """Open a part, or a scene of it, as a sequence without poses; names are ``SCENE__NUMBER``. Raises ValueError: the
+    images were cropped and ``intrinsics`` is None, or no file can be read."""
     folder = parts(path)[0]
     files = _files(folder)
     scale = 1.0 if options.truth_scale is None else options.truth_scale
@@ -59,7 +59,7 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def _files(path: Path) -> list[Path]:
-    """The files of a part or of a scene of one; none of anything else."""
+    """The files of a part or of a scene; [] for other paths."""
     if path.resolve().name in PARTS:
         return part_files(path)
     if path.is_dir() and path.resolve().parent.name in PARTS:
@@ -82,7 +82,7 @@ def _depth(path: Path, scale: float) -> np.ndarray:
 
 
 def _dataset(path: Path, name: str) -> np.ndarray:
-    """Read a dataset of an HDF5 file, and close the file: processes share no open file.
+    """Read a dataset of an HDF5 file, and close the file, because processes must not share an open file.
 
     Raises FrameError: the dataset is missing or unreadable.
     """

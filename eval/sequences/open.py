@@ -16,8 +16,8 @@ from ufmstar_torch.eval.sequences.lens import Lens, parse_distortion
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS, in_metres
 
-# The layouts that have a use for an option which not all have.
-_TAKEN_BY = {
+# By option, the layouts that use it; other options are used by all.
+_USED_BY = {
     "images": ("colmap", "generic"),
     "truth": ("kitti360", "colmap", "generic"),
     "depth_intrinsics": ("7scenes", "scannet", "sens", "kitti360", "generic"),
@@ -30,7 +30,7 @@ _TAKEN_BY = {
 
 
 def open_sequence(path: str | Path, layout: str = "auto", **options: Any) -> FrameSequence:
-    """Opens a sequence of posed images; nothing but headers and text files is read before it is indexed.
+    """Open a sequence of posed images. Only headers and text files are read before it is indexed.
 
     Args:
         path: the sequence's folder, a video file, or ``tour:SEED`` with the options of a rendered tour in its name.
@@ -46,21 +46,21 @@ def open_sequence(path: str | Path, layout: str = "auto", **options: Any) -> Fra
     Raises:
         FileNotFoundError: ``path`` does not exist.
         TypeError: an unknown option.
-        ValueError: unknown or ambiguous layout (with what was looked for), an option out of range or of no
-            use for the layout, malformed files (named by file and line), or no usable frame.
+        ValueError: unknown or ambiguous layout (the message lists the expected files), an option that is out of range
+            or not used by the layout, malformed files (named by file and line), or no usable frame.
     """
     chosen = Options(layout=layout, **options)
     if str(path).startswith("tour:"):
         if refused := [name for name in chosen.changed() if name != "poses"]:
             raise ValueError(f"{path!r} takes no {', '.join(refused)}: a tour's options stand in its name")
-        # Imported on use, since that package imports this one.
+        # Imported here, because that package imports this one.
         return convert_poses(import_module("ufmstar_torch.eval.tour.sequence").open_tour(str(path)), chosen.poses)
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"path: no such file or folder: {path}")
     explicit = chosen.images is not None or chosen.trajectory is not None
     layout = layout_of(layout, path, explicit, chosen.plugin)
-    refused = [name for name, layouts in _TAKEN_BY.items() if layout in READERS and layout not in layouts]
+    refused = [name for name, layouts in _USED_BY.items() if layout in READERS and layout not in layouts]
     refused += ["trajectory", "fps"] if layout == "nyu" else []
     refused += ["fps"] if layout == "tum" or (layout != "generic" and chosen.trajectory is None) else []
     chosen.reject(layout, *refused)
@@ -82,13 +82,13 @@ def open_sequence(path: str | Path, layout: str = "auto", **options: Any) -> Fra
 
 
 def scale_poses(sequence: FrameSequence, metres: float) -> FrameSequence:
-    """The sequence with positions in metres, of which a unit of its poses has ``metres``."""
+    """The sequence with positions in metres; ``metres`` is the length of the poses' unit."""
     scaled = sequence.changed(lambda entry: replace(entry, T_world_cam=in_metres(entry.T_world_cam, metres)))
     return replace(scaled, metric=True, pose_scale=metres * sequence.pose_scale)
 
 
 def convert_poses(sequence: FrameSequence, convention: str) -> FrameSequence:
-    """The sequence with its poses, which were written so, as camera-to-world ones with our axes. Raises ValueError: a
+    """The sequence with its poses converted from ``convention`` to camera-to-world with our axes. Raises ValueError: a
     sequence without poses."""
     if convention == OURS:
         return sequence

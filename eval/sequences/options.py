@@ -1,4 +1,4 @@
-"""The options of ``open_sequence`` as one value, which every reader takes, and which commands have as options."""
+"""The options of ``open_sequence`` as one value, for every reader and for the commands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ufmstar_torch.eval.sequences.images import check_scale
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, parse_intrinsics
 from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
-_WORD, _WORDS = {"type": str | None}, {"type": tuple[str, ...]}  # as commands take them
+_WORD, _WORDS = {"type": str | None}, {"type": tuple[str, ...]}  # types on the command line
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,7 +56,7 @@ class Options:
     trajectory: str | Path | None = field(default=None, metadata=_WORD)  # with our axes, camera-to-world
     poses: str = field(default=OURS, metadata={"choices": tuple(CONVENTIONS)})
     pose_scale: float | None = None
-    fps: float | None = None  # images of a layout that numbers them are counted by that number
+    fps: float | None = None  # multiplies the numbers of images if the layout has such numbers
     time_offset: float = 0.0
     # At 0.1 s a hand that accelerates at 2 m/s^2 departs 2.5 mm from the straight line.
     max_pose_gap: float = 0.1
@@ -89,23 +89,23 @@ class Options:
             raise ValueError(f"scans must be a number of laser scans on either side, at least 0, got {self.scans}")
 
     def changed(self) -> dict[str, Any]:
-        """Those that are not the default, as a command line gives them: arguments of ``open_sequence``."""
-        of = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not f.default}
+        """The options that are not the default, as arguments of ``open_sequence``."""
+        values = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not f.default}
         defaults = {f.name: f.default for f in fields(self)}
-        return {name: value for name, value in of.items() if defaults[name] is None or value != defaults[name]}
+        return {name: value for name, value in values.items() if defaults[name] is None or value != defaults[name]}
 
     def reject(self, layout: str, *names: str) -> None:
-        """Raises ValueError where an option was given that the layout has no use for."""
+        """Raises ValueError: one of the options ``names``, which the layout does not use, is set."""
         for name in names:
             if name in self.changed():
                 other = "use layout='generic' to combine images, depth and a trajectory freely"
                 raise ValueError(f"layout {layout!r} takes no {name}: its files hold that; {other}")
 
 
-def resolve(root: Path, given: str | Path) -> Path:
-    """A path as the user gave it: inside the sequence's folder, or else from the working folder. Raises
-    FileNotFoundError: it is in neither."""
-    for path in (root / given, Path(given)):
+def resolve(root: Path, name: str | Path) -> Path:
+    """A user's path relative to the sequence's folder, or else to the working folder. Raises FileNotFoundError: it is
+    in neither."""
+    for path in (root / name, Path(name)):
         if path.exists():
             return path
-    raise FileNotFoundError(f"no such file or folder: {given} (neither in {root} nor in the working folder)")
+    raise FileNotFoundError(f"no such file or folder: {name} (neither in {root} nor in the working folder)")

@@ -1,4 +1,4 @@
-"""The depth that ``ufmstar run`` has written, to be read as predicted maps: with the intrinsics of each."""
+"""Reads the output of ``ufmstar run`` as predicted maps with their intrinsics."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ RECORDS = "frames.jsonl"
 
 
 class OwnOutput(NamedTuple):
-    """The maps NAME.npz of a run: their folder, the intrinsics [3, 3] of each finished frame's map by name [px], and
-    why the other frames were skipped, by name."""
+    """The maps NAME.npz of a run: their folder; by frame name the intrinsics [3, 3] of finished frames' maps [px], and
+    the reasons of skipped frames."""
 
     frames: Path
     intrinsics: Mapping[str, np.ndarray]
@@ -24,8 +24,8 @@ class OwnOutput(NamedTuple):
 
 
 def own_output(path: Path) -> OwnOutput | None:
-    """The output of a run in a folder, or around it where it is OUT/frames or OUT/depth; None: it is none. Raises
-    ValueError: a line of frames.jsonl is none of a run's; file and line are named."""
+    """The output of a run in a folder, which may also be OUT/frames or OUT/depth; None if there is none. Raises
+    ValueError: a line of frames.jsonl is no record; the message names file and line."""
     for out in (path, path.parent) if path.name in ("frames", "depth") else (path,):
         if (out / RECORDS).is_file() and (out / "frames").is_dir():
             records = read_records((out / RECORDS).read_bytes(), out / RECORDS)
@@ -39,8 +39,8 @@ def own_output(path: Path) -> OwnOutput | None:
 
 
 def read_records(content: bytes, file: Path) -> list[dict]:
-    """The lines of frames.jsonl, each with "name" and "state", and "intrinsics" or "reason"; ``file`` names it in
-    messages. Raises ValueError: another line; it is named."""
+    """The lines of frames.jsonl, each with "name" and "state", and "intrinsics" or "reason"; ``file`` is its name for
+    messages. Raises ValueError: a line has another form; the message names it."""
     records = []
     for number, line in enumerate(content.splitlines(), start=1):
         try:

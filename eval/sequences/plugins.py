@@ -1,9 +1,9 @@
-"""Readers, methods and metrics of one's own: of installed packages (entry points), or of a file (``--plugin FILE.py``).
+"""The user's readers, methods and metrics: from installed packages (entry points) or a file (``--plugin FILE.py``).
 
-A file has one or more of these dicts by name, a package entry points of the same kinds, as ``ufmstar.readers``:
+A file has one or more of these dicts by name; a package has entry points of the same kinds, as ``ufmstar.readers``:
 
-- ``READERS``: with ``detect(path)``, ``read(path, options)`` and ``LOOKED_FOR``, as the modules of this package;
-- ``METHODS``: called with a row and a device for an ``Estimator``; in suites "NAME-Ensemble", "NAME-DepthOnly", ...;
+- ``READERS``: with ``detect(path)``, ``read(path, options)`` and ``LOOKED_FOR``, like the modules of this package;
+- ``METHODS``: callables of a row and a device that return an ``Estimator``; in suites "NAME-Ensemble", ...;
 - ``METRICS``: classes of ``SumMetric``, whose scalars become columns.
 """
 
@@ -32,40 +32,42 @@ class Plugins:
 
 
 def load_plugins(files: Sequence[str] = ()) -> Plugins:
-    """Those of installed packages and of files, which are executed once in a process.
+    """The plug-ins of installed packages and of files, which are executed once per process.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: a file has none, a name occurs twice, or an object lacks what its kind needs.
+        ValueError: a file has no plug-in, a name occurs twice, or an object lacks an attribute of its kind.
     """
     return _load(tuple(str(Path(file).resolve()) for file in files))
 
 
 @cache
 def _load(files: tuple[str, ...]) -> Plugins:
-    found: dict[str, dict[str, Any]] = {kind: {} for kind in _NEEDED}
+    loaded: dict[str, dict[str, Any]] = {kind: {} for kind in _NEEDED}
     for kind in _NEEDED:
         for point in entry_points(group=f"ufmstar.{kind}"):
-            _add(found[kind], kind, point.name, point.load(), f"the entry point {point.value}")
+            _add(loaded[kind], kind, point.name, point.load(), f"the entry point {point.value}")
     for file in files:
-        module, before = _module(Path(file)), sum(map(len, found.values()))
+        module, count = _module(Path(file)), sum(map(len, loaded.values()))
         for kind in _NEEDED:
             named = getattr(module, kind.upper(), {})
             if not isinstance(named, Mapping) or not all(isinstance(name, str) for name in named):
                 raise ValueError(f"{file}: {kind.upper()} must be a dict by name, got {named!r:.80}")
             for name, value in named.items():
-                _add(found[kind], kind, name, value, file)
-        if sum(map(len, found.values())) == before:
+                _add(loaded[kind], kind, name, value, file)
+        if sum(map(len, loaded.values())) == count:
             raise ValueError(f"--plugin {file} has none of {', '.join(kind.upper() for kind in _NEEDED)}")
-    return Plugins(**found)
+    return Plugins(**loaded)
 
 
-def _add(known: dict[str, Any], kind: str, name: str, value: Any, source: str) -> None:
+def _add(by_name: dict[str, Any], kind: str, name: str, value: Any, source: str) -> None:
     missing = [attribute for attribute in _NEEDED[kind] if not hasattr(value, attribute)]
-    if missing or name in known or not name.isidentifier() or not name.islower():
-        why = f"lacks {missing[0]}" if missing else "has that name already" if name in known else "needs small letters"
+    if missing or name in by_name or not name.isidentifier() or not name.islower():
+        why = (
+            f"lacks {missing[0]}" if missing else "has that name already" if name in by_name else "needs small letters"
+        )
         raise ValueError(f"{source}: {kind}: {name!r} {why}")
-    known[name] = value
+    by_name[name] = value
 
 
 def _module(file: Path) -> ModuleType:
@@ -76,6 +78,6 @@ def _module(file: Path) -> ModuleType:
     if spec is None or spec.loader is None:
         raise ValueError(f"--plugin {file}: expected a Python file (*.py)")
     module = module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
+    sys.modules[name] = module  # needed by dataclasses
     spec.loader.exec_module(module)
     return module

@@ -1,6 +1,6 @@
 """Poses: conventions, reading of trajectories in the common text formats, association by timestamp.
 
-All poses are camera-to-world. The number of columns of a line is the format:
+All poses are camera-to-world. The number of columns of a line defines the format:
 
 ====  ==========================================================
 7     ``tx ty tz qx qy qz qw`` (TartanAir)
@@ -24,11 +24,11 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.trajectory import Trajectory
 
-# TUM writes quaternions with four decimals, which leaves the norm within 2e-4 of 1; a hundred times that
-# is no rounding any more but another column order or unit.
+# TUM writes quaternions with four decimals, so the norm is within 2e-4 of 1; an error of a hundred times that means
+# another order of columns or another unit.
 _QUATERNION_TOLERANCE = 0.02
-# Two poses with one timestamp are alike up to this distance [the poses' unit], or the median step between samples if
-# that is larger (rounded timestamps), and this angle [degrees].
+# Two poses with the same timestamp are equal up to this distance [the poses' unit], or the median step between samples
+# if that is larger (rounded timestamps), and this angle [degrees].
 _SAME_PLACE, _SAME_DIRECTION = 0.01, 2.0
 # printf on Windows writes NaN and infinity as 1.#IND, 1.#QNAN, 1.#INF.
 _WINDOWS_NON_FINITE = re.compile(r"[+-]?1\.?#(IND|QNAN|SNAN|INF)\d*", re.IGNORECASE)
@@ -39,7 +39,7 @@ _OPENGL_FROM_CAMERA = np.diag([1.0, -1, -1, 1])
 
 
 class Convention(NamedTuple):
-    """A way to write poses, in words, and the map of poses [..., 4, 4] to camera-to-world ones with our axes."""
+    """A convention of poses: its description, and the conversion of poses [..., 4, 4] to ours."""
 
     description: str
     convert: Callable[[np.ndarray], np.ndarray]
@@ -57,16 +57,16 @@ CONVENTIONS = {
 
 
 def in_metres(T_world_cam: np.ndarray, scale: float) -> np.ndarray:
-    """A pose [4, 4] whose positions have units of ``scale`` metres."""
+    """A pose [4, 4] with its position, in units of ``scale`` metres, converted to metres."""
     T = T_world_cam.copy()
     T[:3, 3] *= scale
     return T
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
-    """Reads a trajectory in any of the formats of this module; ``#`` starts a comment. Samples are sorted by time; of
-    two alike with the same timestamp the first is kept. Raises ValueError: a line (named by file and number) is no pose
-    of a known format, or contradicts another one; or there is no pose at all."""
+    """Read a trajectory in any of the formats of this module; ``#`` starts a comment. Samples are sorted by time; the
+    first of equal poses with the same timestamp is used. Raises ValueError: a line (named by file and number) is no
+    pose of a known format, or contradicts another one; or there is no pose."""
     rows, lines = _numbers(path)
     for row, where in zip(rows, lines, strict=True):
         if len(row) not in (7, 8, 12, 13, 16, 17):
@@ -94,8 +94,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
 
 
 def parse_pose(text: str, where: str) -> tuple[float, np.ndarray] | None:
-    """Timestamp and pose [4, 4] of one line with 8, 13 or 17 numbers; all NaN if an entry of the pose is not finite;
-    None for a comment or an empty line. Raises ValueError: something else; ``where`` names the line."""
+    """Timestamp and pose [4, 4] of one line with 8, 13 or 17 numbers, all NaN if an entry of the pose is not finite;
+    None for a comment or an empty line. Raises ValueError: another form; ``where`` names the line."""
     tokens = _tokens(text)
     if not tokens:
         return None
@@ -106,8 +106,8 @@ def parse_pose(text: str, where: str) -> tuple[float, np.ndarray] | None:
 
 
 def associate(first: np.ndarray, second: np.ndarray, max_difference: float) -> dict[int, int]:
-    """One-to-one pairs {i: j} of timestamps [N] and [M] [s] that differ by at most ``max_difference``, as TUM's tool
-    pairs colour and depth: the closest pair comes first (ties: the earlier one)."""
+    """One-to-one pairs {i: j} of timestamps [N] and [M] [s] that differ by at most ``max_difference``, like TUM's tool
+    for colour and depth: greedy, the closest pair first (ties: the earlier one)."""
     order = np.argsort(second, kind="stable")
     ordered = second[order]
     low = np.searchsorted(ordered, first - max_difference, side="left")
@@ -116,17 +116,17 @@ def associate(first: np.ndarray, second: np.ndarray, max_difference: float) -> d
         (abs(first[i] - ordered[k]), i, int(order[k])) for i in range(len(first)) for k in range(low[i], high[i])
     ]
     pairs: dict[int, int] = {}
-    taken: set[int] = set()
+    used: set[int] = set()
     for _, i, j in sorted(candidates):
-        if i not in pairs and j not in taken:
+        if i not in pairs and j not in used:
             pairs[i] = j
-            taken.add(j)
+            used.add(j)
     return pairs
 
 
 def read_matrix(path: str | Path, *, commas: bool = False) -> np.ndarray:
-    """The numbers of a small text file, one row per line, [R, C] float64; non-finite ones are kept. Raises ValueError:
-    a line holds something else than numbers (between ``commas``), or lines differ in length."""
+    """The numbers of a small text file, one row per line, [R, C] float64, non-finite ones included. Raises ValueError:
+    a line has something other than numbers (with ``commas`` between them), or lines differ in length."""
     rows, lines = _numbers(path, commas)
     for row, where in zip(rows, lines, strict=True):
         if len(row) != len(rows[0]):
@@ -136,7 +136,7 @@ def read_matrix(path: str | Path, *, commas: bool = False) -> np.ndarray:
 
 def read_pose(path: str | Path) -> np.ndarray:
     """The camera-to-world pose [4, 4] of a file with one 4x4 matrix; all NaN if an entry is not finite. Raises
-    ValueError: the file does not hold 4x4 numbers with the bottom row 0 0 0 1."""
+    ValueError: the file does not have 4x4 numbers with the bottom row 0 0 0 1."""
     T = read_matrix(path)
     if T.shape != (4, 4):
         raise ValueError(f"{path}: expected a 4x4 matrix, got {' x '.join(map(str, T.shape))} numbers")
@@ -144,8 +144,8 @@ def read_pose(path: str | Path) -> np.ndarray:
 
 
 def poses_from_quaternions(position: np.ndarray, quaternion_xyzw: np.ndarray) -> np.ndarray:
-    """[N, 4, 4] poses from positions [N, 3] [m] and quaternions [N, 4], normalised here; NaN where they are not
-    finite."""
+    """[N, 4, 4] poses from positions [N, 3] [m] and quaternions [N, 4], which need not be normalised; NaN where they
+    are not finite."""
     T = np.full((len(position), 4, 4), np.nan)
     finite = np.isfinite(position).all(axis=1) & np.isfinite(quaternion_xyzw).all(axis=1)
     if finite.any():
@@ -156,8 +156,8 @@ def poses_from_quaternions(position: np.ndarray, quaternion_xyzw: np.ndarray) ->
 
 
 def trajectory_of(stamps: np.ndarray, position: np.ndarray, quaternion_xyzw: np.ndarray, source: object) -> Trajectory:
-    """Poses as :func:`poses_from_quaternions` in the order of their times [N], one of each. Raises ValueError: there is
-    none in the ``source``."""
+    """Poses as :func:`poses_from_quaternions` in the order of their times [N], one per time. Raises ValueError: the
+    ``source`` has no pose."""
     times, first = np.unique(stamps, return_index=True)
     if not times.size:
         raise ValueError(f"{source}: no pose with finite values")
@@ -165,7 +165,7 @@ def trajectory_of(stamps: np.ndarray, position: np.ndarray, quaternion_xyzw: np.
 
 
 def numbered_lines(path: str | Path) -> list[tuple[int, str]]:
-    """Line numbers from 1, and the lines of a text file. Raises ValueError: it is no text file (UTF-8)."""
+    """Line numbers from 1, and the lines of a text file. Raises ValueError: the file is no text (UTF-8)."""
     try:
         return list(enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1))
     except UnicodeDecodeError as error:
@@ -173,8 +173,8 @@ def numbered_lines(path: str | Path) -> list[tuple[int, str]]:
 
 
 def csv_rows(path: str | Path) -> list[tuple[list[str], str]]:
-    """The words of each line that has any, and FILE:LINE of each, of a table with commas; ``#`` starts a comment line.
-    Raises ValueError: it is no text file."""
+    """The words of each non-empty line of a table with commas, and its FILE:LINE; ``#`` starts a comment line. Raises
+    ValueError: the file is no text."""
     lines = ((text.strip(), f"{path}:{line}") for line, text in numbered_lines(path))
     return [
         ([word.strip() for word in text.replace(";", ",").split(",")], where)
@@ -185,7 +185,7 @@ def csv_rows(path: str | Path) -> list[tuple[list[str], str]]:
 
 def poses_from_columns(values: np.ndarray, lines: list[str]) -> np.ndarray:
     """[N, 4, 4] from rows of 7 (position, quaternion), 12 or 16 numbers; non-finite rows become NaN. Raises ValueError:
-    no rotation in a row, whose FILE:LINE is in ``lines``."""
+    a row is no pose; the message has its FILE:LINE of ``lines``."""
     finite = np.isfinite(values).all(axis=1)
     if values.shape[1] == 7:
         norm = np.linalg.norm(values[:, 3:], axis=1)
@@ -205,16 +205,16 @@ def poses_from_columns(values: np.ndarray, lines: list[str]) -> np.ndarray:
 
 
 def _require_consistent(T_world_cam: np.ndarray, first: np.ndarray, same: np.ndarray, lines: list[str]) -> None:
-    """Raise ValueError where poses [N, 4, 4] with one timestamp contradict each other; ``first`` [M] is the index of
-    each timestamp's first pose, ``same`` [N] which of the M timestamps a pose has, ``lines`` FILE:LINE of each."""
-    kept = T_world_cam[first]
-    step = np.linalg.norm(np.diff(kept[:, :3, 3], axis=0), axis=1)
+    """Raises ValueError: poses [N, 4, 4] with the same timestamp contradict each other. ``first`` [M] is the index of
+    each timestamp's first pose, ``same`` [N] the index of each pose's timestamp, ``lines`` FILE:LINE of each pose."""
+    reference = T_world_cam[first]
+    step = np.linalg.norm(np.diff(reference[:, :3, 3], axis=0), axis=1)
     step = step[np.isfinite(step)]
-    apart = max(_SAME_PLACE, float(np.median(step)) if step.size else 0.0)
-    distance = np.linalg.norm(T_world_cam[:, :3, 3] - kept[same, :3, 3], axis=1)
-    cosine = (np.einsum("nij,nij->n", T_world_cam[:, :3, :3], kept[same, :3, :3]) - 1) / 2
+    tolerance = max(_SAME_PLACE, float(np.median(step)) if step.size else 0.0)
+    distance = np.linalg.norm(T_world_cam[:, :3, 3] - reference[same, :3, 3], axis=1)
+    cosine = (np.einsum("nij,nij->n", T_world_cam[:, :3, :3], reference[same, :3, :3]) - 1) / 2
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    bad = np.flatnonzero((distance > apart) | (angle > _SAME_DIRECTION))
+    bad = np.flatnonzero((distance > tolerance) | (angle > _SAME_DIRECTION))
     if bad.size:
         i = bad[0]
         other, far = lines[first[same[i]]].rpartition(":")[2], f"{distance[i]:.3g} and {angle[i]:.3g} degrees from it"
@@ -223,7 +223,7 @@ def _require_consistent(T_world_cam: np.ndarray, first: np.ndarray, same: np.nda
 
 
 def _numbers(path: str | Path, commas: bool = False) -> tuple[list[list[float]], list[str]]:
-    """The numbers of each line that has any, and FILE:LINE of each; a ``#`` inside a token (Windows' 1.#IND) starts no
+    """The numbers of each non-empty line, and its FILE:LINE; a ``#`` inside a token (Windows' 1.#IND) starts no
     comment."""
     rows, lines = [], []
     for line, text in numbered_lines(path):
@@ -240,7 +240,7 @@ def _tokens(text: str) -> list[str]:
 
 
 def number(word: str, where: str) -> float:
-    """A word as a number, NaN as Windows writes it too. Raises ValueError: it is none; ``where`` names the line."""
+    """A word as a number, Windows' forms of NaN included. Raises ValueError: no number; ``where`` names the line."""
     if _WINDOWS_NON_FINITE.fullmatch(word):
         return float("nan")
     try:

@@ -22,7 +22,7 @@ from ufmstar_torch.eval.sequences.poses import trajectory_of
 from ufmstar_torch.trajectory import Trajectory, interpolate_pose
 
 _DEPTHS = {"16UC1": "u2", "32FC1": "f4"}
-# Encoding: bytes of a pixel, and OpenCV's conversion to RGB (None: it is RGB).
+# By encoding, bytes per pixel and OpenCV's conversion to RGB (None = already RGB).
 _COLOURS: dict[str, tuple[int, str | None]] = {
     "rgb8": (3, None),
     "bgr8": (3, "BGR2RGB"),
@@ -40,7 +40,7 @@ _COLOURS: dict[str, tuple[int, str | None]] = {
 }
 _RADIAL, _FISHEYES = ("plumb_bob", "rational_polynomial", ""), ("equidistant", "fisheye")
 _COUNTS = (4, 5, 8)  # of OpenCV's coefficients
-_STILL = 1e-9  # [m], [1] a transform whose samples differ by less does not move
+_STILL = 1e-9  # [m], [1] largest difference between samples of a static transform
 _NORM_TOLERANCE = 0.02  # of a quaternion
 
 
@@ -68,7 +68,7 @@ def is_depth(message: Any) -> bool:
 
 def depth(message: Any, scale: float | None, path: Path) -> np.ndarray:
     """[H, W] float32 [m], 0 = invalid, of an Image or a CompressedImage of ``compressed_depth_image_transport``;
-    ``scale`` in metres per unit instead of REP 118's."""
+    ``scale`` [m per unit] replaces REP 118's."""
     if hasattr(message, "encoding"):
         if message.encoding not in _DEPTHS:
             raise FrameError(path, f"depth must be 16UC1 or 32FC1, got {message.encoding!r}")
@@ -82,7 +82,7 @@ def depth(message: Any, scale: float | None, path: Path) -> np.ndarray:
 
 
 def _compressed_depth(data: bytes, form: str, path: Path) -> np.ndarray:
-    """A 16-bit PNG behind 12 bytes: i32 format, f32 a, f32 b; for 32FC1 it holds a / depth + b, 0 = invalid."""
+    """A 16-bit PNG after 12 bytes: i32 format, f32 a, f32 b; for 32FC1 its values are a / depth + b, 0 = invalid."""
     try:
         _, a, b = struct.unpack_from("<iff", data)
         with Image.open(BytesIO(data[12:])) as image:
@@ -98,18 +98,18 @@ def _compressed_depth(data: bytes, form: str, path: Path) -> np.ndarray:
 
 
 def _rows(message: Any, kind: np.dtype, channels: int, path: Path) -> np.ndarray:
-    """[H, W] or [H, W, C] of an Image, whose rows may be padded."""
+    """[H, W] or [H, W, C] pixels of an Image, whose rows may be padded."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     used, data = width * channels * kind.itemsize, np.asarray(message.data, np.uint8)
     if not (0 < used <= step and height > 0 and data.size == step * height):
         raise FrameError(path, f"an image of {width}x{height} {message.encoding} has {data.size} bytes, {step} a row")
-    pixels = data.reshape(height, step)[:, :used].copy().view(kind)  # of a bag's own memory, which is read-only
+    pixels = data.reshape(height, step)[:, :used].copy().view(kind)  # a copy, because a bag's memory is read-only
     return pixels if channels == 1 else pixels.reshape(height, width, channels)
 
 
 def lens(info: Any, rectified: bool, where: str) -> Lens:
-    """A CameraInfo's camera; of ``rectified`` images P without the distortion. Raises ValueError: it is not calibrated,
-    its model is not OpenCV's, or its images are cropped or binned."""
+    """A CameraInfo's camera; for ``rectified`` images P without distortion. Raises ValueError: the camera is not
+    calibrated, its model is not OpenCV's, or its images are cropped or binned."""
 
     def field(name: str) -> np.ndarray:  # ROS 1 has capitals
         return np.asarray(getattr(info, name, None) if hasattr(info, name) else getattr(info, name.upper()), np.float64)
@@ -126,13 +126,13 @@ def lens(info: Any, rectified: bool, where: str) -> Lens:
         raise ValueError(f"{where}: the camera is not calibrated, its focal lengths are {K[0, 0]}, {K[1, 1]}")
     coefficients = () if rectified else tuple(float(x) for x in field("d"))
     while len(coefficients) > 4 and coefficients[-1] == 0 and len(coefficients) not in _COUNTS:
-        coefficients = coefficients[:-1]  # of 12 or 14, thin prisms and tilts that are none
+        coefficients = coefficients[:-1]  # of 12 or 14, drop zero thin-prism and tilt coefficients
     fisheye = model in _FISHEYES and any(coefficients)
     return Lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), size, coefficients if any(coefficients) else (), fisheye)
 
 
 def frame_name(text: str) -> str:
-    """A frame's id; ROS 1 may write a slash before it."""
+    """A frame's id without the leading slash of ROS 1."""
     return text.lstrip("/")
 
 
@@ -140,13 +140,13 @@ Sample = tuple[float, ...]  # stamp [s], x y z [m], qx qy qz qw
 
 
 def sample(stamp: float, position: Any, rotation: Any) -> Sample:
-    """A pose at ``stamp`` [s], of a message's position and quaternion."""
-    at, q = position, rotation
-    return (stamp, at.x, at.y, at.z, q.x, q.y, q.z, q.w)
+    """A pose at ``stamp`` [s] from a message's position and quaternion."""
+    p, q = position, rotation
+    return (stamp, p.x, p.y, p.z, q.x, q.y, q.z, q.w)
 
 
 def trajectory(samples: Sequence[Sample]) -> Trajectory:
-    """Poses of one frame in another in the order of time, one of each; NaN where the quaternion is none."""
+    """Poses of one frame in another in the order of time, one per time; NaN if a quaternion is not normalised."""
     values = np.array(samples, dtype=np.float64)
     values[np.abs(np.linalg.norm(values[:, 4:], axis=1) - 1) >= _NORM_TOLERANCE, 1:] = np.nan
     return trajectory_of(values[:, 0], values[:, 1:4], values[:, 4:], "tf")
@@ -161,7 +161,7 @@ class FrameTree:
         self._edges: dict[str, Trajectory] = {}
 
     def add(self, stamp: float, transform: Any) -> None:
-        """A TransformStamped at ``stamp`` [s]. Raises ValueError: the frame had another parent."""
+        """Add a TransformStamped at ``stamp`` [s]. Raises ValueError: the frame has another parent."""
         parent, child = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
         if self._parents.setdefault(child, parent) != parent:
             raise ValueError(f"tf: frame {child!r} has the parents {self._parents[child]!r} and {parent!r}")
@@ -182,8 +182,8 @@ class FrameTree:
         return any(len(self._edge(frame)) > 1 for frame in frames)
 
     def between(self, frame: str, other: str, time: float, max_gap: float) -> np.ndarray | None:
-        """[4, 4] the pose of ``frame`` in ``other``, with which tf connects it, at ``time`` [s]; None where a sample is
-        missing (``interpolate_pose``)."""
+        """[4, 4] the pose of ``frame`` in a connected frame ``other`` at ``time`` [s]; None if a sample is missing
+        (``interpolate_pose``)."""
         above = self.chain(other)
         common = next(name for name in self.chain(frame) if name in above)
         poses = []
@@ -198,7 +198,7 @@ class FrameTree:
         return np.asarray(np.linalg.inv(poses[1]) @ poses[0])
 
     def _edge(self, child: str) -> Trajectory:
-        """A frame's poses in its parent: one, where it does not move."""
+        """A frame's poses in its parent; a single pose if it does not move."""
         if child not in self._edges:
             edge = trajectory(self._samples[child]) if child in self._samples else Trajectory(None, np.eye(4)[None])
             if not (np.abs(edge.T_world_cam - edge.T_world_cam[0]) > _STILL).any():

@@ -1,7 +1,7 @@
-"""ScanNet as SensReader exports it: ``color/N.jpg depth/N.png pose/N.txt intrinsic/intrinsic_*.txt``.
+"""SensReader exports of ScanNet: ``color/N.jpg depth/N.png pose/N.txt intrinsic/intrinsic_*.txt``.
 
-Depth is 16-bit in mm and has its own size and intrinsics (640x480 beside 1296x968); poses that SensReader
-could not track are -inf. https://github.com/ScanNet/ScanNet/tree/master/SensReader
+Depth is 16-bit in mm with another size and other intrinsics than colour (640x480, 1296x968); missing poses are -inf.
+https://github.com/ScanNet/ScanNet/tree/master/SensReader
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a SensReader export. Depth maps keep their own camera, ``depth_intrinsics``. Exports with resized images
-    have the original ``intrinsic_color.txt``: intrinsics that fit 1296x968 (depth: 640x480) but not the files' size are
-    scaled to it. Raises ValueError: no usable frame, intrinsics that fit neither size, a malformed pose file."""
+    """Open a SensReader export. Depth maps keep their camera, ``depth_intrinsics``. Exports with resized images have
+    the original ``intrinsic_color.txt``: intrinsics that fit 1296x968 (depth: 640x480) but not the files' size are
+    scaled. Raises ValueError: no usable frame, intrinsics that fit neither size, a malformed pose file."""
     images = list_files(path / "color")
     frames = [_frame(path, image, options) for image in images]
     if not images:
@@ -49,8 +49,8 @@ def _frame(path: Path, image: Path, options: Options) -> Entry | Skipped:
     return frame_of_files(image.stem, image, pose if pose.is_file() else None, load_depth, options)
 
 
-def _intrinsics(given: IntrinsicsLike | None, file: Path, native: Size, size: Size) -> np.ndarray:
-    if given is not None:
-        return read_intrinsics(given)
+def _intrinsics(override: IntrinsicsLike | None, file: Path, native: Size, size: Size) -> np.ndarray:
+    if override is not None:
+        return read_intrinsics(override)
     K = read_intrinsics(file)
     return scale_intrinsics(K, native, size) if not fits(K, size) and fits(K, native) else K

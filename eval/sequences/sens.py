@@ -31,7 +31,7 @@ _VERSION = 4
 _COLOR = {0: "raw", 1: "png", 2: "jpeg"}
 _DEPTH = {0: "raw_ushort", 1: "zlib_ushort", 2: "occi_ushort"}
 _MATRIX = ("<f4", (4, 4))
-# The header behind the sensor's name; sizes are width, height.
+# The header after the sensor's name; sizes are width, height.
 _HEADER = np.dtype(
     [
         *[(f"{name}_{camera}", *_MATRIX) for camera in ("color", "depth") for name in ("K", "T")],
@@ -41,28 +41,28 @@ _HEADER = np.dtype(
 )
 _FRAME = np.dtype([("T_world_cam", *_MATRIX), ("times", "<u8", 2), ("bytes", "<u8", 2)])
 _BYTES_PER_DEPTH = 2
-_MAX_NAME = 10_000  # [bytes] a longer sensor name is no name: the file is something else
+_MAX_NAME = 10_000  # [bytes] largest sensor name; a file with a longer one is no .sens file
 _MAX_FRAMES = 10_000_000  # 92 hours at 30 Hz: more is a broken header
-_FEW_FRAMES = 10_000  # as many are believed of whatever file: it may be truncated
+_FEW_FRAMES = 10_000  # accepted in a file of any size, which may be truncated
 _MAX_PIXELS = 100_000_000  # of a depth map
 _MICROSECOND = 1e-6
 
 
 def detect(path: Path) -> bool:
-    """True if the path is such a file, or a folder that holds exactly one and is no export."""
+    """True if the path is a .sens file, or a folder with exactly one that is no export."""
     if path.is_dir():
         return len(_files(path)) == 1 and not scannet.detect(path)
     return path.suffix.lower() == _SUFFIX and path.is_file()
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a ``.sens`` file. Depth maps keep their own camera, ``depth_intrinsics``. Frames are named by their number.
-    In a truncated file, those before the break are used and the others skipped. Raises ValueError: another version or
-    compression, a broken header, or no usable frame."""
+    """Open a ``.sens`` file. Depth maps keep their camera, ``depth_intrinsics``. Frames are named by their number. In a
+    truncated file, complete frames are used and the others skipped. Raises ValueError: another version or compression,
+    a broken header, or no usable frame."""
     file = _files(path)[0] if path.is_dir() else path
     with file.open("rb") as opened:
         header = _read_header(opened, file)
-        # Each of the frames claimed is an entry, there or missing; a frame takes a thousand times its header.
+        # Every frame of the header becomes an entry, even if it is missing; limit their number by the file's size.
         if header["frames"] > max(_FEW_FRAMES, (size := file.stat().st_size) // _FRAME.itemsize):
             raise ValueError(f"{file}: broken header: {header['frames']} frames cannot be in a file of {size:,} bytes")
         color_size, depth_size = (tuple(header[key].tolist()[::-1]) for key in ("color_size", "depth_size"))
@@ -86,8 +86,8 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def _read_header(file: BinaryIO, path: Path) -> np.void:
-    """The header, a record of ``_HEADER``, of a file that is opened at its beginning; the frames follow. Raises
-    ValueError: it is cut off, of another version, holds impossible values, or compressions that are not read here."""
+    """Read the header, a record of ``_HEADER``, from the beginning of a file. Raises ValueError: it is truncated, of
+    another version, or has impossible values or unsupported compressions."""
     version = int.from_bytes(_take(file, path, 4), "little")
     if version != _VERSION:
         raise ValueError(f"{path}: expected version {_VERSION} of the .sens format, got {version}")
@@ -104,8 +104,8 @@ def _read_header(file: BinaryIO, path: Path) -> np.void:
         raise ValueError(f"{path}: broken header: {frames} frames, {found}")
     kinds = _COLOR.get(int(header["color"]), "unknown"), _DEPTH.get(int(header["depth"]), "unknown")
     if kinds[0] not in ("jpeg", "png") or kinds[1] != "zlib_ushort":
-        known = "jpeg or png with zlib_ushort can be read: export it with ScanNet's SensReader"
-        raise ValueError(f"{path}: colour is {kinds[0]} and depth {kinds[1]}; of a .sens file, {known}")
+        supported = "jpeg or png with zlib_ushort can be read: export it with ScanNet's SensReader"
+        raise ValueError(f"{path}: colour is {kinds[0]} and depth {kinds[1]}; of a .sens file, {supported}")
     return header
 
 
@@ -121,17 +121,17 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _frames(file: BinaryIO, path: Path, count: int, depth_size: Size, scale: float) -> list[Entry | Skipped]:
-    """The first ``count`` frames, those that are there completely, of a file that is opened where they begin."""
-    here, frames = file.tell(), list[Entry | Skipped]()
+    """The complete ones of the first ``count`` frames, from a file positioned at the first frame."""
+    offset, frames = file.tell(), list[Entry | Skipped]()
     end = file.seek(0, os.SEEK_END)
-    while len(frames) < count and here + _FRAME.itemsize <= end:
-        file.seek(here)
+    while len(frames) < count and offset + _FRAME.itemsize <= end:
+        file.seek(offset)
         frame, name = np.frombuffer(file.read(_FRAME.itemsize), _FRAME)[0], str(len(frames))
         color_bytes, depth_bytes = frame["bytes"].tolist()
-        color_at = here + _FRAME.itemsize
+        color_at = offset + _FRAME.itemsize
         depth_at = color_at + color_bytes
-        here = depth_at + depth_bytes
-        if here > end:
+        offset = depth_at + depth_bytes
+        if offset > end:
             break
         if color_bytes == 0:
             frames.append(Skipped(name, "no image in the file"))
@@ -140,7 +140,7 @@ def _frames(file: BinaryIO, path: Path, count: int, depth_size: Size, scale: flo
         load_depth = partial(_read_depth, path, depth_at, depth_bytes, depth_size, scale) if depth_bytes else None
         load_color = partial(_read_color, path, color_at, color_bytes)
         T = frame["T_world_cam"].astype(np.float64)
-        if not np.abs(T[3] - [0, 0, 0, 1]).max() < 1e-6:  # -inf or 0: it was not tracked
+        if not np.abs(T[3] - [0, 0, 0, 1]).max() < 1e-6:  # -inf or 0: no pose
             T = UNKNOWN
         frames.append(Entry(name, T, load_color, load_depth, time))
     return frames
@@ -167,7 +167,7 @@ def _read_depth(path: Path, offset: int, size: int, shape: Size, scale: float) -
 
 
 def _bytes(path: Path, offset: int, size: int) -> bytes:
-    """A part of the file; FrameError where it cannot be read."""
+    """Read a part of the file. Raises FrameError: it cannot be read."""
     try:
         with path.open("rb") as file:
             file.seek(offset)

@@ -1,9 +1,9 @@
 """7-Scenes: ``frame-NNNNNN.{color.png|color.jpg, depth.png, pose.txt}``, depth in mm, 0 and 65535 invalid.
 
-What its authors publish is the depth camera's K = 585, 585, 320, 240 and that colour and depth were never
-calibrated to each other; the poses are the depth camera's (KinectFusion tracks with it). The colour camera
-is a Kinect's: K = 525, 525, 320, 240 and a baseline of 2.5 cm along x are the values customary in the
-literature, good to a few pixels. Pass ``intrinsics`` and ``T_color_depth`` where better ones are known.
+The authors publish the depth camera's K = 585, 585, 320, 240, and state that colour and depth were not calibrated to
+each other. The poses are the depth camera's (KinectFusion tracks it). The colour camera is a Kinect's: K = 525, 525,
+320, 240 and a baseline of 2.5 cm along x are customary in the literature, accurate to a few pixels. Pass ``intrinsics``
+and ``T_color_depth`` if better values are known.
 https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/
 """
 
@@ -33,7 +33,7 @@ _K_COLOR = (525.0, 525.0, 320.0, 240.0)
 _K_DEPTH = (585.0, 585.0, 320.0, 240.0)
 _MILLIMETRE = 1e-3
 _NO_DEPTH = 65535
-# [m] An approximation: the colour camera sits 2.5 cm to the right of the depth camera and looks the same way.
+# [m] An approximation: the colour camera is 2.5 cm to the right of the depth camera, with the same orientation.
 _T_COLOR_DEPTH = np.array([[1.0, 0, 0, -0.025], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _FRAME = re.compile(r"(frame-\d+)\.(color\.png|color\.jpg|depth\.png|pose\.txt)")
 
@@ -44,9 +44,9 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a 7-Scenes sequence folder (``seq-NN``).
+    """Open a 7-Scenes sequence folder (``seq-NN``).
 
-    Depth is warped into the colour camera, and ``T_world_cam`` is the colour camera's, as is a given ``trajectory``.
+    Depth is warped into the colour camera, and ``T_world_cam`` is the colour camera's, as must be ``trajectory``.
     """
     files: dict[str, dict[str, Path]] = {}
     for file in sorted(path.iterdir(), key=natural_key):
@@ -58,9 +58,9 @@ def read(path: Path, options: Options) -> FrameSequence:
     for name, kinds in files.items():
         load = partial(_read_depth, kinds["depth"], options.truth_scale or _MILLIMETRE) if "depth" in kinds else None
         frames.append(frame_of_files(name, kinds.get("color"), kinds.get("pose"), load, options))
-    own_size = first_depth_size(frames)
+    depth_size = first_depth_size(frames)
     K_color = camera_matrix(options.intrinsics, pinhole(*_K_COLOR), _NATIVE_SIZE, color_size)
-    K_depth = camera_matrix(options.depth_intrinsics, pinhole(*_K_DEPTH), _NATIVE_SIZE, own_size)
+    K_depth = camera_matrix(options.depth_intrinsics, pinhole(*_K_DEPTH), _NATIVE_SIZE, depth_size)
     T_color_depth = _T_COLOR_DEPTH if options.T_color_depth is None else options.T_color_depth
     if not isinstance(T_color_depth, np.ndarray):
         T_color_depth = read_pose(resolve(path, T_color_depth))
@@ -76,7 +76,7 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def _read_depth(path: Path, scale: float) -> np.ndarray:
-    """A depth PNG [H, W] float32 [m] in which 65535 as well as 0 is invalid; errors as ``read_depth``."""
+    """A depth PNG as [H, W] float32 [m]; 65535 and 0 are invalid. Errors as ``read_depth``."""
     values, _ = read_map(path, key="depth")
     if not np.issubdtype(values.dtype, np.integer):
         raise FrameError(path, f"expected 16-bit depth, got {values.dtype}")

@@ -1,7 +1,7 @@
 """Stray Scanner (iOS): ``rgb.mp4, odometry.csv, camera_matrix.csv, depth/NNNNNN.png, confidence/NNNNNN.png``.
 
-Poses are ARKit's, camera-to-world, with our axes. Depth is the laser's, 256x192, in mm; where the confidence is 0, of
-0 to 2, it is left out. Later versions of the app write the camera of each frame into odometry.csv.
+Poses are ARKit's, camera-to-world, with our axes. Depth is the laser's, 256x192, in mm; pixels with confidence 0 (of 0
+to 2) are invalid. Later versions of the app write the camera of each frame into odometry.csv.
 https://docs.strayrobots.io/apps/scanner/format.html
 """
 
@@ -33,8 +33,8 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a recording; frames are called by their number. Rows beyond the video's end are skipped. Raises ValueError:
-    a malformed file (named by line), no video, or no usable frame."""
+    """Open a recording; frames are named by their number. Rows beyond the video's end are skipped. Raises ValueError: a
+    malformed file (named by line), no video, or no usable frame."""
     (names, _), *rows = csv_rows(path / _ODOMETRY) or [([], "")]
     names = [name.lower() for name in names]
     if missing := [name for name in _COLUMNS if name not in names]:

@@ -21,14 +21,14 @@ _LENS = Lens((320.0, 320.0, 320.0, 240.0), (480, 640))
 
 
 def detect(path: Path) -> bool:
-    """True if the folder has this layout, itself or in trajectory folders below it."""
+    """True if the folder, or a trajectory folder in it, has this layout."""
     return bool(parts(path))
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a TartanAir trajectory (left camera); row i of the poses belongs to the image numbered i. A given
-    ``trajectory`` has our axes already. Raises ValueError: no usable frame; several trajectories below ``path``; an
-    image without a pose; a malformed pose line."""
+    """Open a TartanAir trajectory (left camera); row i of the poses belongs to the image numbered i. ``trajectory``
+    must have our axes. Raises ValueError: no usable frame; several trajectories below ``path``; an image without a
+    pose; a malformed pose line."""
     folders = parts(path)
     if len(folders) > 1:
         raise ValueError(f"{path} holds the trajectories {[folder.name for folder in folders]}: open one of them")
@@ -55,6 +55,6 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def parts(path: Path) -> list[Path]:
-    """The folders with a trajectory: ``path``, or those called PNNN in it."""
+    """The folders with a trajectory: ``path``, or folders PNNN in it."""
     folders = [path, *sorted(path.glob("P[0-9]*"))] if path.is_dir() else []
     return [f for f in folders if (f / "pose_left.txt").is_file() and (f / "image_left").is_dir()]

@@ -1,7 +1,7 @@
-"""nerfstudio and instant-ngp: ``transforms.json``, also as ``ns-process-data`` writes it for Polycam and Record3D.
+"""nerfstudio and instant-ngp: ``transforms.json``, also that of ``ns-process-data`` for Polycam and Record3D.
 
-Poses are camera-to-world with OpenGL axes; the first pixel's centre is (0.5, 0.5). A camera may stand in each frame.
-What was made from COLMAP has no metric scale (instant-ngp scales all others too).
+Poses are camera-to-world with OpenGL axes; the first pixel's centre is (0.5, 0.5). Each frame may have its camera.
+Files from COLMAP have no metric scale (instant-ngp also scales all others).
 https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
@@ -26,7 +26,7 @@ from ufmstar_torch.stream_warnings import LOGGER
 
 FILE = "transforms.json"
 LOOKED_FOR = f"{FILE}, also in one of its own name *.json"
-# Of a file or of one of its frames that structure from motion made.
+# Keys of a file or frame made by structure from motion.
 _NOT_METRIC = ("aabb_scale", "colmap_im_id")
 _SIGMA = "sigma_file_path"  # of a frame of `ufmstar export`
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
@@ -34,13 +34,13 @@ _MODELS = (*_FISHEYES, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "")
 
 
 def detect(path: Path) -> bool:
-    """True if the folder, or the path itself, holds a file of this layout."""
+    """True if the path is a file of this layout, or a folder with one."""
     return (path / FILE).is_file() or (path.is_file() and path.suffix == ".json")
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens the frames in the file's order. Raises ValueError: no JSON of this layout (the entry is named), an unknown
-    camera model, or no usable frame."""
+    """Open the frames in the file's order. Raises ValueError: no JSON of this layout (the message names the entry), an
+    unknown camera model, or no usable frame."""
     file = path if path.is_file() else path / FILE
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
@@ -54,20 +54,20 @@ def read(path: Path, options: Options) -> FrameSequence:
     short = len({image.stem for image in paths}) == len(paths)
     for frame, image in zip(frames, paths, strict=True):
         name = image.stem if short else str(image.with_suffix("")).strip("/").replace("/", "__")
-        whole = file.parent / image  # or without its ending, as in NeRF's synthetic scenes
+        whole = file.parent / image  # may lack the suffix, as in NeRF's synthetic scenes
         candidates = (whole, *(whole.with_name(whole.name + suffix) for suffix in IMAGE_SUFFIXES))
-        found = next((path for path in candidates if path.is_file()), None)
-        if found is None:
+        image_file = next((path for path in candidates if path.is_file()), None)
+        if image_file is None:
             entries.append(Skipped(name, "missing image file"))
             continue
         try:
-            lenses[name] = _lens({**content, **frame}, image_size(found), file)
+            lenses[name] = _lens({**content, **frame}, image_size(image_file), file)
         except FrameError:
             entries.append(Skipped(name, "the image's header cannot be read"))
             continue
         depth = None if _SIGMA in frame else frame.get("depth_file_path")
         load_depth = depth_loader(file.parent / depth, scale, scale) if isinstance(depth, str) else None
-        entries.append(Entry(name, _pose(frame, file), partial(read_color, found), load_depth))
+        entries.append(Entry(name, _pose(frame, file), partial(read_color, image_file), load_depth))
     if any(_SIGMA in frame for frame in frames):
         LOGGER.warning("%s: no ground truth: its depth is a prediction, with a sigma beside it", file)
     metric = not any(key in part for part in (content, *frames) for key in _NOT_METRIC)
@@ -83,7 +83,7 @@ def _path(frame: Mapping[str, Any], file: Path) -> Path:
 
 
 def _pose(frame: Mapping[str, Any], file: Path) -> np.ndarray:
-    """[4, 4] camera-to-world with our axes, NaN where it is not finite."""
+    """[4, 4] camera-to-world with our axes, NaN if it is not finite."""
     try:
         T = np.array(frame["transform_matrix"], dtype=np.float64)
         if T.shape not in ((4, 4), (3, 4)):
@@ -99,7 +99,7 @@ def _pose(frame: Mapping[str, Any], file: Path) -> np.ndarray:
 
 
 def _lens(values: Mapping[str, Any], size: Size, file: Path) -> Lens:
-    """The camera of an image of ``size`` (H, W), which may be smaller than w x h, for which its parameters hold."""
+    """The camera of an image of ``size`` (H, W), which may be smaller than the w x h of the file's parameters."""
     model = str(values.get("camera_model", "")).upper()
     if model not in _MODELS:
         raise ValueError(f"{file}: camera_model must be one of {', '.join(_MODELS[:-1])}, got {model[:60]!r}")

@@ -1,7 +1,7 @@
 """TUM RGB-D: ``rgb/ depth/ rgb.txt depth.txt groundtruth.txt``, 16-bit depth in 1/5000 m.
 
-Depth is registered to colour. Colour and depth have their own timestamps and are paired one-to-one; the
-pose is interpolated at the colour image's time. https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
+Depth is registered to colour. Colour and depth have different timestamps and are paired one-to-one; the pose is
+interpolated at the colour image's time. https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a TUM RGB-D sequence. An image without a depth map within ``max_time_difference`` stays, with ``depth``
-    None. The lens's published distortion is undone, in images and depth, unless ``distortion`` or ``intrinsics`` is
-    given. Raises ValueError: no usable frame; neither the folder nor the files name the camera (``freiburgN``) and
-    ``intrinsics`` is not given; a malformed line."""
+    """Open a TUM RGB-D sequence. An image without a depth map within ``max_time_difference`` stays, with ``depth``
+    None. Images and depth are undistorted with the lens's published coefficients, unless ``distortion`` or
+    ``intrinsics`` is set. Raises ValueError: no usable frame; neither the folder nor the files name the camera
+    (``freiburgN``) and ``intrinsics`` is None; a malformed line."""
     times, files = read_file_list(path / "rgb.txt")
     depth_files = _paired_depth(path, times, options.max_time_difference)
     loaders = [depth_loader(depth_files.get(i), options.truth_scale, SCALE) for i in range(len(files))]
@@ -71,7 +71,7 @@ def read_file_list(path: Path) -> tuple[np.ndarray, list[str]]:
 
 
 def _paired_depth(path: Path, color_times: np.ndarray, max_difference: float) -> dict[int, Path]:
-    """The depth files by index of the colour image, those that exist."""
+    """The existing depth files by index of the colour image."""
     if not (path / "depth.txt").is_file():
         return {}
     depth_times, depth_files = read_file_list(path / "depth.txt")
@@ -80,10 +80,10 @@ def _paired_depth(path: Path, color_times: np.ndarray, max_difference: float) ->
 
 
 def _robot(path: Path) -> str:
-    """1, 2 or 3, known from ``freiburgN`` in the folder's name or in the header of rgb.txt."""
+    """1, 2 or 3, from ``freiburgN`` in the folder's name or in the header of rgb.txt."""
     header = "\n".join(text for _, text in numbered_lines(path / "rgb.txt"))[:500]
     for text in (path.resolve().name, header):
         if found := re.search(r"freiburg([123])", text):
             return found[1]
-    known = "names the camera (freiburg1, 2 or 3); pass intrinsics as fx fy cx cy"
-    raise ValueError(f"intrinsics: neither the folder name {path.resolve().name!r} nor rgb.txt {known}")
+    remedy = "names the camera (freiburg1, 2 or 3); pass intrinsics as fx fy cx cy"
+    raise ValueError(f"intrinsics: neither the folder name {path.resolve().name!r} nor rgb.txt {remedy}")

@@ -16,9 +16,9 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 
 
 class Video:
-    """A video file with images of ``size`` (H, W); frames are exact by index, and cheap when read in increasing order:
-    seeking is inexact in most containers, so that an earlier frame is reached by decoding again from the start. Raises
-    FileNotFoundError: no such file; ValueError: it is no video, or one without a frame."""
+    """A video file with images of ``size`` (H, W). Frames are exact by index, and fast in increasing order: seeking is
+    inexact in most containers, so an earlier frame is decoded again from the start. Raises FileNotFoundError: no such
+    file; ValueError: it is no video, or has no frame."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -40,12 +40,12 @@ class Video:
             raise ValueError(f"{self.path}: the video has no frame that can be decoded")
 
     def __len__(self) -> int:
-        """Number of frames stated in the file; a truncated file ends earlier, with :class:`FrameError`."""
+        """Number of frames stated in the file; a truncated file raises :class:`FrameError` earlier."""
         return self._length
 
     def times(self) -> np.ndarray:
-        """[N] when each frame is shown [s], from 0 on, by the timestamps in the container, or where those are not as
-        many as the frames (an edited video), by decoding. Raises FrameError: the file ends before its last frame."""
+        """[N] times of the frames [s], from 0 on, by the timestamps in the container, or by decoding if their number is
+        not that of the frames (an edited video). Raises FrameError: the file ends before its last frame."""
         stamps = _container_times(self.path)
         if len(stamps) != self._length:
             stamps = self._decoded_times()
@@ -54,8 +54,7 @@ class Video:
         return stamps[: self._length] - stamps[0]
 
     def read(self, index: int) -> np.ndarray:
-        """Frame ``index`` as [H, W, 3] uint8 RGB. Raises FrameError: the file ends, or cannot be decoded, before that
-        frame."""
+        """Frame ``index`` as [H, W, 3] uint8 RGB. Raises FrameError: the file ends or cannot be decoded before it."""
         if self._capture is None or index < self._next:
             self._capture, self._next = self._open(), 0
         while self._next <= index:
@@ -66,8 +65,8 @@ class Video:
         return np.ascontiguousarray(image[..., ::-1])
 
     def _decoded_times(self) -> np.ndarray:
-        """[N] timestamps [s] of all frames, by decoding the file: of one that does not say how many it has (a browser's
-        recording), or not when they are shown."""
+        """[N] timestamps [s] of all frames, by decoding the file, if it does not state their number (a browser's
+        recording) or times."""
         import cv2
 
         capture, times = self._open(), []
@@ -84,13 +83,13 @@ class Video:
         return capture
 
     def __getstate__(self) -> dict[str, Any]:
-        """A decoder cannot be pickled: a worker process opens its own."""
+        """Pickle without the decoder; a worker process opens the file again."""
         return {**self.__dict__, "_capture": None, "_next": 0}
 
 
 def _container_times(path: Path) -> np.ndarray:
-    """[N] timestamps [s] of the packets of a file's first video stream, sorted, without decoding any; empty where
-    ffmpeg cannot read it."""
+    """[N] sorted timestamps [s] of the packets of a file's first video stream, without decoding; empty if ffmpeg cannot
+    read it."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
     command = [get_ffmpeg_exe(), "-v", "error", "-nostdin", "-i", str(path.resolve())]

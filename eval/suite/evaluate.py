@@ -1,4 +1,4 @@
-"""One sequence of an evaluation: the rows without a record are computed and stored."""
+"""One sequence of an evaluation: computes and stores the rows without a record."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ def evaluate_item(
         job: its folder is open.
         item: the sequence.
         judge: of the job.
-        stop: see ``evaluate_sequence``; nothing is stored of a sequence that is stopped.
-        progress: likewise, with the sequence's label as the stage.
+        stop: see ``evaluate_sequence``; a stopped sequence stores nothing.
+        progress: see ``evaluate_sequence``; its stage is the sequence's label.
 
     Returns:
-        A line about the sequence, "" where nothing was missing.
+        A line about the sequence, "" if no row was missing.
 
     Raises:
         Stopped: ``stop`` returned True.
         FolderError: earlier results were computed from another sequence of that name.
-        CacheError, OSError: nothing can be written.
+        CacheError, OSError: a file cannot be written.
     """
     if stop():
         raise Stopped
@@ -76,8 +76,8 @@ def evaluate_item(
         sinks = [ExampleWriter(folder.sequence_folder(item))] if job.stores_examples(item) else []
         needed = with_references(todo, possible)
 
-        def shown(now: Progress) -> None:
-            progress(replace(now, stage=item.label))
+        def shown(state: Progress) -> None:
+            progress(replace(state, stage=item.label))
 
         try:
             for problem in check_sequence(sequence).problems if sequence.layout != TOUR else ():
@@ -101,13 +101,13 @@ def evaluate_item(
 
 
 def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:
-    """The missing rows and those whose confidence they are judged by, in the order of ``rows``."""
+    """The missing rows and their references (``engine.judge.references``), in the order of ``rows``."""
     needed = {*missing, *(reference for row in missing for reference in references(row, rows))}
     return [row for row in rows if row in needed]
 
 
 def _record(job: EvalJob, item: WorkItem, judge: Judge, result: RowFigures, made_of: Mapping[str, Any]) -> Record:
-    """A row's figures with what they were computed from and with."""
+    """The record of a row's figures with their provenance."""
     row, network = result.row, judge.networks[result.row.method.base]
     computed_with = {"versions": versions(), "machine": hardware(), "threads": torch.get_num_threads()}
     return Record(

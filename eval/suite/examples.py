@@ -1,14 +1,14 @@
-"""Maps and mixtures of a few frames, from which the pictures of a report are drawn.
+"""Maps and mixtures of a few frames for the pictures of a report.
 
-Written while a sequence is evaluated, below its folder::
+They are written while a sequence is evaluated, below its folder::
 
     examples/FRAME.npz      image [h, w, 3] uint8, truth [h, w] float32 [m] (0 = none), K [3, 3] [px], index
-    examples/FRAME@ROW.npz  depth [m], and where the row has them variance, aleatoric, epistemic, disagreement [m^2] and
-                            measured (share of the disagreement that rests on two views), each [h, w] float32;
-                            image, truth and K too where the row's are others than the frame's
+    examples/FRAME@ROW.npz  depth [m], and if the row has them variance, aleatoric, epistemic, disagreement [m^2] and
+                            measured (share of the disagreement from two views), each [h, w] float32;
+                            also image, truth and K if the row's differ from the frame's
     room/ROW_FRAME.npz      UfM*'s mixture after the frame in the world: mean_world [K, 3] [m], covariance_world
                             [K, 3, 3] [m^2], weight [K] [px], disagreement [K] [m^2], count [K]; T_world_cam
-                            [4, 4]; path [n, 3] where the camera has been until then [m]
+                            [4, 4]; path [n, 3], the camera's positions up to the frame [m]
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class ExampleWriter(FrameSink):
     """A sink that writes examples of a sequence, and UfM*'s mixtures after a quarter, half and all of the frames.
 
     Args:
-        folder: of the sequence; "examples" and "room" are made within it.
-        frames: how many, evenly spaced over the frames.
+        folder: of the sequence, in which "examples" and "room" are created.
+        frames: number of examples, evenly spaced over the frames.
     """
 
     def __init__(self, folder: Path, frames: int = 3) -> None:
@@ -54,7 +54,7 @@ class ExampleWriter(FrameSink):
         self._gaussians = {row.key: row.estimator for row in stream.rows if isinstance(row.estimator, Gaussians)}
 
     def take(self, result: FrameResult) -> None:
-        """After each frame. If no row used the frame, the next one is stored instead. Raises OSError, see
+        """Store a frame that is due. If no row used the frame, the next one is stored instead. Raises OSError, see
         ``write_atomic``."""
         if not result.rows or result.frame is None:
             return
@@ -69,7 +69,7 @@ class ExampleWriter(FrameSink):
             self._write_rooms()
 
     def end(self) -> None:
-        """After the last frame. Raises OSError, see ``write_atomic``."""
+        """Store the last mixtures. Raises OSError, see ``write_atomic``."""
         self._write_rooms()
 
     def _write_frame(self, result: FrameResult, frame: Frame) -> None:
@@ -81,8 +81,8 @@ class ExampleWriter(FrameSink):
             maps = {part: getattr(row, part) for part in _MAPS}
             arrays = {part: value.float().numpy() for part, value in maps.items() if value is not None}
             scene = scenes[key]
-            alike = scene["truth"].shape == first["truth"].shape and np.array_equal(scene["K"], first["K"])
-            _write(folder / f"{frame.name}@{key}.npz", arrays if alike else {**arrays, **scene})
+            same_camera = scene["truth"].shape == first["truth"].shape and np.array_equal(scene["K"], first["K"])
+            _write(folder / f"{frame.name}@{key}.npz", arrays if same_camera else {**arrays, **scene})
 
     def _write_rooms(self) -> None:
         for key, (name, T_world_cam) in self._last.items():
@@ -91,12 +91,12 @@ class ExampleWriter(FrameSink):
 
 
 def _moments(shares: Iterable[float], total: int) -> list[int]:
-    """The numbers of frames after which something is due: rising shares in (0, 1] of ``total``."""
+    """Counts of frames at rising shares in (0, 1] of ``total``."""
     return [max(1, math.ceil(share * total)) for share in shares]
 
 
 def _due(moments: list[int], done: int) -> bool:
-    """Return whether a moment has come after ``done`` frames, and remove those that have come."""
+    """True if one of ``moments`` is at most ``done`` frames; removes these moments from the list."""
     coming = [moment for moment in moments if moment > done]
     due = len(coming) < len(moments)
     moments[:] = coming
@@ -125,7 +125,7 @@ def _scene(frame: Frame, row: RowResult) -> dict[str, NDArray]:
 
 
 def _seen(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: Size) -> NDArray[np.uint8]:
-    """[h, w, 3] an image as a camera K with ``size`` (h, w) sees it: in every pixel the mean of several points."""
+    """[h, w, 3] an image resampled to a camera K with ``size`` (h, w): the mean of several points in every pixel."""
     fine = (_POINTS * size[0], _POINTS * size[1])
     points = resample_nearest(image, K_image, scale_intrinsics(K, size, fine), fine)
     blocks = points.reshape(size[0], _POINTS, size[1], _POINTS, 3)

@@ -1,9 +1,9 @@
-"""The output folder of ``ufmstar eval``: what is finished in it.
+"""The output folder of ``ufmstar eval`` and its finished records.
 
 ```
 OUT/eval.json                          suite, rows, networks, sequences, settings
-OUT/eval.lock, eval-I-of-N.lock        held while eval.json is made or extended, and while shard I of N is evaluated
-OUT/records/DATASET/SEQUENCE/ROW.json  a record, written after ROW.pt: where it exists, both are complete
+OUT/eval.lock, eval-I-of-N.lock        locked while eval.json is written, and while shard I of N is evaluated
+OUT/records/DATASET/SEQUENCE/ROW.json  a record, written after ROW.pt: if it exists, both are complete
 OUT/records/DATASET/SEQUENCE/failed.json
 ```
 """
@@ -35,11 +35,11 @@ _OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz", "room/*.npz")
 def evaluation_folder(
     out: Path, about: Mapping[str, Any], *, shard: Shard = ALL, resume: bool = False, overwrite: bool = False
 ) -> Iterator[None]:
-    """Make the folder, or continue in it, and hold a shard; see ``output_folder``. When continuing, rows, sequences and
-    networks of ``about`` (eval.json) are added to those of the earlier evaluation; suite, settings and the networks of
-    the same base must be the same. The cache of predictions is never removed. Raises FolderError also where another
-    process evaluates the same shard, or any shard of a folder that is to be overwritten."""
-    with output_folder(out, EVALUATION, about, resume=resume, overwrite=overwrite):  # others work there too
+    """Create or resume the folder, and lock a shard; see ``output_folder``. A resume adds rows, sequences and networks
+    of ``about`` (eval.json) to the earlier evaluation; suite, settings and the networks of the same base must be equal.
+    The cache of predictions is never removed. Also raises FolderError: another process evaluates the same shard, or any
+    shard of a folder to overwrite."""
+    with output_folder(out, EVALUATION, about, resume=resume, overwrite=overwrite):  # unlocked for other shards
         lock = hold(out / f"eval-{shard.index}-of-{shard.count}.lock")
     if lock is None:
         raise FolderError(f"--out {out}: another process is evaluating shard {shard} there now")
@@ -60,18 +60,18 @@ class EvalFolder:
         return self.path / "records" / item.folder
 
     def begin(self, item: WorkItem, rows: Iterable[Row]) -> list[Row]:
-        """Make the folder of a sequence, remove files that a killed process had begun, and return the missing rows."""
+        """Create the folder of a sequence, remove temporary files of killed processes, and return the missing rows."""
         folder = self.sequence_folder(item)
         folder.mkdir(parents=True, exist_ok=True)
         remove_temporaries(path for pattern in (".*.tmp", "*/.*.tmp") for path in folder.glob(pattern))
         return self.missing(item, rows)
 
     def is_finished(self, item: WorkItem, rows: Iterable[Row]) -> bool:
-        """Return whether every row has a record, or the sequence has failed."""
+        """True if every row has a record, or the sequence has failed."""
         return (self.sequence_folder(item) / FAILED).exists() or not self.missing(item, rows)
 
     def missing(self, item: WorkItem, rows: Iterable[Row]) -> list[Row]:
-        """The rows without a record; a record that cannot be read counts as none."""
+        """The rows without a readable record."""
         finished = self.records(item)
         return [row for row in rows if row.slug not in finished]
 
@@ -85,8 +85,8 @@ class EvalFolder:
         return records
 
     def require_same_sequence(self, item: WorkItem, digest: str, landmarks: Mapping[str, str]) -> None:
-        """Raises FolderError where finished rows were computed from other frames, cameras, poses or ``landmarks``,
-        whose digests are by row."""
+        """Raises FolderError: finished rows were computed from other frames, cameras, poses or ``landmarks`` (digests
+        by row)."""
         for slug, record in self.records(item).items():
             if slug in landmarks and record.provenance.get("landmarks") != landmarks[slug]:
                 raise FolderError(
@@ -101,43 +101,43 @@ class EvalFolder:
                 )
 
     def write(self, item: WorkItem, record: Record, result: RowFigures) -> None:
-        """Store a row, completely or not at all. Raises OSError: it cannot be written."""
+        """Store a row, atomically. Raises OSError: it cannot be written."""
         record.save(self.sequence_folder(item) / f"{result.row.slug}.json", result.sums)
 
     def fail(self, item: WorkItem, error: Exception | str, rows: Sequence[Row]) -> str:
         """Store why rows of a sequence cannot be computed, and return a line about it."""
         reason = " ".join(str(error).split()) or type(error).__name__
-        about = {"dataset": item.dataset, "sequence": item.sequence, "reason": reason}
-        write_json_atomic(self.sequence_folder(item) / FAILED, {**about, "rows": [row.slug for row in rows]})
+        failure = {"dataset": item.dataset, "sequence": item.sequence, "reason": reason}
+        write_json_atomic(self.sequence_folder(item) / FAILED, {**failure, "rows": [row.slug for row in rows]})
         return f"{item.label}: failed: {reason}"
 
     def failures(self) -> dict[tuple[str, str], str]:
-        """Reasons for which sequences cannot be judged, as :meth:`fail` stored them, by data set and sequence."""
+        """By data set and sequence, the reasons for failures, as stored by :meth:`fail`."""
         stored = [
             json.loads(path.read_text(encoding="utf-8")) for path in sorted(self.path.glob(f"records/*/*/{FAILED}"))
         ]
         return {(one["dataset"], one["sequence"]): one["reason"] for one in stored}
 
     def succeeded(self, item: WorkItem) -> None:
-        """Forget an earlier failure."""
+        """Remove the record of an earlier failure."""
         (self.sequence_folder(item) / FAILED).unlink(missing_ok=True)
 
 
 def _identity(about: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """The values that must be the same: suite, settings, and the networks of bases that both have."""
+    """The values that must be equal: suite, settings, and the networks of common bases."""
     networks = {base: made for base, made in about["networks"].items() if base in other["networks"]}
     return {"suite": about["suite"], "settings": about["settings"], "networks": networks}
 
 
-def _merged(then: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
-    """An earlier evaluation together with what the present one adds."""
-    networks = {**then["networks"], **now["networks"]}
+def _merged(earlier: Mapping[str, Any], current: Mapping[str, Any]) -> dict[str, Any]:
+    """The earlier evaluation extended by the current one."""
+    networks = {**earlier["networks"], **current["networks"]}
     return {
-        **now,
+        **current,
         "networks": networks,
-        "missing_bases": [base for base in now["missing_bases"] if base not in networks],
+        "missing_bases": [base for base in current["missing_bases"] if base not in networks],
         **{
-            name: [*then[name], *(value for value in now[name] if value not in then[name])]
+            name: [*earlier[name], *(value for value in current[name] if value not in earlier[name])]
             for name in ("rows", "sequences", "datasets")
         },
     }

@@ -26,19 +26,19 @@ from ufmstar_torch.recalibrate import Recalibration
 class EvalJob:
     """An evaluation."""
 
-    suite: Suite  # its rows, of the bases that have a network
-    networks: Mapping[str, NetworkChoice]  # chosen, by base
+    suite: Suite  # with the rows whose base has a network
+    networks: Mapping[str, NetworkChoice]  # by base
     items: tuple[WorkItem, ...]  # the sequences
-    out: Path  # the folder for everything that is written
-    missing_bases: tuple[str, ...] = ()  # bases of rows that were left out
-    # Networks of other architectures, by base, whose time, energy and memory are measured as well.
+    out: Path  # output folder
+    missing_bases: tuple[str, ...] = ()  # bases of omitted rows, which have no network
+    # Networks of other architectures, by base, whose time, energy and memory are also measured.
     further: tuple[Mapping[str, NetworkChoice], ...] = ()
-    frames: slice = field(default_factory=lambda: slice(None))  # which of each sequence
+    frames: slice = field(default_factory=lambda: slice(None))  # selects frames of each sequence
     cache: Path | None = None  # folder of predictions; None = in ``out``
     device: str = "cpu"  # "cpu", "cuda", "cuda:1"
     bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
-    examples: int = 3  # of each data set, sequences of which a few frames are stored for pictures
-    plugin: tuple[str, ...] = ()  # files with methods and metrics of one's own
+    examples: int = 3  # number of sequences of each data set with stored frames for pictures
+    plugin: tuple[str, ...] = ()  # files with the user's methods and metrics
     samples: int | None = None  # passes of MC-Dropout
     # runtime, precision: of the networks (``Inference``).
     runtime: str = "auto"
@@ -46,7 +46,7 @@ class EvalJob:
 
     @property
     def folder(self) -> EvalFolder:
-        """The records in its output folder."""
+        """The records in the output folder."""
         return EvalFolder(self.out)
 
     @property
@@ -55,16 +55,15 @@ class EvalJob:
         return tuple(base for base in self.networks if base not in self.suite.bases)
 
     def load(self, device: torch.device, networks: Mapping[str, NetworkChoice] | None = None) -> dict[str, DepthSource]:
-        """Load those networks (None: of the evaluated ones) that the rows need. Raises FileNotFoundError, ValueError,
-        ImportError, see ``NetworkChoice.load``."""
+        """Load the networks that the rows need from ``networks`` (None = the evaluated ones). Raises
+        FileNotFoundError, ValueError, ImportError, see ``NetworkChoice.load``."""
         networks = self.networks if networks is None else networks
         needed = [networks[base] for base in self.suite.bases if base in networks]
         inference = Inference(self.runtime, self.precision)
         return {choice.base: choice.load(device, samples=self.samples, inference=inference) for choice in needed}
 
     def judge(self, networks: Mapping[str, DepthSource], device: torch.device) -> Judge:
-        """The judge of sequences by the loaded networks. Raises CacheError: the folder of predictions cannot be
-        written."""
+        """The judge with the loaded networks. Raises CacheError: the folder of predictions cannot be written."""
         store = PredictionCache(self.cache or self.out / CACHE)
         return Judge(networks, device, store, self.frames, self.bins, load_plugins(self.plugin))
 
@@ -87,28 +86,29 @@ class EvalJob:
         }
 
     def stores_examples(self, item: WorkItem) -> bool:
-        """Return whether the sequence is one of the first of its data set, from which pictures are drawn."""
+        """True if the sequence is one of the first ``examples`` of its data set."""
         same = [other for other in self.items if other.dataset == item.dataset]
         return item in same[: self.examples]
 
 
 def require_methods(suite: Suite, plugin: Sequence[str]) -> None:
-    """Raises ValueError: a row's method is neither of this package nor of a plug-in, or its cost is to be measured."""
-    own = load_plugins(plugin).methods
+    """Raises ValueError: a row's method is neither in this package nor in a plug-in, or is a plug-in's in a suite that
+    measures cost."""
+    methods = load_plugins(plugin).methods
     for row in suite.rows:
         fusion = row.method.fusion
-        if fusion not in FUSIONS and (fusion not in own or suite.efficiency):
-            known = f"there are {', '.join(own)}" if own else "--plugin FILE.py adds yours"
-            why = "the cost of a method of one's own is not measured" if fusion in own else known
+        if fusion not in FUSIONS and (fusion not in methods or suite.efficiency):
+            remedy = f"there are {', '.join(methods)}" if methods else "--plugin FILE.py adds yours"
+            why = "the cost of a method of one's own is not measured" if fusion in methods else remedy
             raise ValueError(f"suite {suite.name}: row {row.method.name}: {why}")
 
 
 def with_recalibrations(suite: Suite, files: Sequence[str]) -> Suite:
-    """The suite with a row for each recalibration, behind the row to which it was fitted.
+    """The suite with a row for each recalibration, after the row to which it was fitted.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: a file is no recalibration, or was fitted to a row that the suite does not have.
+        ValueError: a file is no recalibration, or was fitted to a row outside the suite.
     """
     for file in files:
         fitted = Recalibration.from_json(file).row
@@ -116,6 +116,6 @@ def with_recalibrations(suite: Suite, files: Sequence[str]) -> Suite:
         if row is None:
             raise ValueError(f"--recalibration {file} was fitted to the row {fitted!r}, which the suite does not have")
         recalibrated = replace(row, setting=replace(row.setting, recalibration=file))
-        at = suite.rows.index(row) + 1
-        suite = replace(suite, rows=(*suite.rows[:at], recalibrated, *suite.rows[at:]))
+        position = suite.rows.index(row) + 1
+        suite = replace(suite, rows=(*suite.rows[:position], recalibrated, *suite.rows[position:]))
     return suite

@@ -1,4 +1,4 @@
-"""The record of one row on one sequence, from which every table and figure is made, and the sums behind it."""
+"""The record of one row on one sequence, the source of all tables and figures, and its sums."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ Sums = Mapping[str, Mapping[str, Tensor]]
 
 
 class ResultsError(ValueError):
-    """A folder is no evaluation, or its records do not belong together; the message names the file."""
+    """A folder is no evaluation, or its records are inconsistent; the message names the file."""
 
 
 @dataclass(frozen=True)
 class Record:
     """One row of a table on one sequence."""
 
-    suite: str  # its name, as "paper-table-1"
-    dataset: str  # as "scannet"; ``sequence``: its name within it
-    sequence: str  # see ``dataset``
-    network: str  # as shown, "FastDepth" or "ResNet50-Monodepth2"
-    method: str  # the row's name, ``Method.name``
-    setting: Mapping[str, Any] = field(default_factory=dict)  # ``Setting.to_dict()``; {} = as the paper runs it
-    # "selected", "done", "judged", "skipped" (counts) and "reasons" (count by reason); of UfM* "without_segment" and
-    # "without_match", frames that added nothing to the mixture or met nothing in it.
+    suite: str  # name, as "paper-table-1"
+    dataset: str  # as "scannet"
+    sequence: str  # name in the data set
+    network: str  # label, "FastDepth" or "ResNet50-Monodepth2"
+    method: str  # ``Method.name``
+    setting: Mapping[str, Any] = field(default_factory=dict)  # ``Setting.to_dict()``; {} = the default
+    # "selected", "done", "judged", "skipped" (counts) and "reasons" (count by reason); for UfM* "without_segment" and
+    # "without_match", frames without a segment or without a match in the mixture.
     frames: Mapping[str, Any] = field(default_factory=dict)
-    # ``SequenceMetrics.compute()``: "delta1", "nll", "ece_delta", ... (NaN is kept as None).
+    # ``SequenceMetrics.compute()``: "delta1", "nll", "ece_delta", ... (None = NaN).
     figures: Mapping[str, float | None] = field(default_factory=dict)
-    # ``SequenceMetrics.curves()``, and "nll_by_error:REFERENCE" over the pixels of which REFERENCE is confident.
+    # ``SequenceMetrics.curves()``, and "nll_by_error:REFERENCE" over the pixels where REFERENCE is confident.
     curves: Mapping[str, Any] = field(default_factory=dict)
-    # of the multiview method: "bytes_mean", "bytes_max", "bytes_end" [B], "count_mean", "count_max", "count_end"
-    # (points or components), "smoothing_bytes" (the map kept for smoothing) [B]; {} if alone.
+    # Of UfM or UfM*: "bytes_mean", "bytes_max", "bytes_end" [B], "count_mean", "count_max", "count_end" (points or
+    # components), "smoothing_bytes" (of the smoothing map) [B]; {} for the network alone.
     state: Mapping[str, float] = field(default_factory=dict)
-    # median time per frame [ms] by stage: "network" (one inference, or all of them), "uncertainty".
+    # Median time per frame [ms] by stage: "network" (one inference, or all), "uncertainty".
     ms: Mapping[str, float] = field(default_factory=dict)
     # "versions", "machine", "device", "runtime" of the networks, digests of networks and sequence.
     provenance: Mapping[str, Any] = field(default_factory=dict)
@@ -54,25 +54,25 @@ class Record:
 
     @cached_property
     def row(self) -> Row:
-        """Its row of the table. Raises ValueError: there is no such row."""
+        """The row of the table. Raises ValueError: no such row."""
         return row_from({"method": self.method, "setting": self.setting})
 
     @cached_property
     def values(self) -> dict[str, float | None]:
-        """All its numbers by name: the figures, "frames.done", "state.bytes_mean", "ms.network" and the like."""
+        """All numbers by name: the figures, "frames.done", "state.bytes_mean", "ms.network" and the like."""
         counts = {f"{group}.{key}": v for group in ("frames", "state", "ms") for key, v in getattr(self, group).items()}
         return {**self.figures, **{name: v for name, v in counts.items() if isinstance(v, int | float)}}
 
     def save(self, path: Path, sums: Sums) -> None:
-        """Write it as JSON behind its sums, each whole or not at all: where there is a record, both are complete."""
-        path.unlink(missing_ok=True)  # one that could not be read
+        """Write the sums, then the record as JSON, each atomically: if the record exists, both are complete."""
+        path.unlink(missing_ok=True)  # an unreadable record
         packed = {name: {key: pack(value) for key, value in states.items()} for name, states in sums.items()}
         write_atomic(path.with_suffix(".pt"), lambda file: torch.save(packed, file), durable=True)
         values = {name: value for name, value in asdict(self).items() if name != "path"}
         write_json_atomic(path, {"format": FORMAT, **values})
 
     def sums(self) -> Sums:
-        """``RowFigures.sums``. Raises ResultsError: the file holds none."""
+        """``RowFigures.sums``. Raises ResultsError: the file has none."""
         path = self.path.with_suffix(".pt")
         try:
             stored = torch.load(path, map_location="cpu", weights_only=True)
@@ -84,8 +84,8 @@ class Record:
 
     @classmethod
     def load(cls, path: Path) -> Record:
-        """Read one. Raises ResultsError: the file is not a record of this format, or of no row; the message names
-        it."""
+        """Read a record. Raises ResultsError: the file is not a record of this format, or its row does not exist; the
+        message names the file."""
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
         except (ValueError, RecursionError) as error:

@@ -1,7 +1,7 @@
 """The division of an evaluation: static shards of its sequences, and a task for each sequence of a shard.
 
-``--shard`` chooses a shard (one job of a cluster's array, say); ``--processes`` evaluates it in a pool of processes. A
-record that exists is not computed again, so that a killed evaluation continues where it was.
+``--shard`` chooses a shard, as for one job of a cluster's array; ``--processes`` evaluates it in a pool of processes.
+Existing records are not computed again, so a killed evaluation can continue.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ Shown = Callable[[Progress], object]
 class EvalOutcome:
     """The outcome of an evaluation, or of one shard of it."""
 
-    finished: bool  # False: it was stopped, or a process was killed
-    stopped: bool  # by the caller
-    complete: bool  # whether every sequence of all shards is finished, or has failed
-    failed: Mapping[str, str]  # why a sequence cannot be judged, by its label
+    finished: bool  # False if it was stopped, or a process was killed
+    stopped: bool  # True if the caller stopped it
+    complete: bool  # True if every sequence of all shards is finished or has failed
+    failed: Mapping[str, str]  # by a sequence's label, why it cannot be evaluated
 
 
 def evaluate_suite(
@@ -62,20 +62,19 @@ def evaluate_suite(
     """Evaluate the sequences of a shard.
 
     Args:
-        job: what is evaluated.
-        shard: which part.
-        processes: number of processes on this computer that evaluate sequences of the shard.
-        threads: of the CPU for each of several processes; None: all cores divided among them.
-        resume, overwrite: see ``evaluation_folder``. The shards of an evaluation start in any order, so that each of
-            several resumes what the first one has begun.
+        job: the evaluation.
+        shard: part of its sequences.
+        processes: number of processes on this computer.
+        threads: CPU threads of each of several processes; None = all cores divided among them.
+        resume, overwrite: see ``evaluation_folder``. Shards start in any order; with several, each one resumes.
         stop: called before every frame; True ends the work.
         report: receives a line for every finished sequence.
-        progress: called after every frame, with the sequence's label as the stage; of several processes, after every
+        progress: called after every frame, with the sequence's label as the stage; with several processes, after every
             sequence.
 
     Raises:
-        FolderError, FileNotFoundError, ValueError, ImportError: the work cannot be begun.
-        CacheError, OSError: nothing can be written.
+        FolderError, FileNotFoundError, ValueError, ImportError: the work cannot begin.
+        CacheError, OSError: a file cannot be written.
         RuntimeError: one of several processes failed; the message names the sequence.
     """
     if overwrite and shard.count > 1:
@@ -107,8 +106,8 @@ def _in_processes(
     report: Report,
     progress: Shown,
 ) -> bool:
-    """Evaluate sequences in a pool of processes, a task each; whether all were done. Raises
-    RuntimeError: a task failed; the others end after their frame."""
+    """Evaluate sequences in a pool of processes, one task each. Returns True if all tasks ended. Raises RuntimeError: a
+    task failed; the others end after their current frame."""
     context = multiprocessing.get_context("spawn")
     stopped, queue = context.Event(), context.SimpleQueue()
     for number in range(processes):
@@ -144,7 +143,7 @@ _evaluate_here: Callable[[WorkItem], str]  # in a process of the pool
 def _begin(job: EvalJob, numbers: Any, threads: int, stopped: Any) -> None:
     """Prepare a process of the pool."""
     global _evaluate_here
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the parent as well, which sets ``stopped``
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal also signals the parent, which sets ``stopped``
     Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(threads)
     logging.getLogger("ufmstar_torch").addFilter(_once())
@@ -157,29 +156,28 @@ def _evaluate(item: WorkItem) -> str:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent has ended, however that happened: a process of a pool would wait for ever."""
+    """End this process when its parent has ended in any way; a process of a pool would wait forever."""
     if (parent := multiprocessing.parent_process()) is not None:
         parent.join()
         os._exit(1)
 
 
 def _once() -> Callable[[logging.LogRecord], bool]:
-    """A filter that passes a warning once, whichever stream and numbers it names: the rows of a suite are many
-    streams."""
+    """A filter that passes each warning once, ignoring the numbers in it, because a suite has many streams."""
     logged: set[str] = set()
 
     def first(record: logging.LogRecord) -> bool:
         text = re.sub(r"\d+", "", record.getMessage())
-        known = text in logged
+        repeated = text in logged
         logged.add(text)
-        return not known
+        return not repeated
 
     return first
 
 
 @contextmanager
 def warned_once() -> Iterator[None]:
-    """Within the context, a warning of the package is logged once."""
+    """Within the context, each warning of the package is logged once."""
     logger, once = logging.getLogger("ufmstar_torch"), _once()
     logger.addFilter(once)
     try:

@@ -1,4 +1,4 @@
-"""The sequences that are evaluated, and the shards into which they are divided."""
+"""The sequences of an evaluation, and their shards."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9._+-]+")
 
 @dataclass(frozen=True, order=True)
 class WorkItem:
-    """A sequence that is not opened yet; items are in the order of data set and name."""
+    """A sequence that is not open; items are ordered by data set and name."""
 
     dataset: str  # as "scannet"
-    sequence: str  # its name, unique within the data set
-    path: str  # what ``open_sequence`` takes, ``tour:SEED`` included
-    opening: Options = field(default=_AS_THEY_ARE, compare=False)  # likewise
+    sequence: str  # name, unique within the data set
+    path: str  # argument of ``open_sequence``, may be ``tour:SEED``
+    opening: Options = field(default=_AS_THEY_ARE, compare=False)  # options of ``open_sequence``
 
     @property
     def folder(self) -> Path:
-        """DATASET/SEQUENCE below the outputs' "records", both in letters that every file system takes."""
+        """DATASET/SEQUENCE below "records", both in characters that every file system accepts."""
         return Path(_safe(self.dataset), _safe(self.sequence))
 
     @property
     def label(self) -> str:
-        """For people."""
+        """The displayed name, "DATASET/SEQUENCE"."""
         return f"{self.dataset}/{self.sequence}"
 
     def open(self) -> FrameSequence:
-        """Open it. Raises FileNotFoundError, ValueError: it cannot be opened, or its scale is not known."""
+        """Open the sequence. Raises FileNotFoundError, ValueError: it cannot be opened, or its scale is unknown."""
         from ufmstar_torch.eval.run.scale import require_metric
         from ufmstar_torch.eval.sequences.open import open_sequence
 
@@ -74,7 +74,7 @@ class Shard:
         return f"{self.index}/{self.count}"
 
     def of(self, items: Sequence[WorkItem]) -> list[WorkItem]:
-        """Its items: every n-th, so that all parts get neighbours of each."""
+        """The shard's items: every n-th, so that similar neighbours are in different shards."""
         return list(items[self.index - 1 :: self.count])
 
 
@@ -92,16 +92,16 @@ def find_work(
     """All sequences below the roots, sorted.
 
     Args:
-        roots: ``[DATASET=]PATH``: a folder below which sequences are, a sequence, or ``tour:SEED``. Without DATASET it
-            is the layout's name. "./" before a path with "=" in it keeps it whole.
-        sample: of each data set, take as many at random (all where it has fewer).
-        seed: of the sample: the same names give the same sample, wherever they lie.
-        only: names of sequences (or DATASET/NAME) to take, instead of all; the sample is drawn from them.
-        opening: of all of them; its layout is the only one to look for ("auto": any).
+        roots: ``[DATASET=]PATH``: a folder with sequences below it, a sequence, or ``tour:SEED``. DATASET is the
+            layout's name by default. Write "./" before a path that contains "=".
+        sample: largest number of sequences of each data set, chosen at random; None = all.
+        seed: of the sample, which depends on the names alone and not on folders.
+        only: names of sequences (or DATASET/NAME) to use; the sample is drawn from them. None = all.
+        opening: options of all sequences; only its layout is searched for ("auto" = any).
 
     Raises:
         FileNotFoundError: no such root.
-        ValueError: no sequence below a root, a name in ``only`` that is not there, one name twice in a data set.
+        ValueError: no sequence below a root, an unknown name in ``only``, or one name twice in a data set.
     """
     items = sorted({item for root in roots for item in _below(root, opening)})
     twice = [key for key, n in Counter(item.folder for item in items).items() if n > 1]
@@ -112,12 +112,12 @@ def find_work(
         items = _chosen(items, list(only))
     if sample is None:
         return items
-    taken: list[WorkItem] = []
+    sampled: list[WorkItem] = []
     for dataset in dict.fromkeys(item.dataset for item in items):
         of_dataset = [item for item in items if item.dataset == dataset]
-        # By names, which are sorted: random.sample draws positions.
-        taken += sorted(random.Random(seed).sample(of_dataset, min(sample, len(of_dataset))))
-    return taken
+        # random.sample draws positions in the list, which is sorted by name.
+        sampled += sorted(random.Random(seed).sample(of_dataset, min(sample, len(of_dataset))))
+    return sampled
 
 
 def read_names(file: Path) -> list[str]:
@@ -150,7 +150,7 @@ def _below(root: str, opening: Options) -> list[WorkItem]:
 
 
 def _chosen(items: list[WorkItem], only: list[str]) -> list[WorkItem]:
-    """The items that are named; a name without an item is an error."""
+    """The items with the names ``only``. Raises ValueError: a name without an item."""
     named = {name: [item for item in items if name in (item.sequence, item.label)] for name in only}
     missing = [name for name, chosen in named.items() if not chosen]
     if missing:
@@ -160,6 +160,6 @@ def _chosen(items: list[WorkItem], only: list[str]) -> list[WorkItem]:
 
 
 def _safe(name: str) -> str:
-    """The name where it is fit for a folder, else with dashes and a few digits that keep it unique."""
+    """The name if every file system accepts it, else with dashes and a few hex digits that keep it unique."""
     plain = _UNSAFE.sub("-", name).strip(".-")[:100]
     return name if plain == name else f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"

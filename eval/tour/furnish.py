@@ -1,4 +1,4 @@
-"""Puts furniture, pictures, windows, rugs and lamps into a room, clear of the ways through it."""
+"""Adds furniture, pictures, windows, rugs and lamps to a room, clear of the ways through it."""
 
 from __future__ import annotations
 
@@ -14,19 +14,18 @@ from ufmstar_torch.eval.tour.shapes import Part, ball, box, rotation, tube
 
 Array = NDArray[np.float64]
 
-CLEARANCE = 0.38  # between furniture and any way: 0.3 m for the camera, and the sway of its hand [m]
-OVERHEAD = 2.0  # things whose lower edge is higher than this hang over a way [m]
-LIGHTS = 3  # of a room at most
-_FROM_WALL = 0.02  # the skirting board stands between [m]
-_HALL_FROM = 7.0  # rooms with a side from here on are furnished as halls [m]
+CLEARANCE = 0.38  # smallest distance of furniture from a way: 0.3 m for the camera, and the sway of the hand [m]
+OVERHEAD = 2.0  # objects whose lower edge is higher than this may be above a way [m]
+LIGHTS = 3  # largest number of lights of a room
+_FROM_WALL = 0.02  # distance of furniture from the wall, for the skirting board [m]
+_HALL_FROM = 7.0  # rooms with a side of at least this are furnished as halls [m]
 
 
 def furnish(room: Room, doors: list[Door], way: Array, palette: Palette, rng: np.random.Generator) -> Furnished:
-    """Furnishes a room, whose doors are given, clear of ``way`` [M, 2], x and z of all points where a camera may be
-    [m]."""
+    """Furnish a room with these doors, clear of ``way`` [M, 2], x and z of all points where a camera may be [m]."""
     near = way[((way > room.lower - 1) & (way < room.upper + 1)).all(1)]
     stock = Furnished(room, near, palette, rng)
-    stock.taken += [door.box(0.15, 0.5, 0.1, 0.0) for door in doors]
+    stock.occupied += [door.box(0.15, 0.5, 0.1, 0.0) for door in doors]
     stock.hang_ceiling_lamps()
     if rng.random() < 0.7:
         stock.lay_rug()
@@ -47,13 +46,13 @@ class Furnished:
     palette: Palette
     rng: np.random.Generator
     parts: list[Part] = field(default_factory=list)  # primitives
-    # At most ``LIGHTS`` of lamps and windows: position [m], linear RGB at the distance ``reach`` [m], facing it, reach,
-    # and how far its parts lie apart, which softens shadows [m].
+    # At most ``LIGHTS`` lamps and windows: position [m], linear RGB on a surface that faces it at the distance
+    # ``reach`` [m], reach, and extent, which softens shadows [m].
     lights: list[list[float]] = field(default_factory=list)
-    taken: list[Array] = field(default_factory=list)  # [2, 3] lower and upper corners of the space that is taken [m]
+    occupied: list[Array] = field(default_factory=list)  # [2, 3] lower and upper corners of occupied space [m]
 
     def place_furniture(self) -> None:
-        """Furniture at the walls, in the middle, and chairs around tables."""
+        """Add furniture at the walls and in the middle, and chairs around tables."""
         room, rng = self.room, self.rng
         size = room.upper - room.lower
         large = size.max() >= _HALL_FROM
@@ -70,25 +69,25 @@ class Furnished:
                 spot = rng.uniform(room.lower, room.upper)
             else:
                 spot, yaw = self._at_wall(piece.width * scale)
-            if self._place(piece, spot, yaw, scale):
+            if self._try_place(piece, spot, yaw, scale):
                 placed += 1
                 if piece.name == "table":
                     self._place_chairs(piece, spot, yaw, scale)
 
     def _place_chairs(self, table: Piece, spot: Array, yaw: float, scale: float) -> None:
-        """Chairs around a table that was just placed, pushed under it halfway."""
-        rng, own = self.rng, self.taken[-1]
+        """Add chairs around the table that was placed last, halfway under it."""
+        rng, footprint = self.rng, self.occupied[-1]
         middle = spot + scale * table.depth / 2 * np.array([np.sin(yaw), np.cos(yaw)])
         model, wanted = chair(rng, self.palette), int(rng.integers(1, 4))
         for angle in yaw + np.pi / 2 * rng.permutation(4):
             reach = scale * (0.22 + (table.depth if abs(np.cos(angle - yaw)) > 0.5 else table.width) / 2)
             outward = np.array([np.sin(angle), np.cos(angle)])
             facing = float(angle + np.pi + rng.normal(0, 0.1))
-            if wanted and self._place(model, middle + reach * outward, facing, scale, ignore=own):
+            if wanted and self._try_place(model, middle + reach * outward, facing, scale, ignore=footprint):
                 wanted -= 1
 
     def hang_ceiling_lamps(self) -> None:
-        """One or two lamps, and their light."""
+        """Add one or two lamps, and their light."""
         room, rng, palette = self.room, self.rng, self.palette
         size, style = room.upper - room.lower, room.style
         count = 2 if size.max() > 5 else 1
@@ -112,7 +111,7 @@ class Furnished:
             self.lights.append([x, -room.height + drop + 0.16, z, *color * power, 0.5 * size.mean(), 0.25])
 
     def lay_rug(self) -> None:
-        """A rug, round or not, near the middle."""
+        """Add a round or rectangular rug near the middle."""
         room, rng = self.room, self.rng
         x, z = room.centre + rng.uniform(-0.3, 0.3, 2)
         half = (room.upper - room.lower) * rng.uniform(0.2, 0.32, 2)
@@ -123,7 +122,7 @@ class Furnished:
             self.parts.append(box((x, -0.006, z), (half[0], 0.007, half[1]), finish, yaw=float(rng.normal(0, 0.1))))
 
     def hang_window(self) -> None:
-        """A window with a frame, sometimes with curtains, and its daylight."""
+        """Add a window with a frame, sometimes with curtains, and its daylight."""
         rng, palette = self.rng, self.palette
         w, h = rng.uniform(0.45, 0.8), rng.uniform(0.45, 0.6)
         sill = rng.uniform(0.8, 0.95)
@@ -142,16 +141,16 @@ class Furnished:
         piece = Piece("window", parts, 2 * w + 0.55, 0.1, 2 * h + 0.14)
         for _ in range(8):
             spot, yaw = self._at_wall(piece.width, 0.006)
-            if self._place(piece, spot, yaw, bottom=sill):
-                at = np.array([spot[0], -sill - h, spot[1]]) + 0.35 * np.array([np.sin(yaw), 0.0, np.cos(yaw)])
+            if self._try_place(piece, spot, yaw, bottom=sill):
+                position = np.array([spot[0], -sill - h, spot[1]]) + 0.35 * np.array([np.sin(yaw), 0.0, np.cos(yaw)])
                 if len(self.lights) < LIGHTS:
                     power = 0.55 * float(rng.uniform(*self.room.style.brightness))
                     reach = 0.45 * float((self.room.upper - self.room.lower).mean())
-                    self.lights.append([*at, *np.array([0.88, 0.97, 1.15]) * power, reach, 0.5])
+                    self.lights.append([*position, *np.array([0.88, 0.97, 1.15]) * power, reach, 0.5])
                 return
 
     def hang_picture(self) -> None:
-        """A framed picture, or a clock."""
+        """Add a framed picture, or a clock."""
         rng, palette = self.rng, self.palette
         if rng.random() < 0.15:
             round_ = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -166,21 +165,21 @@ class Furnished:
             piece = Piece("picture", parts, 2 * w, 0.04, 2 * h)
         for _ in range(6):
             spot, yaw = self._at_wall(piece.width, 0.006)
-            if self._place(piece, spot, yaw, bottom=float(rng.uniform(1.3, 1.6))):
+            if self._try_place(piece, spot, yaw, bottom=float(rng.uniform(1.3, 1.6))):
                 return
 
     def _at_wall(self, width: float, gap: float = _FROM_WALL) -> tuple[Array, float]:
-        """A spot at a wall and the yaw that looks away from it."""
+        """A position at a wall and the yaw that faces away from it."""
         room, rng = self.room, self.rng
         axis, sign = int(rng.integers(2)), int(rng.choice([-1, 1]))
         along = 1 - axis
         wall = room.upper[axis] - gap if sign > 0 else room.lower[axis] + gap
         low, high = room.lower[along] + width / 2 + 0.03, room.upper[along] - width / 2 - 0.03
         inward = on_plan(axis, -sign, 0)
-        at = rng.uniform(low, high) if low < high else room.centre[along]
-        return on_plan(axis, wall, at), float(np.arctan2(inward[0], inward[1]))
+        coordinate = rng.uniform(low, high) if low < high else room.centre[along]
+        return on_plan(axis, wall, coordinate), float(np.arctan2(inward[0], inward[1]))
 
-    def _place(
+    def _try_place(
         self,
         piece: Piece,
         spot: Array,
@@ -189,7 +188,7 @@ class Furnished:
         ignore: Array | None = None,
         bottom: float = 0.0,
     ) -> bool:
-        """Adds a piece if there is room for it, whatever stands in the space ``ignore``."""
+        """Add a piece and return True if it fits; overlap with the space ``ignore`` is allowed."""
         room, R = self.room, rotation(1, yaw)
         corners = np.array([[x, z] for x in (-piece.width / 2, piece.width / 2) for z in (0, piece.depth)]) * scale
         ground = corners @ R[np.ix_([0, 2], [0, 2])].T + spot
@@ -199,10 +198,10 @@ class Furnished:
             return False
         if -space[0, 1] > room.height - 0.08 or (bottom < OVERHEAD and self._to_way(low, high) < CLEARANCE):
             return False
-        for other in self.taken:
+        for other in self.occupied:
             if other is not ignore and (space[0] < other[1] + 0.02).all() and (space[1] > other[0] - 0.02).all():
                 return False
-        self.taken.append(space)
+        self.occupied.append(space)
         base = np.array([spot[0], -bottom, spot[1]])
         for p in piece.parts:
             centre, axes = base + R @ (p.centre * scale), R @ p.rotation

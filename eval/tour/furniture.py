@@ -19,9 +19,9 @@ from ufmstar_torch.eval.tour.shapes import Finish, Part, ball, box, tube
 class Piece:
     """A piece of furniture."""
 
-    name: str  # what it is
-    parts: list[Part]  # its primitives
-    width: float  # of the space it takes [m]
+    name: str  # kind
+    parts: list[Part]  # primitives
+    width: float  # of its space [m]
     depth: float
     height: float
 
@@ -40,7 +40,7 @@ def _legs(
 
 
 def _on_top(rng: np.random.Generator, palette: Palette, width: float, z: float, y: float) -> list[Part]:
-    """A few things standing on a surface at height -y."""
+    """A few objects on a surface at height -y."""
     things: list[Part] = []
     for slot in np.linspace(-0.3, 0.3, 3):
         x, what = slot * width + rng.uniform(-0.03, 0.03), int(rng.integers(6))

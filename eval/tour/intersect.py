@@ -1,7 +1,7 @@
-"""Intersections of rays with a tour's surfaces, exactly: closed forms in unit coordinates, in float64.
+"""Exact intersections of rays with a tour's surfaces: closed forms in unit coordinates, in float64.
 
-A ray is origin + t direction, in the unit coordinates of the surface (see ``shapes``); an affine map leaves t
-alone, so with directions of camera z = 1, t is the depth. A miss is infinity.
+A ray is origin + t direction, in the unit coordinates of the surface (see ``shapes``). An affine map does not change t,
+so with directions of camera z = 1, t is the depth. A miss is infinity.
 """
 
 from __future__ import annotations
@@ -14,16 +14,14 @@ from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD
 Scalars = tuple[float, float, float] | tuple[Tensor, Tensor, Tensor]
 Components = tuple[Tensor, Tensor, Tensor]
 
-# Added to directions: turns an exact 0 into a number whose inverse is finite, and leaves all others as they
-# are (they are above 1e-13 or 0).
+# Added to directions: makes the inverse of an exact 0 finite, and does not change others, which are above 1e-13.
 _NOT_ZERO = 1e-30
 _MISS = float("inf")
 
 
 def entry(kind: int, origin: Scalars, direction: Components, taper: float) -> Tensor:
-    """The ray parameter t > 0 at which rays first meet a unit shape (QUAD, BOX, ELLIPSOID or FRUSTUM with its
-    ``taper``) from outside; infinity where they miss it. Origin and direction are x, y, z, the origin common to all
-    rays or one per ray."""
+    """The ray parameter t > 0 at which rays first hit a unit shape (QUAD, BOX, ELLIPSOID or FRUSTUM with its ``taper``)
+    from outside; infinity = miss. Origin and direction are x, y, z; the origin is common to all rays or one per ray."""
     return _ENTRIES[kind](origin, direction, taper)
 
 

@@ -1,4 +1,4 @@
-"""Colours and textures by what a surface is made for: the walls of a room, wood, cloth, ..."""
+"""Colours and textures by the role of a surface: walls of a room, wood, cloth, ..."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ufmstar_torch.eval.tour.style import Range, TourStyle
 
 Color = tuple[float, float, float]
 
-# Textures that show a thing rather than a material; they are used where that thing is meant only.
+# Textures of objects instead of materials; only surfaces of these objects use them.
 _PICTURES = ("books", "painting", "window")
 # The materials of a surface: textures, ranges of saturation and value of its first colour, and of its
 # pattern's period [m].
@@ -37,8 +37,8 @@ class Palette:
     """Draws finishes for one room from its style; the colours of a room's walls and wood stay the same.
 
     Args:
-        style: the room's.
-        rng: where the draws come from.
+        style: of the room.
+        rng: source of random numbers.
     """
 
     def __init__(self, style: TourStyle, rng: np.random.Generator) -> None:
@@ -46,13 +46,13 @@ class Palette:
         self._usual = {role: self._draw(role) for role in ("wood", "cloth", "paint")}
 
     def finish(self, role: str) -> Finish:
-        """A finish for a role; wood, cloth and paint are mostly the room's usual ones."""
+        """A finish for a role; for wood, cloth and paint mostly the room's usual one."""
         if role in self._usual and self._rng.random() < 0.6:
             return self._usual[role]
         return self._draw(role)
 
     def picture(self, texture: str, fallback: str, period: float, glow: float = 0.0) -> Finish:
-        """A surface that shows a thing, where the style has it; else the fallback role."""
+        """A finish with an object's texture, or that of the fallback role if the style has no such texture."""
         if texture not in self._style.textures:
             return self._draw(fallback)
         first, second = self._colors((0.4, 0.8), (0.3, 0.9), (0.0, 1.0))
@@ -65,10 +65,10 @@ class Palette:
         return Finish(texture, color, other, 0.12, glow)
 
     def _draw(self, role: str) -> Finish:
-        wanted, saturation, value, period = _ROLES[role]
-        known = [t for t in wanted if t in self._style.textures]
-        known = known or [t for t in self._style.textures if t not in _PICTURES] or list(self._style.textures)
-        texture = known[int(self._rng.integers(len(known)))]
+        textures, saturation, value, period = _ROLES[role]
+        available = [t for t in textures if t in self._style.textures]
+        available = available or [t for t in self._style.textures if t not in _PICTURES] or list(self._style.textures)
+        texture = available[int(self._rng.integers(len(available)))]
         hues = {"wood": _WOOD_HUES, "leaf": _LEAF_HUES, "wall": _WALL_HUES}.get(role, (0.0, 1.0))
         if role == "floor" and texture == "wood":
             hues = _WOOD_HUES
@@ -76,7 +76,7 @@ class Palette:
         return Finish(texture, first, second, float(self._rng.uniform(*period)) * self._style.scale[0])
 
     def _colors(self, saturation: Range, value: Range, hues: Range) -> tuple[Color, Color]:
-        """A colour, and one that goes with it: as a rule a darker or lighter one of nearly the same hue."""
+        """A colour, and a matching one: mostly darker or lighter with nearly the same hue."""
         rng = self._rng
         h, s, v = rng.uniform(*hues), rng.uniform(*saturation), rng.uniform(*value)
         far = rng.random() < 0.2

@@ -13,24 +13,22 @@ from ufmstar_torch.eval.tour.tour import Tour
 
 Array = NDArray[np.float64]
 
-_STEP, _TURN = 0.16, np.radians(8.0)  # a frame moves about this far [m], or turns about this much [rad]
-_SLOWEST, _FASTEST = 0.5, 1.3  # shares of that pace; with more frames, the way is walked again
-# Shares of a way after which its last room was seen, and after which the camera is back where it began; walked on
-# from there, the first views are seen again.
+_STEP, _TURN = 0.16, np.radians(8.0)  # approximate motion per frame: translation [m] or rotation [rad]
+_SLOWEST, _FASTEST = 0.5, 1.3  # limits of the pace as shares of that motion; with more frames, the way is repeated
+# Shares of a way after which the camera has seen its last room, is back at its start, and has repeated the first views.
 _ENOUGH_TO_SEE, _ENOUGH_TO_RETURN, _ONCE_MORE = 0.6, 0.95, 1.12
-_LOOKAHEAD, _SMOOTH = 0.7, 0.4  # the camera looks at where it will be, with a slow head [m]
-SWAY = 0.04  # of the hand, at most, on either axis [m]
+_LOOKAHEAD, _SMOOTH = 0.7, 0.4  # distance of the point that the camera looks at, and smoothing of its direction [m]
+SWAY = 0.04  # largest sway of the hand on each axis [m]
 _GLANCE, _PITCH, _ROLL = np.radians(22.0), np.radians(4.0), np.radians(1.2)
 
 
 def tour_path(tour: Tour, frames: int, seed: int | None = None, *, pan: bool = False) -> Tensor:
-    """[N, 4, 4] float64 camera-to-world poses [m] of a camera that walks through the rooms and comes back.
+    """[N, 4, 4] float64 camera-to-world poses [m] of a camera that walks through the rooms and returns.
 
-    Without ``seed``, it starts in the first room, walks to the farthest one that the frames allow and back, and
-    once more where it began. (In a tour whose last room has another style it goes there in any case, and turns
-    back only if the frames allow.) With ``seed``, it starts anywhere on the longest way, in either direction. With
-    ``pan``, it stays at the start and turns, with the sway of the hand as its only baseline. Raises ValueError: no
-    frame, or a negative seed.
+    Without ``seed``, the camera starts in the first room, walks to the farthest room that the frames allow and back,
+    and repeats the start. (If the last room has another style, the camera always goes there, and returns only if the
+    frames allow.) With ``seed``, it starts anywhere on the longest way, in either direction. With ``pan``, it stays at
+    the start and turns; the sway of the hand is its only baseline. Raises ValueError: no frame, or a negative seed.
     """
     if frames < 1:
         raise ValueError(f"frames must be at least 1, got {frames}")
@@ -53,9 +51,9 @@ def tour_path(tour: Tour, frames: int, seed: int | None = None, *, pan: bool = F
 
 
 def _way_within(tour: Tour, frames: int) -> tuple[Array, float]:
-    """The way that leads farthest within a number of frames, and which share of it to walk."""
+    """The farthest way within a number of frames, and the share of it to walk."""
     shares = [_FASTEST * frames / float(_effort(way)[-1]) for way in tour.ways]
-    if len(set(tour.room_styles)) > 1:  # the last room is the point of such a tour: see it at any pace
+    if len(set(tour.room_styles)) > 1:  # a tour must reach a last room of another style at any pace
         k = len(tour.ways) - (1 if shares[-1] >= _ONCE_MORE else 2)
         return tour.ways[k], min(_ONCE_MORE, max(shares[k], _ENOUGH_TO_SEE))
     k = max((k for k, share in enumerate(shares) if share >= _ENOUGH_TO_RETURN), default=0)
@@ -63,28 +61,28 @@ def _way_within(tour: Tour, frames: int) -> tuple[Array, float]:
 
 
 def _effort(way: Array) -> Array:
-    """[M + 1] frames needed up to each sample at the usual pace, for the closed way."""
+    """[M + 1] number of frames up to each sample of the closed way at the usual pace."""
     yaw = _gaze(way)
     turned = np.abs(np.diff(np.concatenate([yaw, [_next(yaw)]])))
     return np.concatenate([[0.0], np.cumsum(np.hypot(SPACING / _STEP, turned / _TURN))])
 
 
 def _next(yaw: Array) -> float:
-    """The first yaw again, as the one that follows the last."""
+    """The first yaw, continued after the last one without a jump."""
     return float(yaw[-1] + (yaw[0] - yaw[-1] + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _samples(way: Array, frames: int, share: float) -> Array:
-    """[frames] positions along the way [samples], evenly by effort; several rounds where there is time."""
+    """[frames] positions along the way [samples], evenly by effort; several rounds if the frames allow."""
     effort = _effort(way)
     rounds = max(1, int(frames * _SLOWEST // effort[-1])) if share >= 1 else 1
-    at = rounds * share * effort[-1] * np.arange(frames) / frames
-    whole, rest = np.divmod(at, effort[-1])
+    effort_done = rounds * share * effort[-1] * np.arange(frames) / frames
+    whole, rest = np.divmod(effort_done, effort[-1])
     return whole * len(way) + np.interp(rest, effort, np.arange(len(way) + 1))
 
 
 def _gaze(way: Array) -> Array:
-    """[M] yaw that looks where the way leads, smoothed and continuous [rad]."""
+    """[M] yaw towards a point ahead on the way, smoothed and continuous [rad]."""
     ahead = np.roll(way, -int(_LOOKAHEAD / SPACING), axis=0) - way
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True) + 0.1
     frequency = np.fft.rfftfreq(len(way), SPACING)

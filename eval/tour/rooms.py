@@ -14,10 +14,10 @@ from ufmstar_torch.eval.tour.style import TourStyle
 
 Array = NDArray[np.float64]
 
-# Walls and floors reach this far beyond the edge at which they meet, so that no ray slips between [m].
+# Walls and floors overlap by this at their edges, so that no ray passes between them [m].
 _OVERLAP = 0.02
-_CORNER_TO_DOOR = 0.8  # between a room's corner and the middle of a doorway, at least [m]
-_DOOR_TO_DOOR = 1.5  # between the middles of two doorways of one wall, at least [m]
+_CORNER_TO_DOOR = 0.8  # smallest distance between a room's corner and the middle of a doorway [m]
+_DOOR_TO_DOOR = 1.5  # smallest distance between the middles of two doorways of one wall [m]
 _TRIES = 400
 
 
@@ -28,7 +28,7 @@ class Room:
     lower: Array  # [2] x and z of its corners [m]
     upper: Array
     height: float  # of the ceiling [m]
-    style: TourStyle  # how it is furnished
+    style: TourStyle  # of the furniture
 
     @property
     def centre(self) -> Array:
@@ -57,29 +57,29 @@ class Door:
         """[2] unit vector along the wall, towards larger coordinates."""
         return np.abs(self.normal[::-1])
 
-    def box(self, beside: float, through: float, above: float, below: float) -> Array:
+    def box(self, sideways: float, through: float, above: float, below: float) -> Array:
         """[2, 3] lower and upper corner of a box around the opening: ``through`` to either side of the wall's middle,
-        and so much larger than the opening beside, above and below it [m]."""
-        across = self.along * (self.width / 2 + beside) + np.abs(self.normal) * through
+        and larger than the opening ``sideways``, ``above`` and ``below`` by these margins [m]."""
+        across = self.along * (self.width / 2 + sideways) + np.abs(self.normal) * through
         low, high = self.middle - across, self.middle + across
         return np.array([[low[0], -self.height - above, low[1]], [high[0], below, high[1]]])
 
 
 def on_plan(axis: int, across: float, along: float) -> Array:
-    """[2] x and z of a place, from its coordinates across a wall, on an axis (0 = x, 1 = z), and along it."""
+    """[2] x and z of a point from its coordinates across a wall, on an axis (0 = x, 1 = z), and along it."""
     return np.array([across, along] if axis == 0 else [along, across], dtype=np.float64)
 
 
 def lay_out(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room], list[Door]]:
-    """Draws the rooms; door i joins room i + 1 to an earlier one."""
+    """Draw random rooms; door i joins room i + 1 to an earlier one."""
     count = int(rng.integers(style.rooms[0], style.rooms[1] + 1))
     styles = [style] * (count - 1) + [style.last or style]
     rooms = [_room(styles[0], rng)]
     doors: list[Door] = []
-    for own in styles[1:]:
-        new = _room(own, rng)
+    for room_style in styles[1:]:
+        new = _room(room_style, rng)
         for _ in range(_TRIES):
-            parent = len(rooms) - 1 if rng.random() < 0.75 or own is not style else int(rng.integers(len(rooms)))
+            parent = len(rooms) - 1 if rng.random() < 0.75 or room_style is not style else int(rng.integers(len(rooms)))
             if (attached := _attach(rooms, doors, parent, new, rng)) is not None:
                 rooms.append(attached[0])
                 doors.append(attached[1])
@@ -97,15 +97,15 @@ def _room(style: TourStyle, rng: np.random.Generator) -> Room:
 def _attach(
     rooms: list[Room], doors: list[Door], parent: int, new: Room, rng: np.random.Generator
 ) -> tuple[Room, Door] | None:
-    """The new room moved to a wall of its parent, with a doorway; None where it does not fit."""
+    """The new room moved to a wall of its parent, with a doorway; None if it does not fit."""
     old, size = rooms[parent], new.upper - new.lower
     axis, sign = int(rng.integers(2)), int(rng.choice([-1, 1]))
     thickness, width = float(rng.uniform(0.12, 0.22)), float(rng.uniform(1.0, 1.25))
     along = 1 - axis
     wall = old.upper[axis] if sign > 0 else old.lower[axis]
-    at = rng.uniform(old.lower[along] + _CORNER_TO_DOOR, old.upper[along] - _CORNER_TO_DOOR)
-    start = at - rng.uniform(_CORNER_TO_DOOR, size[along] - _CORNER_TO_DOOR)
-    middle = on_plan(axis, wall + sign * thickness / 2, at)
+    centre = rng.uniform(old.lower[along] + _CORNER_TO_DOOR, old.upper[along] - _CORNER_TO_DOOR)
+    start = centre - rng.uniform(_CORNER_TO_DOOR, size[along] - _CORNER_TO_DOOR)
+    middle = on_plan(axis, wall + sign * thickness / 2, centre)
     lower = on_plan(axis, wall + thickness if sign > 0 else wall - thickness - size[axis], start)
     room = Room(lower, lower + size, new.height, new.style)
     for other in rooms:
@@ -156,18 +156,18 @@ def _wall(room: Room, axis: int, sign: int, doors: list[Door], finish: Finish, b
         centre, half = spot(wall, -0.04, (start + end) / 2), spot(0.012, 0.045, (end - start) / 2)
         return part(BOX, centre, half, board, label="skirting")
 
-    top, at = -room.height - _OVERLAP, float(room.lower[along]) - _OVERLAP
+    top, position = -room.height - _OVERLAP, float(room.lower[along]) - _OVERLAP
     for start, end, height in sorted(openings):
-        yield rectangle(at, start, top, _OVERLAP)
-        yield skirting(at, start)
+        yield rectangle(position, start, top, _OVERLAP)
+        yield skirting(position, start)
         yield rectangle(start, end, top, -height)
-        at = end
-    yield rectangle(at, float(room.upper[along]) + _OVERLAP, top, _OVERLAP)
-    yield skirting(at, float(room.upper[along]) + _OVERLAP)
+        position = end
+    yield rectangle(position, float(room.upper[along]) + _OVERLAP, top, _OVERLAP)
+    yield skirting(position, float(room.upper[along]) + _OVERLAP)
 
 
 def frame(door: Door, finish: Finish) -> Iterator[Part]:
-    """Jambs, head and threshold of a doorway; they line the opening through the whole wall."""
+    """Jambs, head and threshold of a doorway, through the whole wall."""
     n, a = np.abs(door.normal), door.along
     through = door.thickness / 2 + 0.015
 

@@ -1,8 +1,8 @@
-"""Ways through a tour's rooms: round in every room, through the doorways, and back.
+"""Ways through a tour's rooms: around every room, through the doorways, and back.
 
-A way is a uniform cubic B-spline, which stays within the hull of four neighbouring control points. In a room
-they lie on an ellipse round its middle, and in a doorway on its axis, so the way keeps clear of the walls by
-construction; furniture is placed where no way is (see ``furnish``).
+A way is a uniform cubic B-spline, which stays within the hull of four consecutive control points. In a room these are
+on an ellipse around its middle, in a doorway on its axis, so the way is clear of the walls by construction. Furniture
+is placed clear of all ways (see ``furnish``).
 """
 
 from __future__ import annotations
@@ -15,16 +15,19 @@ from ufmstar_torch.eval.tour.rooms import Door, Room
 Array = NDArray[np.float64]
 
 SPACING = 0.02  # of the samples of a way [m]
-_WALL_TO_RING = 1.25  # from the walls to the ellipse, at least, where the room allows it [m]
-_SMALLEST, _LARGEST = 0.35, 0.6  # half axes of the ellipse: at least [m], and at most as a share of the room's half
+_WALL_TO_RING = 1.25  # distance of the ellipse from the walls, if the room is large enough [m]
+_SMALLEST, _LARGEST = (
+    0.35,
+    0.6,
+)  # limits of the ellipse's half axes: smallest [m], largest as a share of the room's half
 _RING_STEP = np.radians(30.0)
 
 
 def ways(rooms: list[Room], doors: list[Door]) -> tuple[Array, ...]:
     """All ways [M, 2] of x and z [m], ``SPACING`` apart, closed (the first point follows the last).
 
-    Way 2 k + 1 goes round in each of the rooms 0 to k and comes back; way 2 k takes the shorter side of every
-    ellipse where it passes through a room. The last one sees the most.
+    Way 2 k + 1 goes around in each of the rooms 0 to k and returns; way 2 k uses the shorter side of the ellipse of
+    every room that it passes through. The last way has the most views.
     """
     routes = []
     for last in range(len(rooms)):
@@ -34,7 +37,7 @@ def ways(rooms: list[Room], doors: list[Door]) -> tuple[Array, ...]:
 
 
 def ring_radii(room: Room) -> Array:
-    """[2] half axes of the ellipse on which the camera goes round in a room [m]."""
+    """[2] half axes of the ellipse on which the camera goes around in a room [m]."""
     half = (room.upper - room.lower) / 2
     return np.minimum(np.maximum(half - _WALL_TO_RING, _SMALLEST), _LARGEST * half)
 
@@ -47,16 +50,16 @@ def _circuit(rooms: list[Room], doors: list[Door], full: bool) -> list[Array]:
         first = entrance or (children[0][1] if children else None)
         start = 0.0 if first is None else _angle(room, first.middle)
         if entrance is None:
-            start += np.pi  # the way begins at the far side, so that the first room is seen before the others
-        at = start
+            start += np.pi  # begin at the far side, so that the camera sees the first room before the others
+        angle = start
         if entrance is not None:
             points.extend(_through(entrance, inward=True))
         for child, door in children:
-            at = _go_round(points, room, at, _angle(room, door.middle), full)
+            angle = _go_round(points, room, angle, _angle(room, door.middle), full)
             points.extend(_through(door, inward=True)[:2])
             visit(child, door)
             points.extend(_through(door, inward=False)[-2:])
-        _go_round(points, room, at, start, full or not children)
+        _go_round(points, room, angle, start, full or not children)
         if entrance is not None:
             points.extend(_through(entrance, inward=False))
 
@@ -78,7 +81,7 @@ def _angle(room: Room, point: Array) -> float:
 
 
 def _go_round(points: list[Array], room: Room, start: float, end: float, full: bool) -> float:
-    """Appends points of a room's ellipse from one parameter to another, the long way if ``full``."""
+    """Append points of a room's ellipse from one parameter to another, on the longer side if ``full``."""
     turn = (end - start + np.pi) % (2 * np.pi) - np.pi
     if full:
         turn += -2 * np.pi if turn > 0 else 2 * np.pi
@@ -91,7 +94,7 @@ def _go_round(points: list[Array], room: Room, start: float, end: float, full: b
 
 
 def _sampled(points: Array) -> Array:
-    """Samples of the closed B-spline with these control points, equally far apart."""
+    """Equally spaced samples of the closed B-spline with these control points."""
     t = np.linspace(0, 1, 64, endpoint=False)[:, None]
     weights = np.stack([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]) / 6
     corners = np.stack([np.roll(points, -k, axis=0) for k in range(4)])  # [4, P, 2]

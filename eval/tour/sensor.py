@@ -1,20 +1,20 @@
-"""From light to a picture: exposure, the response of a display, and what a small camera adds to it."""
+"""From light to a picture: exposure, the response of a display, and the effects of a small camera."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-_GREY, _ADAPTATION, _SPARSE = 0.33, 0.5, 8  # exposure goes half of the way to this mean brightness
+_GREY, _ADAPTATION, _SPARSE = 0.33, 0.5, 8  # target mean brightness, exponent of the exposure, step of sampled pixels
 _SHOULDER = 0.65  # brightness from which highlights are compressed
-_SOFT = 1 - _SHOULDER  # so that the slope is steady there
+_SOFT = 1 - _SHOULDER  # makes the slope continuous at the shoulder
 _EXPOSURE_SPREAD, _VIGNETTE, _SHOT, _READ = 0.08, 0.25, 0.012, 0.006
 
 
 def develop(color: Tensor, seed: int | None = None) -> Tensor:
     """[H, W, 3] uint8 sRGB of linear light [3, H, W], where 1 is white; ``seed`` of the sensor's exposure, vignetting
     and noise, None = none of them."""
-    # A few pixels tell the brightness; so few are summed in one order for any number of threads.
+    # The sum of a few pixels has the same order for any number of threads.
     mean = float(color[:, ::_SPARSE, ::_SPARSE].mean())
     light = (_GREY / max(mean, _GREY / 8)) ** _ADAPTATION * color
     if seed is not None:
@@ -41,7 +41,7 @@ def _sensed(light: Tensor, seed: int) -> Tensor:
 
 
 def _blurred(light: Tensor) -> Tensor:
-    """[C, H, W] with a little of the neighbours in a row."""
+    """[C, H, W] blurred along rows."""
     before = torch.cat([light[..., :1], light[..., :-1]], dim=-1)
     after = torch.cat([light[..., 1:], light[..., -1:]], dim=-1)
     return (before + after + 6 * light) / 8

@@ -29,7 +29,7 @@ def open_tour(name: str) -> FrameSequence:
     of the way), ``pan`` (1: the camera turns in place) and ``sensor`` (1, or 0 for a perfect camera).
 
     Raises:
-        ValueError: another form, an unknown option, or a value that it does not take.
+        ValueError: another form, an unknown option, or an invalid value.
     """
     seed, _, query = name.removeprefix(PREFIX).partition("?")
     if not name.startswith(PREFIX) or not seed.isdecimal():
@@ -60,10 +60,18 @@ def tour_sequence(
     pan: bool = False,
     sensor: bool = True,
 ) -> FrameSequence:
-    """A tour as a sequence; frames are rendered when they are indexed. ``seed`` and ``style`` are those of
-    :func:`make_tour`, ``frames``, ``path_seed`` and ``pan`` of :func:`tour_path`; ``size`` is (H, W), ``fov`` the
-    horizontal field of view [degrees], ``sensor`` adds exposure, vignetting and noise. Raises ValueError: a value is
-    out of its range."""
+    """A tour as a sequence; frames are rendered when they are indexed.
+
+    Args:
+        seed, style: see :func:`make_tour`.
+        frames, path_seed, pan: see :func:`tour_path`.
+        size: (H, W) [px].
+        fov: horizontal field of view [degrees].
+        sensor: True to add exposure, vignetting and noise.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
     if len(size) != 2 or min(size) < 8:
         raise ValueError(f"size must be (H, W) of at least 8 px each, got {size}")
     if not 20 <= fov <= 120:
@@ -105,8 +113,8 @@ def _view(walk: _Renderer, index: int) -> TourView:
 
 
 def export_tour(sequence: FrameSequence, folder: str | Path) -> Path:
-    """Writes a sequence of :func:`tour_sequence` into the generic layout: images/, depth/ (float32 npy [m]), poses.txt
-    and K.txt. Raises FileExistsError: the folder is not empty; ValueError: a frame has no image or no depth."""
+    """Write a sequence of :func:`tour_sequence` in the generic layout: images/, depth/ (float32 npy [m]), poses.txt and
+    K.txt. Raises FileExistsError: the folder is not empty; ValueError: a frame has no image or no depth."""
     from PIL import Image
 
     folder = Path(folder)
@@ -132,7 +140,7 @@ def _whole(text: str, least: int = 0) -> int:
     return int(text)
 
 
-# By option: the argument of ``tour_sequence``, what reads it (ValueError or KeyError where it cannot), and its form.
+# By option: the argument of ``tour_sequence``, its parser (raises ValueError or KeyError), and its form.
 _OPTIONS: dict[str, tuple[str, Callable[[str], Any], str]] = {
     "style": ("style", {style: style for style in STYLES}.__getitem__, f"one of {', '.join(STYLES)}"),
     "frames": ("frames", partial(_whole, least=1), "a number of at least 1"),

@@ -1,4 +1,4 @@
-"""The light that a tour's surfaces send to the camera: texture, Lambert's law, soft shadows, dark corners."""
+"""The light from a tour's surfaces to the camera: texture, Lambert's law, soft shadows, dark corners."""
 
 from __future__ import annotations
 
@@ -13,45 +13,52 @@ from ufmstar_torch.eval.tour.style import TEXTURES
 from ufmstar_torch.eval.tour.texture import Patch, albedo
 from ufmstar_torch.eval.tour.tour import Tour
 
-_AMBIENT = 0.42  # light from everywhere, as a share of the lamps'
-_BEFORE = 0.1  # how far before a surface its shadow is looked up [m]
-_CORNER, _DARKNESS = 0.22, 0.3  # how far corners are darker [m], and by how much
+_AMBIENT = 0.42  # ambient light as a share of the lamps'
+_BEFORE = 0.1  # distance in front of a surface at which its shadow is sampled [m]
+_CORNER, _DARKNESS = 0.22, 0.3  # range of darker corners [m], and their darkening
 _TEXTURES = len(TEXTURES)
-Span = tuple[int, int, int]  # a value, and the first and last-but-one pixel that has it
-_CAP = 1e-3  # how near to a frustum's end a point is on its cap, in unit coordinates
+Span = tuple[int, int, int]  # a value, its first pixel, and the end of its pixels (exclusive)
+_CAP = 1e-3  # distance from a frustum's end within which a point is on its cap, in unit coordinates
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """The points that pixels see; P of them, float32, pixels of the same room, kind and texture side by side."""
+    """The points seen by P pixels, float32, sorted by room, kind and texture."""
 
     surface: Tensor  # [P] int64
     point: Tensor  # [3, P] [m]
     normal: Tensor  # [3, P] unit, towards the camera
     uv: Tensor  # [2, P] coordinates on the surface [m]
-    footprint: Tensor  # [P] size of a pixel there [m]
+    footprint: Tensor  # [P] size of a pixel on the surface [m]
 
 
 def shade(tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin: Tensor, pixel_angle: float) -> Tensor:
-    """[3, P] linear RGB, about 0 to 1, of pixels that see the primitives ``surface`` [P] int64 of a tour at ``depth``
-    [P] float32 along z [m], on rays ``direction`` [3, P] float32 (of depth 1) from ``origin`` [3] [m]; ``pixel_angle``
-    is the size of a pixel at depth 1 [m]."""
+    """[3, P] linear RGB, about 0 to 1, of pixels.
+
+    Args:
+        tour: the rooms.
+        surface: [P] int64 primitives that the pixels see.
+        depth: [P] float32 along z [m].
+        direction: [3, P] float32 rays (of depth 1).
+        origin: [3] of the rays [m].
+        pixel_angle: size of a pixel at depth 1 [m].
+    """
     s = tour.surfaces
     group, order = torch.sort((s.rooms[:, 0] * 4 + s.kind)[surface] * _TEXTURES + s.texture[surface], stable=True)
     values, counts = torch.unique_consecutive(group, return_counts=True)
     ends = torch.cumsum(counts, 0).tolist()
     spans = [(value, end - n, end) for value, end, n in zip(values.tolist(), ends, counts.tolist(), strict=True)]
-    own = surface[order]
+    sorted_surface = surface[order]
     kinds, rooms = _merged(spans, _TEXTURES), _merged(spans, 4 * _TEXTURES)
-    hits = _hits(tour, own, depth[order], direction.index_select(1, order), origin, pixel_angle, kinds)
+    hits = _hits(tour, sorted_surface, depth[order], direction.index_select(1, order), origin, pixel_angle, kinds)
     lit = [_light(tour, room, hits.point[:, a:b], hits.normal[:, a:b]) for room, a, b in rooms]
-    light = torch.maximum(torch.cat(lit, dim=1), s.look[:, 7][own])
+    light = torch.maximum(torch.cat(lit, dim=1), s.appearance[:, 7][sorted_surface])
     radiance = torch.empty_like(light)
     return radiance.index_copy_(1, order, _albedo(tour, hits, spans) * light)
 
 
 def _merged(spans: list[Span], divisor: int) -> list[Span]:
-    """Neighbouring spans whose values agree after division."""
+    """Merge adjacent spans whose values are equal after division."""
     merged: list[Span] = []
     for value, start, end in spans:
         if merged and merged[-1][0] == value // divisor:
@@ -81,7 +88,7 @@ def _hits(
 
 
 def _quad(q: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
-    """Coordinates from the world's origin, so that patterns go on from one piece of a wall to the next."""
+    """Coordinates from the world's origin, so that patterns continue between pieces of a wall."""
     R, centre = g[:9].view(3, 3, -1), g[9:12]
     normal = torch.zeros_like(q)
     normal[1] = -1
@@ -119,25 +126,25 @@ _LOCAL = {QUAD: _quad, BOX: _box, ELLIPSOID: _ellipsoid, FRUSTUM: _frustum}
 
 
 def _albedo(tour: Tour, hits: Hits, spans: list[Span]) -> Tensor:
-    look = tour.surfaces.look.T.contiguous().index_select(1, hits.surface)
-    own = hits.uv / look[6]
-    shifted, pixel = own + look[8:10], hits.footprint / look[6]
+    appearance = tour.surfaces.appearance.T.contiguous().index_select(1, hits.surface)
+    local = hits.uv / appearance[6]
+    shifted, pixel = local + appearance[8:10], hits.footprint / appearance[6]
     colours = []
     for value, start, end in spans:
         part = slice(start, end)
         u, v = shifted[:, part]
-        own_u, own_v = own[:, part]
-        patch = Patch(u, v, own_u, own_v, pixel[part], look[:3, part], look[3:6, part], tour.noise)
+        local_u, local_v = local[:, part]
+        patch = Patch(u, v, local_u, local_v, pixel[part], appearance[:3, part], appearance[3:6, part], tour.noise)
         colours.append(albedo(value % _TEXTURES, patch))
     return torch.cat(colours, dim=1)
 
 
 def _light(tour: Tour, room: int, point: Tensor, normal: Tensor) -> Tensor:
-    """[3, P] what a room's lamps and the light from everywhere bring to its surfaces."""
+    """[3, P] light of a room's lamps and ambient light on its surfaces."""
     lower, upper = tour.rooms[room].float()
-    before = ((point + _BEFORE * normal - lower[:, None]) / (upper - lower)[:, None] * 2 - 1).T
+    sample = ((point + _BEFORE * normal - lower[:, None]) / (upper - lower)[:, None] * 2 - 1).T
     reached = grid_sample(
-        tour.volumes[room][None], before[None, None, None], align_corners=True, padding_mode="border"
+        tour.volumes[room][None], sample[None, None, None], align_corners=True, padding_mode="border"
     )[0, :, 0, 0]
     lamps = tour.lights[room]
     ambient = _AMBIENT * lamps[:, 3:6].sum(0)
@@ -152,7 +159,7 @@ def _light(tour: Tour, room: int, point: Tensor, normal: Tensor) -> Tensor:
 
 
 def _corners(point: Tensor, normal: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """[P] darker where another wall, the floor or the ceiling is near."""
+    """[P] factor of ambient light, smaller near another wall, the floor or the ceiling."""
     open_ = torch.ones_like(point[0])
     for k in range(3):
         near = torch.minimum(point[k] - lower[k], upper[k] - point[k]).clamp_min(0)

@@ -26,13 +26,13 @@ NOBODY = -1
 
 @dataclass(frozen=True)
 class Finish:
-    """The look of a surface: texture and colours."""
+    """The appearance of a surface: texture and colours."""
 
     texture: str = "plain"  # one of ``TEXTURES``
-    first: tuple[float, float, float] = (0.5, 0.5, 0.5)  # its two colours, linear RGB in [0, 1]
+    first: tuple[float, float, float] = (0.5, 0.5, 0.5)  # the two colours, linear RGB in [0, 1]
     second: tuple[float, float, float] = (0.3, 0.3, 0.3)
     period: float = 0.3  # of the pattern [m]
-    glow: float = 0.0  # light of its own, 0 = none
+    glow: float = 0.0  # emitted light, 0 = none
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,17 +41,17 @@ class Part:
 
     kind: int  # QUAD, BOX, ELLIPSOID or FRUSTUM
     centre: Array  # [3] [m]
-    half: Array  # [3] half its extent along its own axes [m]; a quad's is (x, 1, z)
-    finish: Finish  # how it looks
+    half: Array  # [3] half extents along its axes [m]; a quad's is (x, 1, z)
+    finish: Finish
     rotation: Array  # [3, 3] its axes in the world, as columns
     taper: float = 1.0  # of a frustum
-    rooms: tuple[int, int] = (0, NOBODY)  # the one or two rooms from which it can be seen directly
-    label: str = ""  # what it is part of
+    rooms: tuple[int, int] = (0, NOBODY)  # the one or two rooms from which it is directly visible
+    label: str = ""  # name of the piece to which it belongs
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """The primitives of a tour as tensors; N of them."""
+    """The N primitives of a tour as tensors."""
 
     kind: Tensor  # [N] int64
     centre: Tensor  # [N, 3] float64 [m]
@@ -61,7 +61,7 @@ class Surfaces:
     rooms: Tensor  # [N, 2] int64
     texture: Tensor  # [N] int64, index into ``TEXTURES``
     corners: Tensor  # [N, 8, 3] float64 of the boxes around them, by signs along x, y, z as binary digits [m]
-    look: Tensor  # [N, 10] float32: two colours, period [m], glow, and two random offsets of the pattern [m]
+    appearance: Tensor  # [N, 10] float32: two colours, period [m], glow, and two random offsets of the pattern [m]
 
 
 def part(
@@ -105,10 +105,10 @@ def rotation(axis: int, angle: float) -> Array:
 
 
 def surfaces(parts: Sequence[Part], rng: np.random.Generator) -> Surfaces:
-    """The tensors of a list of primitives; ``rng`` shifts every pattern by its own offset."""
+    """The tensors of a list of primitives; ``rng`` shifts every pattern by a random offset."""
     offsets = rng.uniform(0.0, 7.0, (len(parts), 2))
     finishes = [p.finish for p in parts]
-    looks = [[*f.first, *f.second, f.period, f.glow, *at] for f, at in zip(finishes, offsets, strict=True)]
+    appearance = [[*f.first, *f.second, f.period, f.glow, *offset] for f, offset in zip(finishes, offsets, strict=True)]
     return Surfaces(
         kind=torch.tensor([p.kind for p in parts]),
         centre=torch.tensor(np.array([p.centre for p in parts])),
@@ -118,7 +118,7 @@ def surfaces(parts: Sequence[Part], rng: np.random.Generator) -> Surfaces:
         rooms=torch.tensor([p.rooms for p in parts]),
         texture=torch.tensor([TEXTURES.index(finish.texture) for finish in finishes]),
         corners=torch.tensor(np.array([_around(p) for p in parts])),
-        look=torch.tensor(looks, dtype=torch.float32),
+        appearance=torch.tensor(appearance, dtype=torch.float32),
     )
 
 

@@ -1,9 +1,9 @@
 """The styles of a tour's rooms: sizes, surfaces and light.
 
-``home`` is the distribution that a network can be trained on; ``hall`` lies outside of it: larger rooms and
-things, darker and colder light, and textures that no home has. ``mixed`` begins at home and ends in a hall. ``blank``
-is a home of plain surfaces, full of furniture: most walls and floors show nothing to measure. ``scales`` is a hall
-with furniture from a doll's size to the usual one.
+``home`` is the distribution for training networks. ``hall`` is outside of it: larger rooms and objects, darker and
+colder light, and textures that no home has. ``mixed`` begins in a home and ends in a hall. ``blank`` is a home of plain
+surfaces, full of furniture: most walls and floors have no features. ``scales`` is a hall with furniture from a doll's
+size to the usual one.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 Range = tuple[float, float]
 
-# The two sets are disjoint on purpose: a texture of the second is something a network never saw.
+# The two sets are disjoint, so that a network trained on homes has never seen a texture of a hall.
 HOME_TEXTURES = (
     "plain", "plaster", "wood", "checks", "stripes", "tiles", "bricks", "fabric", "books", "painting", "window"
 )  # fmt: skip
@@ -22,10 +22,10 @@ TEXTURES = HOME_TEXTURES + HALL_TEXTURES
 
 @dataclass(frozen=True)
 class TourStyle:
-    """Sizes and looks of a tour's rooms; ranges are (lowest, highest), drawn uniformly."""
+    """Sizes and appearance of a tour's rooms; ranges are (lowest, highest), drawn uniformly."""
 
-    name: str = "home"  # of the rooms' style
-    textures: tuple[str, ...] = HOME_TEXTURES  # the names of the surface textures that occur
+    name: str = "home"  # of the style
+    textures: tuple[str, ...] = HOME_TEXTURES  # names of the surface textures
     rooms: tuple[int, int] = (3, 5)  # number of rooms, lowest and highest
     room_size: Range = (3.2, 6.0)  # side of a room [m]
     ceiling: Range = (2.3, 3.0)  # its height [m]

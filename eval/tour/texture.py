@@ -1,7 +1,7 @@
-"""Patterns of surfaces, evaluated where a pixel looks, softened to the size of a pixel.
+"""Patterns of surfaces, evaluated at the point of a pixel and softened to the size of a pixel.
 
-Coordinates are in periods of the pattern; ``pixel`` is a pixel's size in them, so that edges are as soft as a
-camera would see them, and patterns too fine to be seen fade to their mean.
+Coordinates are in periods of the pattern. ``pixel`` is a pixel's size in these coordinates: edges are as soft as in a
+camera's image, and patterns finer than a pixel fade to their mean.
 """
 
 from __future__ import annotations
@@ -12,26 +12,26 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_CELLS, _FINE = 64, 8  # noise repeats after so many cells, of so many table entries a side
+_CELLS, _FINE = 64, 8  # number of cells after which noise repeats, and table entries per side of a cell
 _SIDE = _CELLS * _FINE
 _POSITIVE = 4096.0  # cells added so that truncation rounds down; a multiple of _CELLS
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Pixels that see one kind of texture; P of them."""
+    """P pixels that see one kind of texture."""
 
     u: Tensor  # [P] coordinates on the surface [periods], shifted at random
     v: Tensor
-    own_u: Tensor  # [P] the same from the surface's middle
-    own_v: Tensor
-    pixel: Tensor  # [P] size of a pixel there [periods]
+    local_u: Tensor  # [P] coordinates without the random shift
+    local_v: Tensor
+    pixel: Tensor  # [P] size of a pixel on the surface [periods]
     first: Tensor  # [3, P] the texture's colours
     second: Tensor
     table: Tensor  # see :func:`noise_table`
 
     def mixed(self, share: Tensor, mean: float = 0.5) -> Tensor:
-        """[3, P] from the first to the second colour; ``mean`` where the pattern is too fine to be seen."""
+        """[3, P] from the first to the second colour by ``share``, or by ``mean`` if the pattern is too fine."""
         return self.first + (self.second - self.first) * (mean + (share - mean) * self.seen())
 
     def gain(self, values: Tensor, contrast: float) -> Tensor:
@@ -39,7 +39,7 @@ class Patch:
         return 1 + contrast * self.seen() * (values - 0.5)
 
     def seen(self) -> Tensor:
-        """[P] how far the pattern is seen: 1 = sharp, 0 = too fine."""
+        """[P] visibility of the pattern: 1 = sharp, 0 = too fine."""
         return (1.6 - 2.0 * self.pixel).clamp(0, 1)
 
     def noise(self, u: Tensor, v: Tensor) -> Tensor:
@@ -49,7 +49,7 @@ class Patch:
 
 
 def noise_table() -> Tensor:
-    """[512 * 512] smooth noise whose value in each cell's first corner is a random number of its own."""
+    """[512 * 512] smooth noise with a random value at the first corner of each cell."""
     corners = torch.rand(_CELLS, _CELLS, generator=torch.Generator().manual_seed(3))
     share = torch.arange(_FINE) / _FINE
     share = share * share * (3 - 2 * share)
@@ -59,7 +59,7 @@ def noise_table() -> Tensor:
 
 
 def albedo(texture: int, patch: Patch) -> Tensor:
-    """[3, P] linear RGB in [0, 1] of a texture, given as an index into ``TEXTURES``."""
+    """[3, P] linear RGB in [0, 1] of a texture, an index into ``TEXTURES``."""
     return _PATTERNS[texture](patch).clamp(0, 1)
 
 
@@ -128,18 +128,18 @@ def _fabric(p: Patch) -> Tensor:
 def _books(p: Patch) -> Tensor:
     i = p.u.floor()
     spine = torch.stack([p.noise(i, torch.full_like(i, k)) for k in (1, 2, 3)])
-    band = 1 - 0.5 * _soft(0.12 - (p.own_v - 1.2).abs(), p.pixel)
+    band = 1 - 0.5 * _soft(0.12 - (p.local_v - 1.2).abs(), p.pixel)
     gap = 0.3 + 0.7 * _soft(_to_edge(p.u) - 0.08, p.pixel)
     return (0.1 + 0.6 * spine**1.5 + 0.2 * p.first) * (band * gap)
 
 
 def _painting(p: Patch) -> Tensor:
-    """Hills before a sky, or coloured fields, by the surface's random shift."""
-    shift = p.u - p.own_u
-    tall = 0.12 * torch.sin(p.own_u * 5 + shift) + 0.06 * torch.sin(p.own_u * 13 + 2)
-    hill = _soft(p.own_v - tall, p.pixel)
-    sun = _soft(0.1 - ((p.own_u - 0.4 * torch.sin(shift)) ** 2 + (p.own_v + 0.2) ** 2).sqrt(), p.pixel)
-    sky = p.first * (0.7 - 0.5 * p.own_v)
+    """Hills and a sky, or coloured fields, chosen by the surface's random shift."""
+    shift = p.u - p.local_u
+    tall = 0.12 * torch.sin(p.local_u * 5 + shift) + 0.06 * torch.sin(p.local_u * 13 + 2)
+    hill = _soft(p.local_v - tall, p.pixel)
+    sun = _soft(0.1 - ((p.local_u - 0.4 * torch.sin(shift)) ** 2 + (p.local_v + 0.2) ** 2).sqrt(), p.pixel)
+    sky = p.first * (0.7 - 0.5 * p.local_v)
     ground = p.second * (0.5 + 0.5 * p.noise(p.u * 9, p.v * 9))
     landscape = (sky * (1 - hill) + ground * hill) * (1 - sun) + (1 - p.second * 0.3) * sun
     field = p.noise((p.u * 3).floor(), (p.v * 2.2).floor())
@@ -153,7 +153,7 @@ def _window(p: Patch) -> Tensor:
     sky = torch.stack([0.45 + 0.4 * cloud, 0.62 + 0.28 * cloud, 0.9 + 0.05 * cloud])
     leaves = 0.4 + 0.6 * p.noise(p.u * 14, p.v * 14)
     tree = torch.stack([0.12 * leaves, 0.25 * leaves, 0.08 * leaves])
-    skyline = _soft(p.own_v - 0.12 - 0.35 * (p.noise(p.u * 2.5, p.v * 0) - 0.5), p.pixel)
+    skyline = _soft(p.local_v - 0.12 - 0.35 * (p.noise(p.u * 2.5, p.v * 0) - 0.5), p.pixel)
     return sky * (1 - skyline) + tree * skyline
 
 
@@ -180,7 +180,7 @@ def _terrazzo(p: Patch) -> Tensor:
 
 
 def _hexagons(p: Patch) -> Tensor:
-    """Distance to the border of hexagonal cells: two rectangular grids of centres, the nearer one counts."""
+    """Distance to the border of hexagonal cells, from the nearer of two rectangular grids of centres."""
     r = 3.0**0.5
     edges = []
     for shift in (0.0, 0.5):

@@ -21,8 +21,8 @@ from ufmstar_torch.eval.tour.volume import light_volumes
 
 Array = NDArray[np.float64]
 
-_DARK = [*[0.0] * 6, 1.0, 0.0]  # a light that is none, see ``Furnished.lights``
-# A doorway lets see at most what its opening and its frame enclose, and a bit more [m].
+_DARK = [*[0.0] * 6, 1.0, 0.0]  # an unused light, see ``Furnished.lights``
+# Margin of the box around a doorway's opening and frame [m].
 _FRAME = 0.12
 _SHADOWLESS = ("window", "picture", "clock", "skirting")  # flat on the wall
 
@@ -38,19 +38,19 @@ class Tour:
     surfaces: Surfaces  # the primitives
     lights: Tensor  # [R, L, 7] float32: position [m], linear RGB, reach [m]; unused ones are dark
     volumes: Tensor  # [R, L, Y, Z, X] float32 share of each light that reaches a grid of points in the room
-    noise: Tensor  # behind the textures, see ``texture.noise_table``
+    noise: Tensor  # of the textures, see ``texture.noise_table``
     ways: tuple[Array, ...]  # [M, 2] float64 closed ways of x and z [m], see ``route.ways``
     camera_height: float  # above the floor [m]
 
 
 @lru_cache(maxsize=8, typed=True)  # True is no seed
 def make_tour(seed: int, style: str = "home") -> Tour:
-    """Makes the rooms of a seed, the same ones everywhere, in one of ``STYLES``. Raises ValueError: a negative seed, or
-    no such style."""
+    """Make the rooms of a seed in one of ``STYLES``, equal on every machine. Raises ValueError: a negative seed, or no
+    such style."""
     if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
         raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
     chosen = style_of(style)
-    # Each part of a tour has its own random numbers, so that one can change without the others.
+    # Each part of a tour has a separate generator, so that it can change without the others.
     plan, height, looks, things, shifts = (np.random.default_rng([seed, number]) for number in range(5))
     rooms, doors = lay_out(chosen, plan)
     routes = ways(rooms, doors)
@@ -58,7 +58,7 @@ def make_tour(seed: int, style: str = "home") -> Tour:
     table = surfaces(parts, shifts)
     corners = torch.tensor(np.array([room.box for room in rooms]))
     openings = [door.box(_FRAME, door.thickness / 2 + _FRAME, _FRAME, _FRAME) for door in doors]
-    rows = torch.tensor([[*own, *[_DARK] * (LIGHTS - len(own))] for own in lights], dtype=torch.float32)
+    rows = torch.tensor([[*lamps, *[_DARK] * (LIGHTS - len(lamps))] for lamps in lights], dtype=torch.float32)
     light_table, sizes = rows[..., :7].contiguous(), rows[..., 7]
     casts = torch.tensor([p.kind != QUAD and p.finish.glow == 0 and p.label not in _SHADOWLESS for p in parts])
     return Tour(
@@ -83,9 +83,9 @@ def _fill(
     lights: list[list[list[float]]] = []
     palettes = [Palette(room.style, looks) for room in rooms]
     for index, room in enumerate(rooms):
-        own = [door for door in doors if index in door.rooms]
-        shell_parts = list(shell(room, own, palettes[index]))
-        stock = furnish(room, own, way, palettes[index], things)
+        room_doors = [door for door in doors if index in door.rooms]
+        shell_parts = list(shell(room, room_doors, palettes[index]))
+        stock = furnish(room, room_doors, way, palettes[index], things)
         parts += [replace(p, rooms=(index, NOBODY)) for p in shell_parts + stock.parts]
         lights.append(stock.lights)
     for door in doors:

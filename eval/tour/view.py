@@ -1,4 +1,4 @@
-"""``render``: what a camera in a tour sees, with exact depth."""
+"""``render``: a camera's image of a tour, with exact depth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class TourView:
 
     image: Tensor  # [H, W, 3] uint8 RGB
     depth: Tensor  # [H, W] float64 along z [m]
-    surface: Tensor  # [H, W] int64 which primitive, -1 where there is none (nowhere, inside of a room)
+    surface: Tensor  # [H, W] int64 index of the primitive, -1 = none (which does not occur inside a room)
 
 
 def intrinsics(height: int, width: int, fov_degrees: float = 70.0) -> NDArray[np.float64]:
@@ -35,9 +35,9 @@ def intrinsics(height: int, width: int, fov_degrees: float = 70.0) -> NDArray[np
 def render(
     tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int, *, frame_seed: int | None = None
 ) -> TourView:
-    """Renders one view from a pose [4, 4] (camera-to-world, x right, y down, z forward [m]) with intrinsics [3, 3]
-    [px]. ``frame_seed`` adds what a sensor does (exposure, vignetting, noise). Raises ValueError: a malformed pose,
-    intrinsics or size, or a camera outside of every room."""
+    """Render one view from a pose [4, 4] (camera-to-world, x right, y down, z forward [m]) with intrinsics [3, 3] [px].
+    ``frame_seed`` adds a sensor's exposure, vignetting and noise. Raises ValueError: a malformed pose, intrinsics or
+    size, or a camera outside of all rooms."""
     pose, intrinsics = _checked(tour, T_world_cam, K, height, width)
     depth, surface = cast(tour, pose, intrinsics, height, width)
     valid = surface >= 0
@@ -53,8 +53,8 @@ def render(
 
 
 def cast(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Depth [H, W] float64 [m], infinite where nothing is, and the primitives seen [H, W] int64, -1 for none; arguments
-    as of :func:`render`."""
+    """Depth [H, W] float64 [m], infinite without a surface, and the visible primitives [H, W] int64, -1 = none;
+    arguments as for :func:`render`."""
     seen = surface_windows(tour.surfaces.corners, T_world_cam, K, height, width)
     u, v = _pixels(height, width)
     depth = torch.full((height, width), float("inf"), dtype=torch.float64)

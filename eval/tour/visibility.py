@@ -1,14 +1,14 @@
-"""Visibility: the part of the image that each primitive can touch."""
+"""Visibility: the part of the image that each primitive can cover."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-# Outlines are cut at this depth [m]: what is nearer lies thousands of pixels beside the image, as a camera
-# keeps away from everything.
+# Outlines are cut at this depth [m]. Cameras are never near a surface, so nearer parts are thousands of pixels outside
+# of the image.
 _NEAR = 1e-3
-# Corners are numbered by their signs along x, y, z as binary digits; edges join those that differ in one.
+# The number of a corner has its signs along x, y, z as binary digits; edges join corners that differ in one digit.
 _EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
 Window = tuple[int, int, int, int]
 
@@ -16,8 +16,8 @@ Window = tuple[int, int, int, int]
 def surface_windows(
     corners: Tensor, T_world_cam: Tensor, K: Tensor, height: int, width: int
 ) -> list[tuple[int, Window]]:
-    """The primitives that can be seen, with the first and last-but-one row and column that each can touch: those of the
-    outline of its corners [N, 8, 3] [m], cut where they pass the camera."""
+    """The visible primitives, with the range of rows and columns (start, end exclusive) that each can cover, from the
+    outline of its corners [N, 8, 3] [m], cut at the near plane."""
     R, p = T_world_cam[:3, :3].tolist(), (corners - T_world_cam[:3, 3]).unbind(-1)
     x, y, z = (p[0] * R[0][k] + p[1] * R[1][k] + p[2] * R[2][k] for k in range(3))  # R^T (p - t)
     start, end = [a for a, _ in _EDGES], [b for _, b in _EDGES]

@@ -1,6 +1,6 @@
-"""The share of each light that reaches a grid of points in a room: soft shadows for the price of a lookup.
+"""The share of each light that reaches a grid of points in a room, for soft shadows by interpolation.
 
-Computed once per tour with shadow rays; a surface looks up a point a little before it.
+It is computed once per tour with shadow rays; a surface samples it slightly in front.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from ufmstar_torch.eval.tour.intersect import Components, entry
 from ufmstar_torch.eval.tour.shapes import NOBODY, Surfaces
 
 GRID = (14, 22, 22)  # points of a room along y, z, x
-# Where a light's rays end, as parts of its size: the corners of a tetrahedron.
+# Sample points of a light in units of its size: the corners of a tetrahedron.
 _SAMPLES = ((1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, -1.0, -1.0))
-# A surface nearer to a lamp would shade half of the room, and casts no shadow [m].
+# A surface nearer to a lamp than this casts no shadow, which would cover half of the room [m].
 _TOO_NEAR = 0.5
-_SMALL = 0.05  # half extents below this cast no shadow worth a ray [m]
+_SMALL = 0.05  # primitives with smaller half extents cast no shadow [m]
 
 
 def light_volumes(rooms: Tensor, surfaces: Surfaces, lights: Tensor, sizes: Tensor, casts: Tensor) -> Tensor:
     """[R, L, *GRID] float32 share of each light in [0, 1] at the points of rooms with corners [R, 2, 3] [m]. The lights
-    [R, L, 7] (positions first [m]) have the sizes [R, L] [m]; ``casts`` [N] bool: which surfaces cast a shadow."""
+    [R, L, 7] (positions first [m]) have the sizes [R, L] [m]; ``casts`` [N] is True for surfaces that cast shadows."""
     volume = torch.ones(*lights.shape[:2], *GRID)
     for r, (lower, upper) in enumerate(rooms.float()):
         x, y, z = (lower[k] + (upper[k] - lower[k]) * torch.linspace(0, 1, GRID[n]) for k, n in enumerate((2, 0, 1)))
@@ -39,17 +39,17 @@ def light_volumes(rooms: Tensor, surfaces: Surfaces, lights: Tensor, sizes: Tens
 
 
 def _casters(surfaces: Surfaces, casts: Tensor, room: int) -> list[int]:
-    own = (surfaces.rooms[:, 0] == room) & (surfaces.rooms[:, 1] == NOBODY) & casts
+    in_room = (surfaces.rooms[:, 0] == room) & (surfaces.rooms[:, 1] == NOBODY) & casts
     large = surfaces.half.sort(dim=1).values[:, 1] > _SMALL
-    return [int(i) for i in torch.nonzero(own & large).flatten()]
+    return [int(i) for i in torch.nonzero(in_room & large).flatten()]
 
 
 def _visible(points: Components, lamp: Tensor, surfaces: Surfaces, casters: list[int]) -> Tensor:
-    """[*GRID] 1.0 where nothing stands between a point and a lamp [3]; ``points`` are x, y, z that broadcast."""
+    """[*GRID] 1.0 where no caster is between a point and a lamp [3]; ``points`` are x, y, z that broadcast."""
     to_x, to_y, to_z = (points[k] - lamp[k] for k in range(3))
     distance = (to_x * to_x + to_y * to_y + to_z * to_z).sqrt()
     free = torch.ones(GRID)
-    # From the lamp to the points: a point may be inside of something.
+    # Rays from the lamp to the points, because a point may be inside a primitive.
     for i in casters:
         axes = (surfaces.rotation[i].float() / surfaces.half[i].float()).T.tolist()
         to_lamp = (lamp - surfaces.centre[i].float()).tolist()

@@ -152,7 +152,7 @@ class AnchorInput:
     scale: Tensor | None = None
 
 
-def check_anchors(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor] = ()) -> AnchorInput:
+def check_anchors(anchors: Anchors, frame: FrameInput, network_variances: Sequence[Tensor] = ()) -> AnchorInput:
     """Anchors of one frame, ready to be used; in float64 on the depth's device.
 
     An anchor is not valid whose values are impossible, which lies beside the image or on a pixel without a depth, whose
@@ -161,7 +161,7 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor] = (
     Args:
         anchors: see :class:`Anchors`.
         frame: B streams, the same.
-        own: the network's own variances that count, A and E, each [B, H, W] [m^2].
+        network_variances: the network's own variances that count, A and E, each [B, H, W] [m^2].
 
     Raises:
         TypeError: something else than anchors; a field is no tensor or of the wrong kind of dtype.
@@ -176,20 +176,22 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor] = (
     depth = require_float("anchors.depth", anchors.depth, shape, frame.depth).detach().double()
     variance = require_float("anchors.variance", anchors.variance, shape, frame.depth).detach().double()
     # Compared as standard deviations: the square of a large depth overflows.
-    known = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & _inside(pixel, frame.size)
+    usable = (
+        (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & _inside(pixel, frame.size)
+    )
     if anchors.valid is not None:
-        known = known & require_mask("anchors.valid", anchors.valid, shape, frame.depth)
+        usable = usable & require_mask("anchors.valid", anchors.valid, shape, frame.depth)
     for name in ("pose_error", "shared", "scale"):
         if (of_frame := getattr(anchors, name)) is not None:
             require_float(f"anchors.{name}", of_frame, [(b,)], frame.depth)
     one, zero = torch.ones_like(depth), torch.zeros_like(depth)
-    pixel = torch.where(known[..., None], pixel, zero[..., None])
+    pixel = torch.where(usable[..., None], pixel, zero[..., None])
     u, v = pixel.round().long().unbind(-1)
     index = v * frame.size[1] + u
     predicted = torch.gather(frame.depth.flatten(1), 1, index).double()
-    known = known & torch.gather(frame.valid.flatten(1), 1, index)
+    usable = usable & torch.gather(frame.valid.flatten(1), 1, index)
     near = (depth <= FARTHEST_OFF * predicted) & (predicted <= FARTHEST_OFF * depth)
-    valid, far = known & near, known & ~near
+    valid, far = usable & near, usable & ~near
     rejected = far.sum(1)
     square = torch.where(far, (depth / predicted - 1).clamp_max(FARTHEST_OFF).square(), zero).sum(1)
     many = (rejected > FEW) & (rejected > valid.sum(1))
@@ -199,7 +201,7 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor] = (
         predicted=torch.where(valid, predicted, one),
         depth=torch.where(valid, depth, one),
         variance=torch.where(valid, variance, zero),
-        own_variance=torch.where(valid, _claimed(own, index, zero), zero),
+        own_variance=torch.where(valid, _claimed(network_variances, index, zero), zero),
         valid=valid,
         rejected=rejected,
         contradiction=torch.where(many, square / rejected.clamp_min(1), torch.zeros_like(square)),
@@ -209,11 +211,11 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor] = (
     )
 
 
-def _claimed(own: Sequence[Tensor], index: Tensor, none: Tensor) -> Tensor:
-    """[B, N] float64 the sum of the maps ``own`` [B, H, W] at pixels ``index``, ``none`` without maps."""
-    if not own:
+def _claimed(network_variances: Sequence[Tensor], index: Tensor, none: Tensor) -> Tensor:
+    """[B, N] float64 the sum of the maps ``network_variances`` [B, H, W] at pixels ``index``, ``none`` without maps."""
+    if not network_variances:
         return none
-    total, *others = (torch.gather(value.detach().flatten(1), 1, index) for value in own)
+    total, *others = (torch.gather(value.detach().flatten(1), 1, index) for value in network_variances)
     for other in others:
         total = total + other
     return total.double()

@@ -92,7 +92,7 @@ class PoseRefinement(SavedState):
         self.offset.load_state(state)
 
     @property
-    def given(self) -> float:
+    def pose_variance(self) -> float:
         """Variance of a position by errors of the given poses [px^2]."""
         return float(self._variance.sum()) + self._by_offset
 

@@ -62,8 +62,8 @@ def follow(
         if abs(np.log(now / gain)) <= _BRIGHTER:
             break
         gain = now
-        alike = np.clip(before * gain, 0, 255).astype(np.uint8)
-        again, better = _followed(alike, after, position, back_tolerance, expected)
+        brightened = np.clip(before * gain, 0, 255).astype(np.uint8)
+        again, better = _followed(brightened, after, position, back_tolerance, expected)
         if np.count_nonzero(better) <= np.count_nonzero(fine):
             break
         found, fine = again, better

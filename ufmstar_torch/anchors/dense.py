@@ -245,28 +245,33 @@ class DenseEvidence(SavedState):
         """Landmarks that the image shows, measured again where the camera has moved, and new ones in the cells between
         them; how many pixels were tried; False where the views contradict each other. The running estimates follow."""
         sighted = self._memory.sighted(small, T, K, cell)
-        known = len(sighted.slot)
+        sighted_count = len(sighted.slot)
         pixel = np.concatenate([sighted.pixel, _pixels(small, cell, sighted.pixel)])
         rho, variance = np.zeros(len(pixel)), np.ones(len(pixel))
         agreed, lasts = np.zeros((2, len(pixel)), np.bool_)
-        expected = np.concatenate([np.flatnonzero(sighted.due), np.arange(known, len(pixel))])
+        expected = np.concatenate([np.flatnonzero(sighted.due), np.arange(sighted_count, len(pixel))])
         if compared is not None:
             found, fit, lasting, trusted = self._searched(small, pixel[expected], *compared, K, cell)
             at = expected[found]
             lasts[at] = lasting
             agreed[at], rho[at], variance[at] = True, fit.rho, fit.variance + np.square(_SCALE * fit.rho)
         agreed &= (rho > np.sqrt(variance)) & trusted
-        both, fine = self._memory.compare(sighted, rho[:known], variance[:known], agreed[:known])
-        again, new = np.flatnonzero(agreed[:known] & fine), np.flatnonzero(agreed[known:]) + known
+        both, fine = self._memory.compare(
+            sighted, rho[:sighted_count], variance[:sighted_count], agreed[:sighted_count]
+        )
+        again, new = (
+            np.flatnonzero(agreed[:sighted_count] & fine),
+            np.flatnonzero(agreed[sighted_count:]) + sighted_count,
+        )
         self._memory.write(both.slot[again], small, both.pixel[again], both.rho[again], both.variance[again], T, K)
         remembered = new[lasts[new]]
         self._memory.write(None, small, pixel[remembered], rho[remembered], variance[remembered], T, K)
-        rho[:known], variance[:known] = both.rho, both.variance
-        kept = np.concatenate([np.flatnonzero(fine), new]) if trusted else new
-        if len(kept) >= _ENOUGH:
-            self._depth *= float(np.exp((1 - self.config.memory) * np.log(median(1 / rho[kept]) / self._depth)))
-        tried = known + (0 if compared is None else len(expected))
-        return Depths(pixel[kept], rho[kept], variance[kept]), tried, trusted
+        rho[:sighted_count], variance[:sighted_count] = both.rho, both.variance
+        matched = np.concatenate([np.flatnonzero(fine), new]) if trusted else new
+        if len(matched) >= _ENOUGH:
+            self._depth *= float(np.exp((1 - self.config.memory) * np.log(median(1 / rho[matched]) / self._depth)))
+        tried = sighted_count + (0 if compared is None else len(expected))
+        return Depths(pixel[matched], rho[matched], variance[matched]), tried, trusted
 
     def _searched(
         self, small: NDArray[np.uint8], pixel: NDArray, views: Views, shares: NDArray, K: NDArray, cell: int
@@ -279,15 +284,18 @@ class DenseEvidence(SavedState):
         self._baseline = float(np.linalg.norm(np.linalg.inv(K) @ views.b[-1]))
         actual = measure(small, pixel, views, self._search())
         accepted = confirmed(pixel, actual, cell)
-        alike = accepted[actual.agreed + actual.contradicted > 1]
-        trusted, found = len(alike) < _ENOUGH or bool(alike.mean() >= self.config.min_share), np.flatnonzero(accepted)
-        given = actual.only(found), shares, views, K, self._depth, trusted
-        fit = self._errors.corrected(pixel[found], *given)
+        agreeing = accepted[actual.agreed + actual.contradicted > 1]
+        trusted, found = (
+            len(agreeing) < _ENOUGH or bool(agreeing.mean() >= self.config.min_share),
+            np.flatnonzero(accepted),
+        )
+        arguments = actual.only(found), shares, views, K, self._depth, trusted
+        fit = self._errors.corrected(pixel[found], *arguments)
         lasting = (actual.agreed[found] > 1) | (fit.variance < np.square(CERTAIN * fit.rho))
         return found, fit, lasting, trusted
 
-    def _coarse(self, small: NDArray[np.uint8], taken: NDArray[np.float64], views: Views, cell: int) -> Depths:
-        """Search the cells without a pixel of ``taken`` [N, 2] by windows of twice the width: in images of half the
+    def _coarse(self, small: NDArray[np.uint8], occupied: NDArray[np.float64], views: Views, cell: int) -> Depths:
+        """Search the cells without a pixel of ``occupied`` [N, 2] by windows of twice the width: in images of half the
         size."""
         from ufmstar_torch.kernels.anchor_check_cpu import confirmed
         from ufmstar_torch.kernels.dense_cpu import Views, measure
@@ -296,22 +304,22 @@ class DenseEvidence(SavedState):
         S = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
         H, images = S @ views.H @ np.linalg.inv(S), np.stack([_halved(image) for image in views.image])
         reduced = Views(images, np.ascontiguousarray(H), np.ascontiguousarray(views.b @ S.T), views.noise / 4)
-        taken = (taken - 0.5) / 2
-        inside = ((taken >= 0) & (taken < half.shape[::-1])).all(1)
-        pixel = _pixels(half, cell // 2, taken[inside])
+        occupied = (occupied - 0.5) / 2
+        inside = ((occupied >= 0) & (occupied < half.shape[::-1])).all(1)
+        pixel = _pixels(half, cell // 2, occupied[inside])
         found = measure(half, pixel, reduced, self._search())
         variance = _COARSE_NOISE * found.variance + np.square(_SCALE * found.rho)
         fine = confirmed(pixel, found, cell // 2) & (found.rho > np.sqrt(variance))
         return Depths(2 * pixel[fine] + 0.5, found.rho[fine], variance[fine])
 
-    def _apart(self, corners: Landmarks, taken: NDArray[np.float64], width: int) -> NDArray[np.int64]:
-        """Indices of the corners that become anchors: certain ones, away from the ``taken`` positions [N, 2]."""
+    def _apart(self, corners: Landmarks, occupied: NDArray[np.float64], width: int) -> NDArray[np.int64]:
+        """Indices of the corners that become anchors: certain ones, away from the ``occupied`` positions [N, 2]."""
         from ufmstar_torch.kernels.anchor_check_cpu import farther
 
         over = self._tracker.remaining_error / max(self._tracker.baseline, 1e-9) / self._tracker.focal
         sigma = np.maximum(np.sqrt(corners.variance) / corners.depth, over * np.maximum(corners.depth, self._depth))
         fine = np.flatnonzero(sigma <= self.config.corner_sigma)
-        return fine[farther(corners.pixel[fine], taken, self.config.corner_distance * width)]
+        return fine[farther(corners.pixel[fine], occupied, self.config.corner_distance * width)]
 
     def _search(self) -> Search:
         from ufmstar_torch.kernels.dense_cpu import Search
@@ -362,13 +370,13 @@ def _cell(width: int) -> int:
     return max(round(8 * 1.25 ** np.log2(width / 160)), 4)
 
 
-def _pixels(small: NDArray[np.uint8], cell: int, taken: NDArray[np.float64]) -> NDArray[np.float64]:
+def _pixels(small: NDArray[np.uint8], cell: int, occupied: NDArray[np.float64]) -> NDArray[np.float64]:
     """[N, 2] the pixel (u, v) of the largest gradient in every cell that has one, and none of those taken [M, 2]."""
     from ufmstar_torch.kernels.dense_cpu import best_pixels
 
     shape = (-(-small.shape[0] // cell), -(-small.shape[1] // cell))
     pixel, strength = np.zeros((*shape, 2)), np.zeros(shape)
-    column, row = (taken / cell).astype(np.int64).T
+    column, row = (occupied / cell).astype(np.int64).T
     strength[row, column] = -1
     best_pixels(small, cell, pixel, strength)
     return pixel[strength > 0]

@@ -100,8 +100,8 @@ class Memory(SavedState):
         from ufmstar_torch.kernels.landmarks_cpu import sight
 
         self.frame += 1
-        kept = self._point, self._pose, self._sigma, self._patch, self._used
-        pixel, depth, spread, shown = sight(image, *kept, T_world_cam, K)
+        columns = self._point, self._pose, self._sigma, self._patch, self._used
+        pixel, depth, spread, shown = sight(image, *columns, T_world_cam, K)
         self._seen[shown > 0], self._failed[shown > 0] = self.frame, 0
         hidden = np.flatnonzero(shown < 0)
         self._failed[hidden] += 1
@@ -146,11 +146,11 @@ class Memory(SavedState):
         """
         spread, square = sighted.variance + variance, np.square(sighted.rho)
         difference = np.square(rho - sighted.rho)
-        alike = difference <= _SIGMAS**2 * (spread + self.apart * square) + _SHARE**2 * square
+        consistent = difference <= _SIGMAS**2 * (spread + self.apart * square) + _SHARE**2 * square
         if measured.sum() >= _ENOUGH:
             now = _beyond((difference / square)[measured], (spread / square)[measured])
             self.apart = self._fading * self.apart + (1 - self._fading) * now
-        confirmed, refuted = measured & alike, measured & ~alike
+        confirmed, refuted = measured & consistent, measured & ~consistent
         self.confirmed[sighted.slot[confirmed]] += 1
         self._failed[sighted.slot[refuted]] += 2
         self._used[sighted.slot[refuted & (self.confirmed[sighted.slot] == 0)]] = False

@@ -135,14 +135,14 @@ class PoseErrors(SavedState):
         speed, slope = (np.where(used, x, 1.0) for x in (measured.speed, measured.slope))
         along = np.where(used[..., None], measured.along, 0.0)
         left = self._left[shares]
-        own = np.where(used, (measured.noise + left * (1 + slope**2)) / speed**2, np.inf)
+        noise = np.where(used, (measured.noise + left * (1 + slope**2)) / speed**2, np.inf)
         value = np.where(used, measured.value - measured.rho[:, None], 0.0)
         across = np.where(shows, measured.across, 0.0)
         across_variance = np.where(shows, measured.across_noise + left, np.inf)
         before, rho = self._before(shares), measured.rho
         for _ in range(_LINEARISED):  # errors of poses move the depths at which they are linearised
             on_line, across_change = linearised(pixel, rho, along, slope, views, K)
-            shown = Shown(on_line / speed[..., None], value, own, across_change, across, across_variance)
+            shown = Shown(on_line / speed[..., None], value, noise, across_change, across, across_variance)
             solution = solved(shown, *before)
             rho = measured.rho + solution.rho
         if not np.isfinite(solution.covariance).all():  # nothing is stored that is not a number
@@ -151,16 +151,16 @@ class PoseErrors(SavedState):
         if trusted:
             self._learn_camera(solution, views.image.shape[2])
         compared = used & (measured.agreed > 1)[:, None]
-        self._learn_noise(solution.residual[compared], solution.beside, measured.across_noise, shows, shares)
+        self._learn_noise(solution.residual[compared], solution.across_residual, measured.across_noise, shows, shares)
         apart = (self._disagreement + solution.residual.sum(1)) / np.maximum(measured.agreed, 1)
-        variance = _PATCH * apart * own.min(1, initial=np.inf) + solution.common
+        variance = _PATCH * apart * noise.min(1, initial=np.inf) + solution.common
         return Fit(rho, variance)
 
     def _before(self, shares: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Precision [S, S] and mean [S] of the errors of some keyframes and of the camera, S = 6 V + 4."""
         sigma = np.sqrt(np.repeat(self._variance[shares], 3, axis=1))
-        alike = np.where(np.eye(len(shares)), 1.0, _SHARED)
-        poses = np.einsum("kl,kc,lc,cd->kcld", np.linalg.inv(alike), 1 / sigma, 1 / sigma, np.eye(POSE))
+        shared = np.where(np.eye(len(shares)), 1.0, _SHARED)
+        poses = np.einsum("kl,kc,lc,cd->kcld", np.linalg.inv(shared), 1 / sigma, 1 / sigma, np.eye(POSE))
         n = POSE * len(shares)
         precision = np.zeros((n + CAMERA, n + CAMERA))
         precision[:n, :n] = poses.reshape(n, n)
@@ -188,14 +188,14 @@ class PoseErrors(SavedState):
     def _learn_noise(
         self,
         residual: NDArray[np.float64],
-        beside: NDArray[np.float64],
+        across_residual: NDArray[np.float64],
         noise: NDArray[np.float64],
         shows: NDArray[np.bool_],
         shares: NDArray[np.int64],
     ) -> None:
         if len(residual) < _ENOUGH:
             return
-        left = (_medians(beside, shows) / _MEDIAN_SQUARE - _medians(noise, shows)).clip(_LEAST**2)
+        left = (_medians(across_residual, shows) / _MEDIAN_SQUARE - _medians(noise, shows)).clip(_LEAST**2)
         for share, each, count in zip(shares, left, shows.sum(0), strict=True):
             if count >= _ENOUGH:
                 self._left[share] = self._faded(self._left[share], each)

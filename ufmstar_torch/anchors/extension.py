@@ -133,15 +133,15 @@ class AnchorFrame(FrameExtension):
     def before_regression(self, tensors: Tensors, mixture_cam: GaussianMixture, distribute: Distribute) -> Columns:
         """Add the frame's anchors to the evidence."""
         evidence = _evidence(tensors).padded(mixture_cam.capacity)
-        given = evidence, mixture_cam, self.frame, self.anchors, self._config
-        return self._columns(learn(*given, distribute, self._kernels.supported))
+        arguments = evidence, mixture_cam, self.frame, self.anchors, self._config
+        return self._columns(learn(*arguments, distribute, self._kernels.supported))
 
     def in_view(self, tensors: Tensors, capacity: int, seen: Any, views: Any) -> Columns | None:
         """Add the frame's anchors to the evidence, in the compiled step."""
         if self._kernels.learn_in_view is None:
             return None
-        given = _evidence(tensors), capacity, seen, views, self.frame, self.anchors, self._config
-        return self._columns(self._kernels.learn_in_view(*given))
+        arguments = _evidence(tensors), capacity, seen, views, self.frame, self.anchors, self._config
+        return self._columns(self._kernels.learn_in_view(*arguments))
 
     def _columns(self, learnt: Learnt) -> Columns:
         self._used = learnt.used
@@ -155,13 +155,13 @@ class AnchorFrame(FrameExtension):
     def after_frame(self, state: UfMStarState, out: StepOutput, total: Total) -> tuple[UfMStarState, StepOutput]:
         """Count the anchors, those that were used and those that were rejected."""
         none, anchors = torch.zeros_like(self._used), self.anchors
-        given, rejected = (none, none) if anchors is None else (anchors.valid.sum(1), anchors.rejected)
+        count, rejected = (none, none) if anchors is None else (anchors.valid.sum(1), anchors.rejected)
         measured = out.statistics.pose_error
         if anchors is not None:
             self._warn(anchors)
             measured = anchors.pose_error
         counts = replace(
-            out.statistics, anchors=given, anchors_used=self._used, anchors_rejected=rejected, pose_error=measured
+            out.statistics, anchors=count, anchors_used=self._used, anchors_rejected=rejected, pose_error=measured
         )
         return state, replace(out, statistics=counts)
 
@@ -210,7 +210,13 @@ class AnchorExtension(Extension):
                 raise ValueError(f"{name} holds negative weights or values beyond {LARGEST:g}")
 
     def of_frame(
-        self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool
+        self,
+        frame: FrameInput,
+        network_variances: Sequence[Tensor],
+        argument: Any,
+        before: Sequence[FrameExtension],
+        *,
+        dense: bool,
     ) -> AnchorFrame:
         """With the frame's anchors checked.
 
@@ -218,7 +224,7 @@ class AnchorExtension(Extension):
             TypeError, ValueError: as :func:`check_anchors`.
         """
         kernels = self._kernels(self._config.backend, frame.depth.device.type)
-        anchors = None if given is None else check_anchors(given, frame, own)
+        anchors = None if argument is None else check_anchors(argument, frame, network_variances)
         return AnchorFrame(frame, anchors, self._config, kernels, self._warn)
 
     def _warn(self, anchors: AnchorInput) -> None:

@@ -45,9 +45,9 @@ class SavedState:
         """
         values: dict[str, Any] = {}
         for attribute, name in self.HELD.items():
-            value, own = np.array(state[name].numpy()), np.asarray(getattr(self, attribute))
-            if value.shape != own.shape or value.dtype != own.dtype:
-                text = f"must have shape {own.shape} and dtype {own.dtype}, got {value.shape} and {value.dtype}"
+            value, current = np.array(state[name].numpy()), np.asarray(getattr(self, attribute))
+            if value.shape != current.shape or value.dtype != current.dtype:
+                text = f"must have shape {current.shape} and dtype {current.dtype}, got {value.shape} and {value.dtype}"
                 raise ValueError(f"state[{name!r}] {text}")
             if not (np.abs(value, dtype=np.float64) <= LARGEST).all():  # NaN is not
                 text = f"finite and within {LARGEST:g}: the state is damaged, start with reset()"

@@ -143,9 +143,9 @@ class LandmarkMap:
         shifted[:2, 2] += offset
         result = self.anchors(torch.from_numpy(T)[None], torch.from_numpy(shifted), size)
         assert result.valid is not None
-        kept = np.flatnonzero(result.valid[0].numpy())
-        kept = kept[:: -(-len(kept) // _MOST) or 1]
-        pixel, depth, variance = (x[0].numpy()[kept] for x in (result.pixel, result.depth, result.variance))
+        visible = np.flatnonzero(result.valid[0].numpy())
+        visible = visible[:: -(-len(visible) // _MOST) or 1]
+        pixel, depth, variance = (x[0].numpy()[visible] for x in (result.pixel, result.depth, result.variance))
         return Landmarks(pixel - offset, depth, variance, len(self.sigma), none="no landmark of the map is in view")
 
     def reset(self) -> None:

@@ -46,8 +46,8 @@ class StreamLandmarks:
     """
 
     def __init__(self, sources: Given | list[Given] | tuple[Given, ...]) -> None:
-        given = sources if isinstance(sources, list | tuple) else [sources]
-        self._sources = [landmark_source(one) for one in given]
+        listed = sources if isinstance(sources, list | tuple) else [sources]
+        self._sources = [landmark_source(one) for one in listed]
         self._before = self._states()
         self.needs_image = any(source.needs_image for source in self._sources)
         self.last: list[Landmarks] = []
@@ -148,9 +148,9 @@ class StreamLandmarks:
                 raise ValueError(f"anchors: the state holds {key!r}, but the streams are 0 to {len(parts) - 1}")
             parts[int(stream)][name] = value
         try:
-            for source, own, part in zip(self._sources, before, parts, strict=True):
-                if part.keys() != own.keys():
-                    raise ValueError(f"anchors: the state must hold {sorted(own)}, got {sorted(part)}")
+            for source, source_state, part in zip(self._sources, before, parts, strict=True):
+                if part.keys() != source_state.keys():
+                    raise ValueError(f"anchors: the state must hold {sorted(source_state)}, got {sorted(part)}")
                 source.load_state(part)
         except BaseException:
             self._restore(before, range(len(before)))

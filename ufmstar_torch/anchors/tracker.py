@@ -252,7 +252,7 @@ class LandmarkTracker(SavedState):
     @property
     def pose_error(self) -> float:
         """Standard deviation of corners from their epipolar lines by the given poses [px]; NaN = not measured."""
-        return (self._off**2 + self._refinement.given) ** 0.5 if self._off >= 0 else float("nan")
+        return (self._off**2 + self._refinement.pose_variance) ** 0.5 if self._off >= 0 else float("nan")
 
     @property
     def lag(self) -> float:
@@ -330,12 +330,12 @@ class LandmarkTracker(SavedState):
         last, K = self._poses[self._view], self._K
         position, point = self._pixel[chosen, self._view], self._point[chosen]
         depth = (point - last[:3, 3]) @ last[:3, 2]
-        known = np.isfinite(depth)
-        if known.sum() < _ENOUGH:
+        finite = np.isfinite(depth)
+        if finite.sum() < _ENOUGH:
             return None
         rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ np.linalg.inv(K).T
-        usual = median(depth[known])
-        point = np.where(known[:, None], point, usual * rays @ last[:3, :3].T + last[:3, 3])
+        usual = median(depth[finite])
+        point = np.where(finite[:, None], point, usual * rays @ last[:3, :3].T + last[:3, 3])
 
         def seen_by(pose: NDArray[np.float64]) -> NDArray[np.float64]:
             cam = (point - pose[:3, 3]) @ pose[:3, :3]

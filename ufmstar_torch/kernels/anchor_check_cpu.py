@@ -71,18 +71,18 @@ def confirmed(pixel: NDArray[np.float64], measured: Measured, cell: int) -> NDAr
     return fine
 
 
-def farther(pixel: NDArray[np.float64], taken: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:
-    """Which pixels [N, 2] lie farther than a distance [px] from all ``taken`` ones [M, 2]."""
+def farther(pixel: NDArray[np.float64], occupied: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:
+    """Which pixels [N, 2] lie farther than a distance [px] from all ``occupied`` ones [M, 2]."""
     far = np.ones(len(pixel), np.bool_)
-    _farther(pixel, taken, distance * distance, far)
+    _farther(pixel, occupied, distance * distance, far)
     return far
 
 
 @reordered
-def _farther(pixel, taken, square, far):
+def _farther(pixel, occupied, square, far):
     for n in range(len(pixel)):
-        for m in range(len(taken)):
-            du, dv = pixel[n, 0] - taken[m, 0], pixel[n, 1] - taken[m, 1]
+        for m in range(len(occupied)):
+            du, dv = pixel[n, 0] - occupied[m, 0], pixel[n, 1] - occupied[m, 1]
             if du * du + dv * dv <= square:
                 far[n] = False
                 break
@@ -96,7 +96,7 @@ def _confirm(pixel, rho, variance, found, cell, lies_in, fine):
         if fine[n]:
             continue
         row, column = int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell
-        alike = count = 0
+        agreeing = count = 0
         for j in range(max(row - _CELLS, 0), min(row + _CELLS + 1, lies_in.shape[0])):
             for i in range(max(column - _CELLS, 0), min(column + _CELLS + 1, lies_in.shape[1])):
                 m = lies_in[j, i]
@@ -105,8 +105,8 @@ def _confirm(pixel, rho, variance, found, cell, lies_in, fine):
                 count += 1
                 limit = max(_SIGMAS**2 * (variance[n] + variance[m]), (_SHARE * rho[n]) ** 2)
                 if (rho[m] - rho[n]) ** 2 < limit and variance[m] < (CERTAIN * rho[m]) ** 2:
-                    alike += 1
-        fine[n] = alike >= _LEAST and alike >= _MOST * count
+                    agreeing += 1
+        fine[n] = agreeing >= _LEAST and agreeing >= _MOST * count
         fine[n] |= variance[n] >= (CERTAIN * rho[n]) ** 2
 
 

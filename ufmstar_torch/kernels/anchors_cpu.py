@@ -34,8 +34,8 @@ _NOTHING = 1e-30  # of a mean: less is 0 and not a number too small for single p
 def inliers(anchors: AnchorInput) -> Tensor:
     """As :func:`ufmstar_torch.anchors.evidence.inliers`, for CPU tensors; the same anchors."""
     out = np.empty(anchors.valid.shape, np.bool_)
-    given = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.valid)
-    each(_inliers, list(zip(*map(array, given), out, strict=True)))
+    fields = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.valid)
+    each(_inliers, list(zip(*map(array, fields), out, strict=True)))
     return torch.from_numpy(out)
 
 
@@ -69,8 +69,8 @@ def learn_in_view(
     if anchors is None:
         fields = [np.empty((b, 0), np.int64), np.empty((b, 0, 2)), *np.empty((4, b, 0)), np.empty((b, 0), np.bool_)]
     else:
-        given = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.own_variance)
-        fields = [array(anchors.index), *map(array, given), array(anchors.valid)]
+        columns = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.own_variance)
+        fields = [array(anchors.index), *map(array, columns), array(anchors.valid)]
     features = [one.features for one in seen]
     assert config.anchors is not None
     settings = frame.size[1], 0.5 ** (1 / config.anchors.half_life), config.anchors.shrinkage
@@ -83,14 +83,14 @@ def learn_in_view(
 
 @kernel
 def _learn(
-    view, features, index, pixel, predicted, depth, variance, own, valid, K, before, overall_before,
+    view, features, index, pixel, predicted, depth, variance, network_variance, valid, K, before, overall_before,
     width, memory, shrinkage, component, overall, used, beyond, stream,
 ):  # fmt: skip
     """One stream: N anchors, K components, of which only ``view`` can explain a point."""
     chosen = np.empty(valid.size, np.bool_)
     rows, sums = np.empty((valid.size, 3)), np.zeros((component.shape[0], 3))
     supported(pixel, predicted, depth, variance, valid, chosen)
-    used[0] = _rows(predicted, depth, variance, own, chosen, rows)
+    used[0] = _rows(predicted, depth, variance, network_variance, chosen, rows)
     if valid.size > 0:
         _distribute(index, predicted, chosen, rows, K, width, view, sums)
     fade = memory if used[0] > 0 else 1.0
@@ -115,7 +115,7 @@ def _learn(
 
 
 @part
-def _rows(predicted, depth, variance, own, supported, rows):
+def _rows(predicted, depth, variance, network_variance, supported, rows):
     """Write w (1, r, e) [N, 3] of the anchors, 0 where not supported; return how many are used."""
     n = supported.size
     squares, used, others = np.zeros(n), 0, -1
@@ -131,7 +131,7 @@ def _rows(predicted, depth, variance, own, supported, rows):
         if not supported[i]:
             continue
         r = depth[i] / predicted[i] - 1
-        claim = (variance[i] + own[i]) / (predicted[i] * predicted[i])
+        claim = (variance[i] + network_variance[i]) / (predicted[i] * predicted[i])
         limit = 1.0
         if others > 0:
             limit = min(others, CLAIM) * max((total - squares[i]) / others, LEAST_SIGMA**2)
@@ -173,7 +173,7 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
         points[i, 0], points[i, 1], points[i, 2] = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z
     start, order = grid(pixel, chosen, _SOME)[4:]
     room = packed.shape[1]
-    kept, work = np.empty(visible.size, np.int64), np.empty(8 + room, packed.dtype)
+    retained, work = np.empty(visible.size, np.int64), np.empty(8 + room, packed.dtype)
     near, density, added = np.empty((FIELDS, room)), np.empty(room), np.empty((3, room))
     point, row = np.empty(3), np.empty(4)
     row[3] = settings[0]
@@ -181,11 +181,11 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
         if start[cell] == start[cell + 1]:
             continue
         box = _box(points, order, start[cell], start[cell + 1])
-        count = cull(packed, visible.size, settings[4], box, settings, work, kept)
+        count = cull(packed, visible.size, settings[4], box, settings, work, retained)
         n = padded(count)
         for i in range(count):
             for field in range(FIELDS):
-                near[field, i] = fields[kept[i], field]
+                near[field, i] = fields[retained[i], field]
         for i in range(count, n):  # nowhere
             for field in range(FIELDS - 1):
                 near[field, i] = 0.0
@@ -193,14 +193,14 @@ def _distribute(index, predicted, chosen, rows, K, width, view, sums):
         for axis in range(3):
             for i in range(n):
                 added[axis, i] = 0.0
-        for place in range(start[cell], start[cell + 1]):
-            p = order[place]
+        for position in range(start[cell], start[cell + 1]):
+            p = order[position]
             for axis in range(3):
                 point[axis], row[axis] = points[p, axis], rows[p, axis]
             add_shares(near, room, n, point, row, density, added)
         for i in range(count):
             for axis in range(3):
-                sums[visible[kept[i]], axis] += added[axis, i]
+                sums[visible[retained[i]], axis] += added[axis, i]
 
 
 @leaf
@@ -208,7 +208,7 @@ def _box(points, order, first, last):
     """The least and the greatest corner of the points in those places of an order."""
     a = b = c = np.inf
     d = e = f = -np.inf
-    for place in range(first, last):
-        x, y, z = points[order[place], 0], points[order[place], 1], points[order[place], 2]
+    for position in range(first, last):
+        x, y, z = points[order[position], 0], points[order[position], 1], points[order[position], 2]
         a, b, c, d, e, f = min(a, x), min(b, y), min(c, z), max(d, x), max(e, y), max(f, z)
     return a, b, c, d, e, f

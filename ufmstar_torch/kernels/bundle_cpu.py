@@ -120,7 +120,7 @@ def _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, 
     views = precision.shape[1]
     last = POSE * views
     # By the newest pose and by view k's: rows u and v.
-    own, other, weighted = np.empty((2, POSE)), np.empty((2, POSE)), np.empty(h.shape)
+    by_newest, other, weighted = np.empty((2, POSE)), np.empty((2, POSE)), np.empty(h.shape)
     for n in range(len(ray)):
         x, y = ray[n, -1, 0], ray[n, -1, 1]
         row = h[n]
@@ -141,10 +141,14 @@ def _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, 
                 at = u if i == 0 else w
                 r0, r1, r2 = R[i, 0] - at * R[2, 0], R[i, 1] - at * R[2, 1], R[i, 2] - at * R[2, 2]
                 # R [n]x with n = (x, y, 1), negative: the change by w of the newest view.
-                own[i, 0], own[i, 1], own[i, 2] = (r2 * y - r1) * over, (r0 - r2 * x) * over, (r1 * x - r0 * y) * over
+                by_newest[i, 0], by_newest[i, 1], by_newest[i, 2] = (
+                    (r2 * y - r1) * over,
+                    (r0 - r2 * x) * over,
+                    (r1 * x - r0 * y) * over,
+                )
                 for c in range(3):
-                    own[i, 3 + c] = rho[n] * (to[i, c] - at * to[2, c]) * over
-                    other[i, 3 + c] = -own[i, 3 + c]
+                    by_newest[i, 3 + c] = rho[n] * (to[i, c] - at * to[2, c]) * over
+                    other[i, 3 + c] = -by_newest[i, 3 + c]
             # [q]x: the change by w_k.
             other[0, 0], other[0, 1], other[0, 2] = u * w, -(1 + u * u), w
             other[1, 0], other[1, 1], other[1, 2] = 1 + w * w, -u * w, -u
@@ -153,7 +157,7 @@ def _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, 
             above += p * (du * right + dv * down)
             first = POSE * k
             for c in range(POSE):
-                by_own, by_own_v = p * own[0, c], p * own[1, c]
+                by_own, by_own_v = p * by_newest[0, c], p * by_newest[1, c]
                 by, by_v = p * other[0, c], p * other[1, c]
                 row[last + c] += by_own * du + by_own_v * dv
                 row[first + c] += by * du + by_v * dv
@@ -162,7 +166,7 @@ def _equations(ray, precision, into, moved, to_view, rho, prior, student, A, b, 
                 for d in range(POSE):
                     A[last + c, first + d] += by_own * other[0, d] + by_own_v * other[1, d]
                 for d in range(c + 1):
-                    A[last + c, last + d] += by_own * own[0, d] + by_own_v * own[1, d]
+                    A[last + c, last + d] += by_own * by_newest[0, d] + by_own_v * by_newest[1, d]
                     A[first + c, first + d] += by * other[0, d] + by_v * other[1, d]
         v[n] = above / total
         weighted[n] = row

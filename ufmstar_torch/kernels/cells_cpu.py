@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import kept
+from ufmstar_torch.kernels.compile_cpu import cached
 from ufmstar_torch.kernels.field_cpu import Floats, fast
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.read import LARGEST
 
 # An anchor's stated depth or variance may be NaN.
-with_nan = kept(fastmath={"contract", "reassoc", "nsz", "arcp"})
+with_nan = cached(fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
 def cell_means(logs: NDArray[Any], valid: NDArray[np.bool_], rows: int, cols: int) -> Floats:
@@ -117,7 +117,7 @@ def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limi
     counts. The four weights s/(1 + D^2) have the quotients of s times the other three denominators.
     """
     height, rows = len(logs), len(left)
-    alike, largest = limits
+    contrast, largest = limits
     by_depth, by_row = slopes
     for i in range(height):
         v = (i + 0.5) / height
@@ -128,19 +128,19 @@ def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limi
         depths, used, gs, Vs = depth[i], valid[i], logs[i], claimed[i]
         ys, out, inside, other = y[i], spread[i], inlier[i], outlier[i]
         for j in range(len(across)):
-            g, d, V, beside = np.float64(gs[j]), np.float64(depths[j]), np.float64(Vs[j]), across[j]
+            g, d, V, right_share = np.float64(gs[j]), np.float64(depths[j]), np.float64(Vs[j]), across[j]
             a0, a1, a2, a3 = g - n0[0, j], g - n1[0, j], g - n2[0, j], g - n3[0, j]
-            q0, q1, q2, q3 = alike + a0 * a0, alike + a1 * a1, alike + a2 * a2, alike + a3 * a3
-            w0, w1 = (1 - below) * (1 - beside) * q1 * (q2 * q3), (1 - below) * beside * q0 * (q2 * q3)
-            w2, w3 = below * (1 - beside) * q3 * (q0 * q1), below * beside * q2 * (q0 * q1)
+            q0, q1, q2, q3 = contrast + a0 * a0, contrast + a1 * a1, contrast + a2 * a2, contrast + a3 * a3
+            w0, w1 = (1 - below) * (1 - right_share) * q1 * (q2 * q3), (1 - below) * right_share * q0 * (q2 * q3)
+            w2, w3 = below * (1 - right_share) * q3 * (q0 * q1), below * right_share * q2 * (q0 * q1)
             share = 1 / (w0 + w1 + w2 + w3)
             offset = w0 * n0[1, j] + w1 * n1[1, j] + w2 * n2[1, j] + w3 * n3[1, j]
-            own = w0 * n0[2, j] + w1 * n1[2, j] + w2 * n2[2, j] + w3 * n3[2, j]
+            variance = w0 * n0[2, j] + w1 * n1[2, j] + w2 * n2[2, j] + w3 * n3[2, j]
             here = w0 * n0[3, j] + w1 * n1[3, j] + w2 * n2[3, j] + w3 * n3[3, j]
             p = w0 * n0[4, j] + w1 * n1[4, j] + w2 * n2[4, j] + w3 * n3[4, j]
             unseen = w0 * n0[5, j] + w1 * n1[5, j] + w2 * n2[5, j] + w3 * n3[5, j]
             value = base[j] + by_depth * g + by_row * (2 * v - 1) + offset * share
             ys[j] = min(max(value, -largest), largest) if used[j] else np.nan
             other[j] = p * share if used[j] else np.nan
-            out[j] = max(own * d * d, unseen * (V if V == V else 0.0)) * share
+            out[j] = max(variance * d * d, unseen * (V if V == V else 0.0)) * share
             inside[j] = here * d * d * share

@@ -39,7 +39,7 @@ def check_values(
 ) -> FrameInput:
     """As :func:`ufmstar_torch.frame.check_values`, for the CPU. Depth that is valid everywhere is not copied."""
     b, height, width = depth.shape
-    poses, cameras = (_matrices(given, b) for given in (pose, intrinsics))
+    poses, cameras = (_matrices(has_depth, b) for has_depth in (pose, intrinsics))
     checked = [_camera(T, K, height, width, rotation_tolerance) for T, K in zip(poses, cameras, strict=True)]
     T_safe, K_safe, faults, deviations = zip(*checked, strict=True)
     z, wanted = array(depth), None if mask is None else array(mask)
@@ -57,11 +57,11 @@ def check_values(
     if not use.all():
         left_out = np.flatnonzero(~use)
         values, stream = z.reshape(-1)[left_out], left_out // (height * width)
-        given = (values > 0) & (values < np.inf) & (counts[0] == 0)[stream]
+        has_depth = (values > 0) & (values < np.inf) & (counts[0] == 0)[stream]
         if wanted is not None:
-            given &= wanted.reshape(-1)[left_out]
+            has_depth &= wanted.reshape(-1)[left_out]
         far = values > max_depth
-        for kind, chosen in enumerate((given & far, given & ~far), start=1):
+        for kind, chosen in enumerate((has_depth & far, has_depth & ~far), start=1):
             counts[kind] = np.bincount(stream[chosen], minlength=b)
         safe = z.copy()
         safe.reshape(-1)[left_out] = 0

@@ -197,7 +197,7 @@ def _report(what: str) -> None:
     logging.getLogger("ufmstar_torch").warning("compiled kernels: %s; compiling in memory", what)
 
 
-def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile at the first call, and keep the result on disk; in memory alone where no folder can be written to."""
 
     def decorated(function: Callable[..., Any]) -> Any:
@@ -218,7 +218,7 @@ def _inner(**options: Any) -> Any:
     return register_jitable(error_model="numpy", no_cfunc_wrapper=True, pipeline_class=_Part, **options)
 
 
-kernel = kept()
+kernel = cached()
 part = _inner()
 
 # A part that allocates nothing; the kernel that calls it holds its arrays. numba counts the references of every view of
@@ -230,7 +230,7 @@ contracted = _inner(_nrt=False, fastmath={"contract"})
 
 # A kernel and a leaf whose sums may be taken in any order, so that they run in vectors.
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
-reordered = kept(fastmath=_ANY_ORDER)
+reordered = cached(fastmath=_ANY_ORDER)
 reordered_leaf = _inner(_nrt=False, fastmath=_ANY_ORDER)
 
 
@@ -249,10 +249,10 @@ def _allocated(context: Any, builder: Any, signature: Any, arguments: Any) -> An
     """A new array of the signature's type, whose shape is the first argument."""
     kind, shape = signature.return_type, signature.args[0]
     several = isinstance(shape, types.BaseTuple)
-    given = cgutils.unpack_tuple(builder, arguments[0]) if several else [arguments[0]]
+    unpacked = cgutils.unpack_tuple(builder, arguments[0]) if several else [arguments[0]]
     sizes = [
         context.cast(builder, size, of, types.intp)
-        for size, of in zip(given, shape.types if several else [shape], strict=True)
+        for size, of in zip(unpacked, shape.types if several else [shape], strict=True)
     ]
     itemsize = context.get_constant(types.intp, get_itemsize(context, kind))
     strides = [itemsize]

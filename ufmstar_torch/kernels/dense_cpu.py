@@ -167,7 +167,7 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
     start, first_low, first_high, sigmas, least_score, least_rival, match = search
     height, width = image.shape
     flat = image.reshape(image.size)
-    place, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
+    corner, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
     template, patch = np.empty(WIDE * WIDE, np.float32), np.empty(COUNT, np.float32)
     along_u, along_v = np.empty(COUNT, np.float32), np.empty(COUNT, np.float32)
     rows, windows = np.empty((2, SIDE + 1), np.uint64), np.empty((LONGEST + 1, SIDE), np.uint64)
@@ -190,7 +190,7 @@ def _measure(image, pixel, keys, H, b, noise, search, rho, variance, agreed, con
                 half = max(sigmas * np.sqrt(variance[n] + noise[k] / speed**2), 1 / speed)
                 low, high = at - half, at + half
             if not (
-                _warped(flat, width, height, u, v, H[k], b[k], at, place, share, template)
+                _warped(flat, width, height, u, v, H[k], b[k], at, corner, share, template)
                 and normalised(template, patch, along_u, along_v)
                 and _search(patch, key, width, height, x, y, z, b[k], low, high, windows, scores, best)
             ):
@@ -251,7 +251,7 @@ def _inverse_depth(x, y, z, b, u, v):
 
 
 @reordered_leaf
-def _warped(flat, width, height, u, v, H, b, rho, place, share, template):
+def _warped(flat, width, height, u, v, H, b, rho, corner, share, template):
     """The template around (u, v) as a view sees it at inverse depth rho; see :func:`sampled`. False where it leaves the
     image or changes its scale too much."""
     z = H[2, 0] * u + H[2, 1] * v + H[2, 2] + rho * b[2]
@@ -264,12 +264,12 @@ def _warped(flat, width, height, u, v, H, b, rho, place, share, template):
     if not z * z / LARGEST_SCALE**2 < determinant < z * z * LARGEST_SCALE**2:
         return False
     over = z / determinant
-    return sampled(flat, width, height, u, v, d * over, -b_ * over, -c * over, a * over, place, share, template)
+    return sampled(flat, width, height, u, v, d * over, -b_ * over, -c * over, a * over, corner, share, template)
 
 
 @reordered_leaf
-def sampled(flat, width, height, u, v, a, b, c, d, place, share, template):
-    """The pixels of an image at (u, v) + ((a, b), (c, d)) x, for the pixels x of a template, bilinear. ``place`` and
+def sampled(flat, width, height, u, v, a, b, c, d, corner, share, template):
+    """The pixels of an image at (u, v) + ((a, b), (c, d)) x, for the pixels x of a template, bilinear. ``corner`` and
     ``share`` are buffers. False where one lies outside."""
     far_u, far_v = (abs(a) + abs(b)) * (1 - FIRST), (abs(c) + abs(d)) * (1 - FIRST)
     if not (far_u <= u < width - 1.01 - far_u and far_v <= v < height - 1.01 - far_v):  # .01: for rounding
@@ -279,16 +279,16 @@ def sampled(flat, width, height, u, v, a, b, c, d, place, share, template):
         su, sv = u + a * _RIGHT[k] + b * _DOWN[k], v + c * _RIGHT[k] + d * _DOWN[k]
         iu, iv = np.int32(su), np.int32(sv)
         share[0, k], share[1, k] = su - np.float32(iu), sv - np.float32(iv)
-        place[k] = np.uint32(iv * np.int32(width) + iu)
+        corner[k] = np.uint32(iv * np.int32(width) + iu)
     for k in range(WIDE * WIDE):  # the four pixels around, as the bytes of a number, which vectors take apart
-        at = np.uint64(place[k])
+        at = np.uint64(corner[k])
         below = at + np.uint64(width)
         upper, lower = (flat[at + np.uint64(1)] << 8) | flat[at], (flat[below + np.uint64(1)] << 8) | flat[below]
-        place[k] = np.uint32((lower << 16) | upper)
+        corner[k] = np.uint32((lower << 16) | upper)
     for k in range(WIDE * WIDE):
-        upper, lower = np.float32(np.int32(place[k] & 255)), np.float32(np.int32(place[k] >> 16 & 255))
-        upper += share[0, k] * (np.float32(np.int32(place[k] >> 8 & 255)) - upper)
-        lower += share[0, k] * (np.float32(np.int32(place[k] >> 24)) - lower)
+        upper, lower = np.float32(np.int32(corner[k] & 255)), np.float32(np.int32(corner[k] >> 16 & 255))
+        upper += share[0, k] * (np.float32(np.int32(corner[k] >> 8 & 255)) - upper)
+        lower += share[0, k] * (np.float32(np.int32(corner[k] >> 24)) - lower)
         template[k] = upper + share[1, k] * (lower - upper)
     return True
 
@@ -331,9 +331,9 @@ def _copied(key, at, width, count, rows):
 
 
 @reordered_leaf
-def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, place):
+def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, corner):
     """The best window between two inverse depths; its centre on the line (u, v), its ZNCC, and the ZNCC of its rival,
-    the best one more than APART steps away, in ``place``. False where there is none."""
+    the best one more than APART steps away, in ``corner``. False where there is none."""
     z_low, z_high = z + low * b[2], z + high * b[2]
     if z_low <= 1e-3 or z_high <= 1e-3:
         return False
@@ -363,7 +363,7 @@ def _search(patch, key, width, height, x, y, z, b, low, high, windows, scores, p
     for s in range(steps + 1):
         if abs(s - at) > APART and scores[s] > rival:
             rival = scores[s]
-    place[0], place[1], place[2], place[3] = u_low + at * du, v_low + at * dv, best, rival
+    corner[0], corner[1], corner[2], corner[3] = u_low + at * du, v_low + at * dv, best, rival
     return True
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import kept, kernel, part
+from ufmstar_torch.kernels.compile_cpu import cached, kernel, part
 
 WINDOW = 32
 # Right-hand sides: the features and y, and zeros to a multiple of four.
@@ -21,7 +21,7 @@ RIGHT = 8
 _WIDTH = WINDOW + RIGHT
 
 # Kernels (``compile_cpu``) in which sums have any order, and neither infinity nor NaN occurs.
-fast = kept(fastmath=True)
+fast = cached(fastmath=True)
 Floats = NDArray[np.float64]
 
 
@@ -54,8 +54,8 @@ class Observed(NamedTuple):
     value: Floats
 
 
-def given(prior: Prior, observed: Observed, weight: Floats) -> Field:
-    """As :meth:`ufmstar_torch.posterior.field.Field.given`."""
+def conditioned(prior: Prior, observed: Observed, weight: Floats) -> Field:
+    """As :meth:`ufmstar_torch.posterior.field.Field.conditioned`."""
     n, F = len(prior.diagonal), len(prior.mean)
     nodes, offset, coefficients = np.zeros((n, RIGHT)), np.empty(n), prior.mean.copy()
     diagonal, precision, right_side = prior.diagonal.copy(), prior.precision.copy(), np.zeros(F)
@@ -168,24 +168,24 @@ def _eliminate(diagonal, right, down, columns, cols, window, factor):
             _enter(window, j + cols, diagonal, right, down, columns, cols)
         if j < 0:
             continue
-        own, row = j % WINDOW, factor[j]
-        scale = 1 / np.sqrt(window[own, own])
+        slot, row = j % WINDOW, factor[j]
+        scale = 1 / np.sqrt(window[slot, slot])
         for c in range(_WIDTH):
-            row[c] = window[own, c] * scale
+            row[c] = window[slot, c] * scale
         for k in range(WINDOW):
             other, times = window[k], row[k]
             for c in range(len(row)):  # a constant length would be unrolled, without vectors
                 other[c] -= times * row[c]
         for k in range(WINDOW):
-            window[k, own] = 0.0
+            window[k, slot] = 0.0
         for c in range(_WIDTH):
-            window[own, c] = 0.0
+            window[slot, c] = 0.0
 
 
 @part
 def _enter(window, i, diagonal, right, down, columns, cols):
     """Node i with its links to those before it, at a place that is 0."""
-    own, n = i % WINDOW, len(diagonal)
+    slot, n = i % WINDOW, len(diagonal)
     total = diagonal[i]
     if (i + 1) % cols:
         total += right[i]
@@ -193,24 +193,24 @@ def _enter(window, i, diagonal, right, down, columns, cols):
         total += down[i]
     if i % cols:
         total += right[i - 1]
-        window[own, (i - 1) % WINDOW] -= right[i - 1]
-        window[(i - 1) % WINDOW, own] -= right[i - 1]
+        window[slot, (i - 1) % WINDOW] -= right[i - 1]
+        window[(i - 1) % WINDOW, slot] -= right[i - 1]
     if i >= cols:
         total += down[i - cols]
-        window[own, (i - cols) % WINDOW] -= down[i - cols]
-        window[(i - cols) % WINDOW, own] -= down[i - cols]
-    window[own, own] += total
+        window[slot, (i - cols) % WINDOW] -= down[i - cols]
+        window[(i - cols) % WINDOW, slot] -= down[i - cols]
+    window[slot, slot] += total
     for c in range(RIGHT):
-        window[own, WINDOW + c] = columns[i, c]
+        window[slot, WINDOW + c] = columns[i, c]
 
 
 @fast
 def _covary(factor, window, out, solved, variance):
     """Backwards through the factor, of which the diagonal is overwritten."""
     for j in range(len(factor) - 1, -1, -1):
-        own, row = j % WINDOW, factor[j]
-        scale = 1 / row[own]
-        row[own] = 0.0
+        slot, row = j % WINDOW, factor[j]
+        scale = 1 / row[slot]
+        row[slot] = 0.0
         for c in range(_WIDTH):
             out[c] = 0.0
         for k in range(0, WINDOW, 4):
@@ -221,11 +221,11 @@ def _covary(factor, window, out, solved, variance):
         along = 1.0
         for c in range(WINDOW):
             along += out[c] * row[c]
-            window[own, c] = -scale * out[c]
-            window[c, own] = -scale * out[c]
-        variance[j] = window[own, own] = scale * scale * along
+            window[slot, c] = -scale * out[c]
+            window[c, slot] = -scale * out[c]
+        variance[j] = window[slot, slot] = scale * scale * along
         for c in range(RIGHT):
-            solved[j, c] = window[own, WINDOW + c] = scale * (row[WINDOW + c] - out[WINDOW + c])
+            solved[j, c] = window[slot, WINDOW + c] = scale * (row[WINDOW + c] - out[WINDOW + c])
 
 
 def distance(source: NDArray[np.bool_], right: Floats, down: Floats, cols: int, limit: float) -> Floats:

@@ -33,10 +33,10 @@ def patches(image: NDArray[np.uint8], pixel: NDArray[np.float64]) -> NDArray[np.
 def _patches(image, pixel, out):
     height, width = image.shape
     flat, template = image.reshape(image.size), np.empty(WIDE * WIDE, np.float32)
-    place, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
+    corner, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
     along_u, along_v = np.empty(COUNT, np.float32), np.empty(COUNT, np.float32)
     for n in range(len(pixel)):
-        if sampled(flat, width, height, pixel[n, 0], pixel[n, 1], 1.0, 0.0, 0.0, 1.0, place, share, template):
+        if sampled(flat, width, height, pixel[n, 0], pixel[n, 1], 1.0, 0.0, 0.0, 1.0, corner, share, template):
             normalised(template, out[n], along_u, along_v)
 
 
@@ -78,7 +78,7 @@ def sight(
 def _sight(image, point, pose, sigma, patch, used, P, centre, K_inverse, pixel, depth, spread, shown):
     height, width = image.shape
     flat, template = image.reshape(image.size), np.empty(WIDE * WIDE, np.float32)
-    place, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
+    corner, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
     window = np.empty(COUNT, np.float32)
     p, error, rotated, into = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for n in np.flatnonzero(used):
@@ -113,7 +113,7 @@ def _sight(image, point, pose, sigma, patch, used, P, centre, K_inverse, pixel, 
         pixel[n, 0], pixel[n, 1], depth[n], spread[n] = p[0], p[1], z, abs(error[2])
         if not 1 / LARGEST_SCALE**2 < determinant < LARGEST_SCALE**2 or shift_u**2 + shift_v**2 > FARTHEST**2:
             continue
-        if not sampled(flat, width, height, p[0], p[1], a, b, c, d, place, share, template):
+        if not sampled(flat, width, height, p[0], p[1], a, b, c, d, corner, share, template):
             continue
         for j in range(SIDE):
             for i in range(SIDE):

@@ -46,11 +46,11 @@ def grid(pixel, chosen, mean_count):
             start[cell[i] + 1] += 1
     for c in range(columns * rows):
         start[c + 1] += start[c]
-    place, order = start.copy(), np.empty(count, np.int64)
+    next_free, order = start.copy(), np.empty(count, np.int64)
     for i in range(chosen.size):
         if chosen[i]:
-            order[place[cell[i]]] = i
-            place[cell[i]] += 1
+            order[next_free[cell[i]]] = i
+            next_free[cell[i]] += 1
     return low, side, columns, rows, start, order
 
 

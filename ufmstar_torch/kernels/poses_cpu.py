@@ -113,7 +113,7 @@ class Solution:
         rho: [N] inverse depth from its origin [1/m]; 0 where nothing is shown.
         common: [N] variance of ``rho`` by the errors that remain [1/m^2].
         residual: [N, V] square of what is left of ``value``, over its variance.
-        beside: [N, V] square of what is left of ``across`` [px^2].
+        across_residual: [N, V] square of what is left of ``across`` [px^2].
     """
 
     error: NDArray[np.float64]
@@ -121,7 +121,7 @@ class Solution:
     rho: NDArray[np.float64]
     common: NDArray[np.float64]
     residual: NDArray[np.float64]
-    beside: NDArray[np.float64]
+    across_residual: NDArray[np.float64]
 
 
 def solved(shown: Shown, precision: NDArray[np.float64], start: NDArray[np.float64]) -> Solution:
@@ -130,20 +130,20 @@ def solved(shown: Shown, precision: NDArray[np.float64], start: NDArray[np.float
     n, v = shown.value.shape
     size = len(start)
     error, covariance, mean_change = np.zeros(size), np.zeros((size, size)), np.zeros((n, size))
-    rho, residual, beside = np.zeros(n), np.zeros((n, v)), np.zeros((n, v))
+    rho, residual, across_residual = np.zeros(n), np.zeros((n, v)), np.zeros((n, v))
     _solved(
         *(shown.change, shown.value, 1 / shown.variance),
         *(shown.across_change, shown.across, 1 / shown.across_variance),
-        *(precision, precision @ start, error, covariance, mean_change, rho, residual, beside),
+        *(precision, precision @ start, error, covariance, mean_change, rho, residual, across_residual),
     )
     common = (mean_change @ covariance * mean_change).sum(1)
-    return Solution(error, covariance, rho, common, residual, beside)
+    return Solution(error, covariance, rho, common, residual, across_residual)
 
 
 @reordered
 def _solved(
     change, value, weight, across_change, across, across_weight,
-    precision, right, error, covariance, mean_change, rho, residual, beside,
+    precision, right, error, covariance, mean_change, rho, residual, across_residual,
 ):  # fmt: skip
     count, views, _ = change.shape
     mean, by = np.zeros(count), np.empty(EACH)
@@ -151,7 +151,7 @@ def _solved(
         A, r = precision.copy(), right.copy()
         student = 0.0 if turn == 0 else STUDENT
         _equations(
-            *(change, value, weight, residual, across_change, across, across_weight, beside, student),
+            *(change, value, weight, residual, across_change, across, across_weight, across_residual, student),
             *(A, r, mean_change, mean),
         )
         _inverse(A, covariance)
@@ -164,12 +164,24 @@ def _solved(
                 for c in range(EACH):
                     left -= change[n, k, c] * by[c]
                     left_across -= across_change[n, k, c] * by[c]
-                residual[n, k], beside[n, k] = left * left * weight[n, k], left_across * left_across
+                residual[n, k], across_residual[n, k] = left * left * weight[n, k], left_across * left_across
 
 
 @reordered
 def _equations(
-    change, value, weight, residual, across_change, across, across_weight, beside, student, A, r, mean_change, mean
+    change,
+    value,
+    weight,
+    residual,
+    across_change,
+    across,
+    across_weight,
+    across_residual,
+    student,
+    A,
+    r,
+    mean_change,
+    mean,
 ):
     """Add the pixels to the normal equations A d = r; the means over the views, by their precisions, are written.
     ``student`` = 0: each counts in full."""
@@ -186,7 +198,7 @@ def _equations(
                 continue
             if student > 0:
                 w *= (student + 1) / (student + residual[n, k])
-                a *= (student + 1) / (student + beside[n, k] * a)
+                a *= (student + 1) / (student + across_residual[n, k] * a)
             total[n] += w
             mean[n] += w * value[n, k]
             for c in range(EACH):

@@ -49,12 +49,12 @@ def update(
     maps = [x.detach().contiguous().numpy() for x in (packed.double(), frame.depth, frame.valid, claimed)]
     streams = zip(*maps, _anchors(anchors, len(packed)), strict=True)
     results = each(functools.partial(_of_stream, config), list(streams))
-    kept, depth, variance, outlier, inlier = (np.stack([result[i] for result in results]) for i in range(5))
+    memory, depth, variance, outlier, inlier = (np.stack([result[i] for result in results]) for i in range(5))
     sums = [result[5] for result in results]
     calibration = [r.ratios["calibration"] if r.below[-1] > 0 else np.nan for r in sums]
     unseen = [r.ratios["unseen"] for r in sums]
     outputs = [torch.from_numpy(x) for x in (depth, variance, np.array(calibration), np.array(unseen), outlier, inlier)]
-    return torch.from_numpy(kept).to(packed.dtype), Posterior(*outputs)
+    return torch.from_numpy(memory).to(packed.dtype), Posterior(*outputs)
 
 
 def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | None]:
@@ -67,15 +67,15 @@ def _anchors(anchors: AnchorInput | None, streams: int) -> list[AnchorRows | Non
 
 def _of_stream(
     config: PosteriorConfig, packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any],
-    given_: AnchorRows | None,
+    anchor_rows: AnchorRows | None,
 ) -> tuple[Floats, NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], Running]:  # fmt: skip
     """The memory after the frame; depth, variance, the probability of another surface, and the variance on its own;
     the memory's parts."""
-    running, anchors = Running.of(packed, config), _NONE if given_ is None else given_
+    running, anchors = Running.of(packed, config), _NONE if anchor_rows is None else anchor_rows
     some = len(anchors.depth) > 0
-    if given_ is None and not running.frames:
-        own = np.where(valid, depth, np.nan).astype(depth.dtype)
-        return packed, own, claimed, np.full_like(depth, np.nan), claimed, running
+    if anchor_rows is None and not running.frames:
+        predicted = np.where(valid, depth, np.nan).astype(depth.dtype)
+        return packed, predicted, claimed, np.full_like(depth, np.nan), claimed, running
     with np.errstate(all="ignore"):  # what is not valid is not read
         logs = np.log(depth)
     rows, cols = (min(SIDE, n) for n in depth.shape)
@@ -84,13 +84,13 @@ def _of_stream(
     field, left_out, weight = fitted(scene)
     away = away_from(scene, weight * config.weak_sigma**2 >= 1)
     if some:
-        kept = learnt(scene, field, weight, left_out, running)
+        memory = learnt(scene, field, weight, left_out, running)
     else:
-        kept = running.drifted(grid.mean) if running.frames and valid.any() else packed
+        memory = running.drifted(grid.mean) if running.frames and valid.any() else packed
     node = np.arange(rows * cols)
     x = features(grid.log_depth - grid.mean, (node % cols + 0.5) / cols, (node // cols + 0.5) / rows)
     mean, variance = at(field, node, x)
-    b, now = field.coefficients, Running.of(kept, config)
+    b, now = field.coefficients, Running.of(memory, config)
     offset, every = mean - (x * b).sum(1), np.ones(len(scene.noise), np.bool_)
     unseen = away * now.ratios["unseen"]
     variance = inlier_factor(now, away) * (variance + now.ratios["roughness"] + unseen)
@@ -100,4 +100,4 @@ def _of_stream(
     variance, inlier = second_moments(config, scale * (variance + steepness(grid, field.offset)), p, offset, wide)
     nodes = np.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], 1)
     depth, spread, inlier, p = read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), config)
-    return kept, depth, spread, p, inlier, now
+    return memory, depth, spread, p, inlier, now

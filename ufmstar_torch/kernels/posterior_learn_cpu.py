@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.field_cpu import Field, Floats, at, given
+from ufmstar_torch.kernels.field_cpu import Field, Floats, at, conditioned
 from ufmstar_torch.kernels.posterior_scene_cpu import (
     LeftOut,
     Running,
@@ -48,7 +48,7 @@ def _of_discs(
     held, config = _discs(scene, running.frames), scene.config
     rest = ~held
     held = held & (np.count_nonzero(rest) >= LEAST_REST)
-    field = given(scene.prior, scene.observed, weight * rest)
+    field = conditioned(scene.prior, scene.observed, weight * rest)
     node, x, noise = scene.observed.node[held], scene.observed.features[held], scene.noise[held]
     mean, variance = at(field, node, x)
     away, b = away_from(scene, rest)[node], field.coefficients
@@ -58,16 +58,16 @@ def _of_discs(
     unseen = away * running.ratios["unseen"]
     wide = elsewhere_variance(config, spread_around(scene, rest, b[0])[node], unseen)
     scale, factor = local_scale(scene, left_out, rest)[node], inlier_factor(running, away)
-    own = factor * (variance + noise + unseen) + steepness(scene.grid, field.offset)[node]
-    own, more_wrong = scale * own, wrong_factor(config, away, scale)
+    inlier_variance = factor * (variance + noise + unseen) + steepness(scene.grid, field.offset)[node]
+    inlier_variance, more_wrong = scale * inlier_variance, wrong_factor(config, away, scale)
     p = np.minimum(running.ratios["wrong"] * more_wrong, MOST_WRONG)
-    z2 = error**2 / own - (error + offset) ** 2 / (noise + wide)
+    z2 = error**2 / inlier_variance - (error + offset) ** 2 / (noise + wide)
     with np.errstate(over="ignore", divide="ignore"):  # certainly on its own surface, or never on another
-        elsewhere = 1 / (1 + np.exp(-np.log(p / (1 - p)) - (np.log(own / (noise + wide)) + z2) / 2))
-    stated = second_moments(config, own, p, offset, wide)[0]
+        elsewhere = 1 / (1 + np.exp(-np.log(p / (1 - p)) - (np.log(inlier_variance / (noise + wide)) + z2) / 2))
+    stated = second_moments(config, inlier_variance, p, offset, wide)[0]
     sums = {
         "wrong": (area * elsewhere, area * more_wrong),
-        "inlier": (area * (1 - elsewhere) * factor * error**2 / own, area * (1 - elsewhere)),
+        "inlier": (area * (1 - elsewhere) * factor * error**2 / inlier_variance, area * (1 - elsewhere)),
         "calibration": (area * error**2 / stated, area),
     }
     added = {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.kernels.cells_cpu import features, local_variance, ranges
-from ufmstar_torch.kernels.field_cpu import Field, Floats, Observed, Prior, at, distance, given
+from ufmstar_torch.kernels.field_cpu import Field, Floats, Observed, Prior, at, conditioned, distance
 from ufmstar_torch.posterior.config import PosteriorConfig
 from ufmstar_torch.posterior.read import LARGEST
 from ufmstar_torch.posterior.running import FEATURES, RATIOS, ratios
@@ -45,8 +45,8 @@ class Running(NamedTuple):
         b, covariance = left[:FEATURES], left[FEATURES:].reshape(FEATURES, FEATURES)
         if packed[0] == 0:
             above, below, covariance = value * weight, weight, np.diag(config.prior_variance)
-        known = np.where(below > 0, above / np.maximum(below, 1e-12), value).clip(least, largest)
-        by_name = dict(zip(names, known.tolist(), strict=True))
+        values = np.where(below > 0, above / np.maximum(below, 1e-12), value).clip(least, largest)
+        by_name = dict(zip(names, values.tolist(), strict=True))
         return cls(config, packed[0], packed[1], above, below, b, covariance, by_name)
 
     def added(self, sums: dict[str, tuple[float, float]]) -> tuple[Floats, Floats]:
@@ -164,7 +164,7 @@ def _loosened(scene: Scene, field: Field) -> Prior:
 
 
 def _with_weights(scene: Scene, weight: Floats) -> tuple[Field, LeftOut]:
-    field = given(scene.prior, scene.observed, weight)
+    field = conditioned(scene.prior, scene.observed, weight)
     mean, variance = at(field, scene.observed.node, scene.observed.features)
     left = np.maximum(1 - weight * variance, LEAST_LEFT)
     return field, LeftOut((scene.observed.value - mean) / left, variance / left + scene.noise)
@@ -222,9 +222,9 @@ def elsewhere_variance(config: PosteriorConfig, around: Floats, unseen: Floats) 
 def second_moments(
     config: PosteriorConfig, variance: Floats, p: Floats, offset: Floats, wide: Floats
 ) -> tuple[Floats, Floats]:  # fmt: skip
-    own, q = np.minimum(variance, config.widest), np.exp(np.minimum(-offset, LARGEST))
+    inlier_variance, q = np.minimum(variance, config.widest), np.exp(np.minimum(-offset, LARGEST))
     tail = q * q * np.exp(2 * wide) - 2 * q * np.exp(wide / 2) + 1
-    inlier: Floats = np.exp(2 * own) - 2 * np.exp(own / 2) + 1
+    inlier: Floats = np.exp(2 * inlier_variance) - 2 * np.exp(inlier_variance / 2) + 1
     return (1 - p) * inlier + p * tail, inlier
 
 

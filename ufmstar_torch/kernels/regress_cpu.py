@@ -40,7 +40,7 @@ class Seen(NamedTuple):
     features: NDArray[np.float64]
 
 
-def look(
+def views_of(
     seen: Sequence[Seen], depth: Tensor, intrinsics: Tensor, config: UfMStarConfig, *others: torch.dtype
 ) -> list[View]:
     """The part of each stream's mixture in view, as the exact sum takes it, with the error of the depth's dtype or of a
@@ -84,7 +84,7 @@ def regress_maps(
         each(near, calls)
         return _regression(out, out_f)
     if views is None:
-        views = look(seen, depth, intrinsics, config)
+        views = views_of(seen, depth, intrinsics, config)
     calls = []
     for b, one in enumerate(seen):
         into = out[b], out_f[b]
@@ -109,11 +109,11 @@ def fill_and_smooth(
     Returns:
         The new memory, the map to show, and the number of pixels of each stream that are not measured.
     """
-    given = [array(value) for value in (disagreement, depth, memory)]
-    after, shown = np.empty_like(given[2]), np.empty_like(given[0])
-    share = given[0].dtype.type(config.unmeasured_relative**2 if config.unmeasured == "relative" else 0)
+    maps_in = [array(value) for value in (disagreement, depth, memory)]
+    after, shown = np.empty_like(maps_in[2]), np.empty_like(maps_in[0])
+    share = maps_in[0].dtype.type(config.unmeasured_relative**2 if config.unmeasured == "relative" else 0)
     settings = share, config.unmeasured == "nan", float(alpha)
-    maps = (*given, array(measured), after, shown)
+    maps = (*maps_in, array(measured), after, shown)
     counts = each(_fill_and_smooth, [(*(value[b].reshape(-1) for value in maps), *settings) for b in range(len(after))])
     return torch.from_numpy(after), torch.from_numpy(shown), counts
 
@@ -123,11 +123,11 @@ def _fill_and_smooth(disagreement, depth, previous, measured, memory, shown, sha
     one, zero, unmeasured = shown.dtype.type(1), shown.dtype.type(0), 0
     half = shown.dtype.type(HALF)
     for i in range(shown.size):
-        value, known = disagreement[i], measured[i]
-        missing = one - known
+        value, share_measured = disagreement[i], measured[i]
+        missing = one - share_measured
         value = _plus(value, (missing if missing > zero else zero) * depth[i] * depth[i], share)
-        unmeasured += known < half
-        now, before = memory.dtype.type(np.nan if blank and known < half else value), previous[i]
+        unmeasured += share_measured < half
+        now, before = memory.dtype.type(np.nan if blank and share_measured < half else value), previous[i]
         memory[i] = before if now != now else now if before != before else (1 - alpha) * before + alpha * now
         shown[i] = now if now != now else memory[i]
     return unmeasured

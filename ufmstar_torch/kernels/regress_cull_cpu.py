@@ -143,8 +143,8 @@ def whiten(components, n, whitened):
 
 
 @leaf
-def cull(packed, n, level, box, settings, work, kept):
-    """Write those of the n packed components that matter in the box (low, high) to ``kept``; return how many.
+def cull(packed, n, level, box, settings, work, retained):
+    """Write those of the n packed components that matter in the box (low, high) to ``retained``; return how many.
 
     ``level`` is how many components the level has, whose share of a threshold each may add.
     ``work`` is scratch for 8 numbers and one for each component.
@@ -161,6 +161,6 @@ def cull(packed, n, level, box, settings, work, kept):
     threshold = work[7] + real(_limit(epsilon, level))
     count = 0
     for j in range(n):
-        kept[count] = j
+        retained[count] = j
         count += upper[j] > threshold
     return count

@@ -20,7 +20,7 @@ def near(depth, K, pixels, components, m, features, settings, out, out_f, first,
     """
     prior_weight, prior_mean, sigmas, near, far = settings
     log_peak, local, extent = _prepared(components, m.size, sigmas)
-    gaps, kept, sums = empty(m.size, np.float64), empty(m.size, np.int64), empty(features.shape[1], np.float64)
+    gaps, nearest, sums = empty(m.size, np.float64), empty(m.size, np.int64), empty(features.shape[1], np.float64)
     for i in range(first * pixels.size // shares, (first + 1) * pixels.size // shares):
         v = pixels[i] // depth.shape[1]
         u = pixels[i] - v * depth.shape[1]
@@ -28,7 +28,7 @@ def near(depth, K, pixels, components, m, features, settings, out, out_f, first,
         if z > 0:
             x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
             value = _point(
-                x, y, z, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, kept, sums
+                x, y, z, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, nearest, sums
             )
         out[i] = value
         for g in range(sums.size):
@@ -52,14 +52,14 @@ def _prepared(components, n, sigmas):
 
 
 @part
-def _point(x, y, z, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, kept, sums):
+def _point(x, y, z, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, nearest, sums):
     """The regression at one point; its features are left in ``sums`` [F]."""
     count, least = 0, np.inf
     for k in range(m.size):
         gap = abs(z - local[k, 2]) - extent[k, 2]
         gap = max(gap, abs(x - local[k, 0]) - extent[k, 0], abs(y - local[k, 1]) - extent[k, 1])
         if gap <= far:
-            gaps[count], kept[count] = gap, k
+            gaps[count], nearest[count] = gap, k
             count += 1
             least = min(least, gap)
     radius = near if least <= near else far
@@ -69,7 +69,7 @@ def _point(x, y, z, log_peak, local, extent, m, features, prior_weight, prior_me
     for j in range(count):
         if gaps[j] > radius:
             continue
-        k = kept[j]
+        k = nearest[j]
         dx, dy, dz = x - local[k, 0], y - local[k, 1], z - local[k, 2]
         y0 = local[k, 3] * dx
         y1 = local[k, 4] * dx + local[k, 5] * dy

@@ -16,7 +16,7 @@ import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import contracted, empty, kernel, leaf, part
 from ufmstar_torch.kernels.regress_cull_cpu import FIELDS, cull, pad
-from ufmstar_torch.kernels.regress_vectors_cpu import PIXELS, TILE, TINY, mix, mix_more, mix_three, place
+from ufmstar_torch.kernels.regress_vectors_cpu import PIXELS, TILE, TINY, mix, mix_more, mix_three, place_points
 from ufmstar_torch.kernels.vectors_cpu import LANES
 
 _SIDE = 4  # tiles of a block
@@ -58,9 +58,9 @@ def _scratch(view, features, shift):
 
     Returns:
         Scratch of a tile: its pixels' rays less that through the middle [2, 64], the depths of one of them [64], points
-        [16, 192], boxes and origins [16, 9] in float64, whether they have a pixel, what :func:`place` adds in holes
-        [16, 64], and its work [10]. Of lists of components: their fields, work of :func:`cull`, and two lists. Of sums
-        at a tile: what they start with [6], offsets and densities of components, the sums [5, 64], averages of the
+        [16, 192], boxes and origins [16, 9] in float64, whether they have a pixel, what :func:`place_points` adds in
+        holes [16, 64], and its work [10]. Of lists of components: their fields, work of :func:`cull`, and two lists. Of
+        sums at a tile: what they start with [6], offsets and densities of components, the sums [5, 64], averages of the
         other features, and the values of one of them.
     """
     n, dtype, more = view[2].shape[1], view[2].dtype, features - _mixed(features)  # n is padded
@@ -102,7 +102,7 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
             seen[tile] = v < depth.shape[0] and u < depth.shape[1]
             if seen[tile]:
                 _depths(depth, v, u, z)
-                seen[tile] = _place((u + half - K[0, 2]) / K[0, 0], (v + half - K[1, 2]) / K[1, 1], tiles, tile)
+                seen[tile] = _placed((u + half - K[0, 2]) / K[0, 0], (v + half - K[1, 2]) / K[1, 1], tiles, tile)
             some |= seen[tile]
         if not some:
             continue
@@ -147,7 +147,7 @@ def _block(pixel, width, columns):
 def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sums, out, out_f):
     """The blocks of an image at some pixels, up to 64 at a time; ``begin`` and ``order`` are those of
     :func:`_by_block`."""
-    grid, z, kept, averages, more, last = tiles[0], tiles[1], lists[2], sums[3], sums[4], out_f.shape[0] - 1
+    grid, z, retained, averages, more, last = tiles[0], tiles[1], lists[2], sums[3], sums[4], out_f.shape[0] - 1
     columns = (depth.shape[1] + _BLOCK - 1) // _BLOCK
     for block in range(begin.size - 2):
         v0, u0 = block // columns * _BLOCK + 0.5 * (_BLOCK - 1), block % columns * _BLOCK + 0.5 * (_BLOCK - 1)
@@ -160,11 +160,11 @@ def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sum
                 z[i] = depth[v, u]
             for i in range(count, PIXELS):  # the last one again
                 grid[0, i], grid[1, i], z[i] = grid[0, count - 1], grid[1, count - 1], z[count - 1]
-            if not _place((u0 - K[0, 2]) / K[0, 0], (v0 - K[1, 2]) / K[1, 1], tiles, 0):
+            if not _placed((u0 - K[0, 2]) / K[0, 0], (v0 - K[1, 2]) / K[1, 1], tiles, 0):
                 continue
-            chosen = cull(view[2], view[0].size, view[4][4], _box(tiles[3], 0), view[4], lists[1], kept)
+            chosen = cull(view[2], view[0].size, view[4][4], _box(tiles[3], 0), view[4], lists[1], retained)
             filled = (count + LANES - 1) // LANES * LANES
-            _average(filled, tiles, 0, kept, chosen, view, features, sums)
+            _average(filled, tiles, 0, retained, chosen, view, features, sums)
             for i in range(count):
                 out[order[low + i]] = averages[_TOTAL, i]
                 for g in range(more.shape[0]):
@@ -187,14 +187,14 @@ def _depths(depth, v0, u0, z):
 
 
 @leaf
-def _place(x, y, tiles, tile):
+def _placed(x, y, tiles, tile):
     """The points of a tile, its box (low, high) and its origin; False where all of its pixels are holes.
 
     ``x`` and ``y`` are the ray through its middle, at z = 1.
     """
     grid, z, points, boxes, _, hole, work = tiles
     work[7], work[8] = x, y
-    place(z, grid, work[7:], points[tile], hole[tile], work)
+    place_points(z, grid, work[7:], points[tile], hole[tile], work)
     least = np.float64(work[6])
     if not least < np.inf:
         return False

@@ -16,7 +16,7 @@ TINY = 2.0**-100
 
 
 @vectors
-def place(code, z, grid, ray, points, hole, box):
+def place_points(code, z, grid, ray, points, hole, box):
     """The points of a tile from its origin, the middle of the tile at the least depth.
 
     Args:
@@ -29,8 +29,8 @@ def place(code, z, grid, ray, points, hole, box):
     """
     rows, ray_x, ray_y = range(0, PIXELS, code.lanes), ray.one(0), ray.one(1)
     depths = [z.load(row) for row in rows]
-    given = [(depth > 0.0).select(depth, math.inf) for depth in depths]
-    least = functools.reduce(Lanes.at_most, given).everywhere(Lanes.at_most)
+    filled = [(depth > 0.0).select(depth, math.inf) for depth in depths]
+    least = functools.reduce(Lanes.at_most, filled).everywhere(Lanes.at_most)
     columns: list[list[Lanes]] = [[], [], []]
     for row, depth in zip(rows, depths, strict=True):
         seen = depth > 0.0
@@ -111,9 +111,9 @@ def _mix(code, terms, chosen, offsets, count, points, some, start, hole, sums, d
         x, y, z = (points.load(i, axis * PIXELS) for axis in range(3))
         totals = [code.variable(start.one(min(row, 3))) for row in range(2 + features)]
         with code.loop(count) as j:
-            at, beside = code.times(chosen.whole(j), TERMS), code.times(j, 3)
+            at, offset = code.times(chosen.whole(j), TERMS), code.times(j, 3)
             a, b, c, d, e, f, peak, *averaged = (terms.one(at, term) for term in range(8 + features))
-            x0, y0, z0 = (offsets.one(beside, axis) for axis in range(3))
+            x0, y0, z0 = (offsets.one(offset, axis) for axis in range(3))
             p, q, r = a * x + x0, b * x + (c * y + y0), d * x + (e * y + (f * z + z0))
             density = (((peak - p * p) - q * q) - r * r).exp2()
             for total, part in zip(totals, (density, *(density * value for value in averaged)), strict=True):
@@ -159,15 +159,15 @@ def add_shares(code, fields, stride, n, point, row, density, added):
     at = [point.one(axis) for axis in range(3)]
     total = code.variable(at[0] * 0.0)
     with code.loop(n, code.lanes) as j:
-        given = [fields.load(code.plus(j, code.times(stride, i))) for i in range(10)]
-        (x, y, z), (a, b, c, d, e, f) = (one - mean for one, mean in zip(at, given[:3], strict=True)), given[3:9]
+        columns = [fields.load(code.plus(j, code.times(stride, i))) for i in range(10)]
+        (x, y, z), (a, b, c, d, e, f) = (one - mean for one, mean in zip(at, columns[:3], strict=True)), columns[3:9]
         p, q, r = a * x, b * x + c * y, d * x + (e * y + f * z)
-        value = (((given[9] - p * p) - q * q) - r * r).exp2()
+        value = (((columns[9] - p * p) - q * q) - r * r).exp2()
         density.store(value, j)
         total.value = total.value + value
     evidence = total.value.everywhere(Lanes.__add__) + row.one(3)
     shares = [row.one(axis).over(evidence) for axis in range(3)]
     with code.loop(n, code.lanes) as j:
         for axis, share in enumerate(shares):
-            place = code.plus(j, code.times(stride, axis))
-            added.store(added.load(place) + density.load(j) * share, place)
+            target = code.plus(j, code.times(stride, axis))
+            added.store(added.load(target) + density.load(j) * share, target)

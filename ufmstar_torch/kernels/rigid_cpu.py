@@ -52,7 +52,7 @@ def turn(code, motion, n, stride, fields):
     R = [[motion.one(4 * i + j) for j in range(4)] for i in range(3)]
     with code.loop(n, code.lanes) as column:
         at = [code.plus(column, code.times(stride, i)) for i in range(WEIGHT)]
-        x, y, z, *S = (fields.load(place) for place in at)
+        x, y, z, *S = (fields.load(row) for row in at)
         half = [[a * S[j] + b * S[3 + j] + c * S[6 + j] for j in range(3)] for a, b, c, _ in R]
         for i, (a, b, c, t) in enumerate(R):
             fields.store(a * x + b * y + c * z + t, at[i])

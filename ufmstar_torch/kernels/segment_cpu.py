@@ -47,26 +47,26 @@ class _Limits(NamedTuple):
     min_rows: int
 
 
-def segment(given: SegmentInput) -> tuple[GaussianMixture, Tensor]:
+def segment(inputs: SegmentInput) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.segment.segment`, for CPU tensors, float64 inside."""
-    mixture, labels = gaussians(given)
+    mixture, labels = gaussians(inputs)
     return mixture, labels()
 
 
-def gaussians(given: SegmentInput) -> tuple[GaussianMixture, Callable[[], Tensor]]:
+def gaussians(inputs: SegmentInput) -> tuple[GaussianMixture, Callable[[], Tensor]]:
     """The mixture of :func:`segment`, and a function that writes the labels."""
-    z = array(given.depth)
+    z = array(inputs.depth)
     streams, height, width = z.shape
-    limits = _limits(given.config, given.depth_bins)
-    room = height * given.segments_per_row
+    limits = _limits(inputs.config, inputs.depth_bins)
+    room = height * inputs.segments_per_row
     spans, runs = np.empty((streams, height, 4), np.int64), np.empty((streams, height * width, 2), np.int32)
     table, table_int = np.empty((streams, room, SEGMENT)), np.empty((streams, room, SEGMENT_INT), np.int64)
     shares = shares_of_stream(streams, height * width // _LIGHTER)
     rows = [height * i // shares for i in range(shares + 1)]
     scans, joins = [], []
-    for b, K in enumerate(array(given.intrinsics).tolist()):
+    for b, K in enumerate(array(inputs.intrinsics).tolist()):
         fx, fy, cx, cy = K[0][0], K[1][1], K[0][2], K[1][2]
-        slope = given.config.slope(min(fx, fy))
+        slope = inputs.config.slope(min(fx, fy))
         bins = _depth_bins(0.5 * min(width / fx, height / fy), limits)
         tables = spans[b], table[b], table_int[b]
         for first, last in itertools.pairwise(rows):
@@ -82,14 +82,14 @@ def gaussians(given: SegmentInput) -> tuple[GaussianMixture, Callable[[], Tensor
         return torch.from_numpy(out)
 
     dtype = z.dtype
-    k = max(1, *(kept.size for kept, *_ in joined))
+    k = max(1, *(retained.size for retained, *_ in joined))
     mean, covariance = np.zeros((streams, k, 3), dtype), np.zeros((streams, k, 3, 3), dtype)
     weight, count = np.zeros((streams, k), dtype), np.zeros((streams, k), np.int64)
     for b, fit in enumerate(joined):
         write_gaussians(*fit[:3], mean[b], covariance[b], weight[b], count[b])
     features = np.empty((streams, k, 0), dtype)
-    if given.features is not None:
-        features = _feature_means(array(given.features), labels().numpy(), weight)
+    if inputs.features is not None:
+        features = _feature_means(array(inputs.features), labels().numpy(), weight)
     fields = (mean, covariance, weight, np.zeros((streams, k), dtype), count, features)
     return GaussianMixture(*map(torch.from_numpy, fields)), labels
 
@@ -98,9 +98,9 @@ def _feature_means(features: np.ndarray, labels: np.ndarray, weight: np.ndarray)
     """Means [B, K, F] of the features [B, F, H, W] over the pixels of each Gaussian, summed in raster order, in the
     dtype of ``weight`` [B, K]."""
     out = np.empty((*weight.shape, features.shape[1]), weight.dtype)
-    for b, place in enumerate(labels + 1):  # 0: of no Gaussian
+    for b, gaussian in enumerate(labels + 1):  # 0: of no Gaussian
         for f, values in enumerate(features[b]):
-            sums = np.bincount(place.ravel(), values.ravel(), weight.shape[1] + 1)
+            sums = np.bincount(gaussian.ravel(), values.ravel(), weight.shape[1] + 1)
             out[b, :, f] = sums[1:] / np.maximum(weight[b], 1)
     return out
 

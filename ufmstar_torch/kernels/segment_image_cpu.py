@@ -53,13 +53,13 @@ def join_rows(width, fy, cy, slope, lengths2, limits, spans, table, table_int):
             active, interval, before, created, member, h,
         )  # fmt: skip
         before, emitted = _retire(active, interval, n, v, v == height - 1, whole, emitted)
-    kept, place, slot = empty(created, np.int64), empty(created, np.int64), empty(table.shape[0] + 1, np.int64)
-    n = _prune(whole, created, limits, empty(created, np.int64), kept, place)
+    retained, position, slot = empty(created, np.int64), empty(created, np.int64), empty(table.shape[0] + 1, np.int64)
+    n = _prune(whole, created, limits, empty(created, np.int64), retained, position)
     slot[0] = -1
     for v in range(height):
         for i in range(spans[v, 0], spans[v, 1]):
-            slot[i + 1] = place[member[i]]
-    return kept[:n], gaussians, whole, slot
+            slot[i + 1] = position[member[i]]
+    return retained[:n], gaussians, whole, slot
 
 
 @kernel
@@ -210,7 +210,7 @@ def _merge(o, o_int, h, h_int):
 
 
 @leaf
-def _prune(whole, created, limits, emitted, kept, place):
+def _prune(whole, created, limits, emitted, retained, position):
     """Write the kept Gaussians in order of emission, and for each in order of creation its place among them or -1.
 
     Returns how many are kept; ``emitted`` is scratch.
@@ -220,21 +220,21 @@ def _prune(whole, created, limits, emitted, kept, place):
     n = 0
     for i in range(created):
         g = emitted[i]
-        place[g] = -1
+        position[g] = -1
         large, tall = whole[g, N] >= limits.min_pixels, whole[g, _MERGED] >= limits.min_rows
         if limits.prune == 0 or (large and tall) or (limits.prune == 1 and (large or tall)):
-            kept[n] = g
-            place[g] = n
+            retained[n] = g
+            position[g] = n
             n += 1
     return n
 
 
 @kernel
-def write_gaussians(kept, gaussians, whole, mean, covariance, weight, count):
+def write_gaussians(retained, gaussians, whole, mean, covariance, weight, count):
     """The kept Gaussians as the mixture's slots; a single pixel has no sample covariance (zeros)."""
-    for i in range(kept.size):
-        g = gaussians[kept[i]]
-        n = whole[kept[i], N]
+    for i in range(retained.size):
+        g = gaussians[retained[i]]
+        n = whole[retained[i], N]
         weight[i], count[i] = n, 1
         scatter = 0
         for r in range(3):

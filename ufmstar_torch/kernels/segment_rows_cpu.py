@@ -56,7 +56,9 @@ def scan_rows(z, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, sp
     rx = empty(width, np.float64)
     for u in range(width):
         rx[u] = (u - cx) / fx
-    place = empty(width + 1, np.int32)  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
+    finished_index = empty(
+        width + 1, np.int32
+    )  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
     older = empty((limits.max_open, 15), np.float64)
     end, pixels = first * segments_of_row(width, limits), first * width
     for v in range(first, last):
@@ -66,8 +68,8 @@ def scan_rows(z, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, sp
             depth[u] = d if (d > 0) & (d <= limits.max_depth) else 0.0  # NaN fails every comparison
         _thresholds(depth, rx, slope, limits, x, tau_z)
         end, pixels = _scanline(
-            (depth, x, tau_z), (v - cy) / fy, slope, lengths2, edges, limits, older, table, table_int, end, place,
-            runs, pixels,
+            (depth, x, tau_z), (v - cy) / fy, slope, lengths2, edges, limits, older, table, table_int, end,
+            finished_index, runs, pixels,
         )  # fmt: skip
         spans[v, 1], spans[v, 3] = end, pixels
 
@@ -100,13 +102,13 @@ def _near(x, z, last_x, last_z, tau_z, slope, limits):
 
 @leaf
 def _scanline(
-    row, ry, slope, lengths2, edges, limits, older, segments, segments_int, done, place, runs, run,
+    row, ry, slope, lengths2, edges, limits, older, segments, segments_int, done, finished_index, runs, run,
 ):  # fmt: skip
     """Scanline segmentation of a row, of which ``row`` are depth, x and tau_z.
 
     Writes the finished segments from ``done`` on and the runs from ``run`` on; returns the end of both. The newest open
     segment lives in registers, the others in a ring of max_open - 1 places, ``front`` being the newest of them.
-    ``place`` is scratch.
+    ``finished_index`` is scratch.
     """
     depth, x, tau_z = row
     y_factor, room, first_run = 1.0 + ry * ry, limits.max_open - 1, run
@@ -136,7 +138,7 @@ def _scanline(
                 continue
             if newest.n > 0:
                 front, waiting, done = _push(
-                    newest, older, front, waiting, room, limits.sparse, segments, segments_int, done, place
+                    newest, older, front, waiting, room, limits.sparse, segments, segments_int, done, finished_index
                 )
             started += 1
             newest = _fresh(u, k, started, x[u], z)
@@ -151,13 +153,13 @@ def _scanline(
             newest = _extended(newest, x[u], depth[u], u, k, y_factor)
             u += 1
     if newest.n > 0:
-        done = _finish(newest, limits.sparse, segments, segments_int, done, place)
+        done = _finish(newest, limits.sparse, segments, segments_int, done, finished_index)
     for i in range(waiting):
         q = front - i if front >= i else front - i + room
-        done = _finish(_load(older, q), limits.sparse, segments, segments_int, done, place)
-    place[0] = 0
+        done = _finish(_load(older, q), limits.sparse, segments, segments_int, done, finished_index)
+    finished_index[0] = 0
     for i in range(first_run, run):
-        runs[i, 1] = place[runs[i, 1]]
+        runs[i, 1] = finished_index[runs[i, 1]]
     return done, run
 
 
@@ -177,14 +179,14 @@ def _begun(runs, first, run, u, owner):
 
 
 @leaf
-def _push(newest, older, front, waiting, room, sparse, segments, segments_int, done, place):
+def _push(newest, older, front, waiting, room, sparse, segments, segments_int, done, finished_index):
     """Let the newest open segment wait, and finish the oldest if there is no room."""
     if room == 0:
-        return front, waiting, _finish(newest, sparse, segments, segments_int, done, place)
+        return front, waiting, _finish(newest, sparse, segments, segments_int, done, finished_index)
     front = front + 1 if front + 1 < room else 0
     if waiting == room:  # the ring is full: the place after the front holds the oldest
         oldest = _load(older, front)
-        done = _finish(oldest, sparse, segments, segments_int, done, place)
+        done = _finish(oldest, sparse, segments, segments_int, done, finished_index)
     else:
         waiting += 1
     _store(older, front, newest)
@@ -242,12 +244,12 @@ def _load(older, q):
 
 
 @leaf
-def _finish(o, sparse, segments, segments_int, done, place):
+def _finish(o, sparse, segments, segments_int, done, finished_index):
     """Output an open segment unless it is too sparse; returns the new number of finished ones."""
     if o.n <= sparse:
-        place[o.born] = 0
+        finished_index[o.born] = 0
         return done
-    place[o.born] = done + 1
+    finished_index[o.born] = done + 1
     out, whole = segments[done], segments_int[done]
     out[MX], out[MZ] = o.x_left + o.dx / o.n, o.z_left + o.dz / o.n
     out[CXX] = o.dxx - o.dx * o.dx / o.n

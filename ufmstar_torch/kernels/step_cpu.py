@@ -25,7 +25,7 @@ from ufmstar_torch.fuse import make_room
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.fuse_cpu import lift
-from ufmstar_torch.kernels.regress_cpu import Seen, View, fill_and_smooth, look, regress_maps
+from ufmstar_torch.kernels.regress_cpu import Seen, View, fill_and_smooth, regress_maps, views_of
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, padded
 from ufmstar_torch.kernels.segment_cpu import gaussians
 from ufmstar_torch.kernels.stream_cpu import join, match
@@ -175,10 +175,10 @@ def _join(
         capacity *= 2
     updated = tuple(_extended(value, capacity) for value in slots)
     settings = config.overlap_weighted, float(np.finfo(slots[1].dtype).eps)
-    poses, given = array(frame.T_world_cam), (*segments[:3], segments[5])
+    poses, current = array(frame.T_world_cam), (*segments[:3], segments[5])
     calls = [
         (
-            poses[b], first[b], tuple(value[b] for value in updated), tuple(value[b] for value in given), pair[:3],
+            poses[b], first[b], tuple(value[b] for value in updated), tuple(value[b] for value in current), pair[:3],
             _distance(b, pair, segments, config), pair.new, pair.occupied,
             settings, columns + 1,
         )
@@ -211,10 +211,10 @@ def _within_limit(joined: _Joined, old: Sequence[int], position: Tensor, limit: 
     room = make_room(GaussianMixture(**joined.mixture), joined.sums, before, coming, position, limit)
     seen = []
     for one, source, components in zip(joined.seen, array(room.slot), room.mixture.components.tolist(), strict=True):
-        kept = source[:components]
+        retained = source[:components]
         here = np.zeros((FIELDS, padded(components)))
-        here[:, :components] = one.components[:, kept]
-        seen.append(Seen(here, one.disagreement[kept], one.features[kept]))
+        here[:, :components] = one.components[:, retained]
+        seen.append(Seen(here, one.disagreement[retained], one.features[retained]))
     return _Joined(
         {name: value[:, :limit].contiguous() for name, value in room.mixture.tensors().items()},
         seen,
@@ -232,7 +232,7 @@ def _columns(
     what is in view, and what the regression is to add to the columns, where an extension works on what is in view."""
     capacity, tensors = joined.mixture["weight"].shape[1], {**state.by_stream, **joined.sums}
     if config.regression == "exact":
-        views = look(joined.seen, frame.depth, frame.intrinsics, config, state.covariance.dtype)
+        views = views_of(joined.seen, frame.depth, frame.intrinsics, config, state.covariance.dtype)
         if (found := extensions.in_view(tensors, capacity, joined.seen, views)) is not None:
             return found[0], views, array(found[1])
     mixture = GaussianMixture(**joined.mixture).to(torch.float64)

@@ -180,14 +180,14 @@ def device_step(
     b = frame.depth.shape[0]
     stored = state.covariance.dtype
     eps = 8 * torch.finfo(stored).eps
-    given = SegmentInput.of_frame(frame, config)
-    current, _ = fit(given, floor=Floor(config.near_plane, eps))
+    inputs = SegmentInput.of_frame(frame, config)
+    current, _ = fit(inputs, floor=Floor(config.near_plane, eps))
     here = cameras(state, frame)
     camera = frame.intrinsics.contiguous()
     previous, new = candidates(state.mixture, here.to_camera, current, camera, frame.size, config)
     counts = torch.zeros(ends.COUNTS, b, dtype=torch.int64, device=frame.depth.device)
     bits, matched = match_bits(previous, new, config, counts[ends.PAIRS])
-    mixture = fuse_bits(state.mixture, current, here.to_first, (bits, new.index, previous.place, new.count), config)
+    mixture = fuse_bits(state.mixture, current, here.to_first, (bits, new.index, previous.position, new.count), config)
     full, gone = _full(mixture.capacity, config), torch.zeros_like(frame.fault)
     if full and config.max_components is not None:
         coming = (current.valid & (current.mean[..., 2] > config.near_plane) & ~matched).sum(1)

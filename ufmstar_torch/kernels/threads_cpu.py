@@ -24,9 +24,9 @@ def each(function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> 
         return [function(*one) for one in arguments]
     # The calls are independent: which thread takes which changes no result. The last one is this thread's own.
     pool = _pool(os.getpid(), threads - 1)
-    own = range(threads - 1, len(arguments), threads)
-    others = {i: pool.submit(function, *arguments[i]) for i in range(len(arguments)) if i not in own}
-    results = {i: function(*arguments[i]) for i in own} | {i: other.result() for i, other in others.items()}
+    here = range(threads - 1, len(arguments), threads)
+    others = {i: pool.submit(function, *arguments[i]) for i in range(len(arguments)) if i not in here}
+    results = {i: function(*arguments[i]) for i in here} | {i: other.result() for i, other in others.items()}
     return [results[i] for i in range(len(arguments))]
 
 

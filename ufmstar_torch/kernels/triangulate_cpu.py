@@ -78,27 +78,31 @@ def _tracks(pixel, seen, into, out_of, centre, damping, steps, point, covariance
     """Pixels [N, W, 2] are counted from the principal point. ``into`` [W, 3, 3] takes an offset from a camera to
     (u z, v z, z) in its image, ``out_of`` [W, 3, 3] a pixel (u, v, 1) to the direction of its ray."""
     views = seen.shape[1]
-    given, work, inverse = np.empty((views, 3 * _LANES)), np.empty(14 * _LANES), np.empty((3, 3))
+    seen_at, work, inverse = np.empty((views, 3 * _LANES)), np.empty(14 * _LANES), np.empty((3, 3))
     for first in range(0, seen.shape[0], _LANES):
         count = min(_LANES, seen.shape[0] - first)
         for w in range(views):
             for lane in range(_LANES):
                 n = first + min(lane, count - 1)
                 u, v = (pixel[n, w, 0], pixel[n, w, 1]) if seen[n, w] else (0.0, 0.0)
-                given[w, lane], given[w, _LANES + lane], given[w, 2 * _LANES + lane] = u, v, 1.0 if seen[n, w] else 0.0
-        _nearest(given, out_of, centre, work)
+                seen_at[w, lane], seen_at[w, _LANES + lane], seen_at[w, 2 * _LANES + lane] = (
+                    u,
+                    v,
+                    1.0 if seen[n, w] else 0.0,
+                )
+        _nearest(seen_at, out_of, centre, work)
         for step in range(steps + 1):
             for lane in range(count):
                 _inverse(work, lane, damping, inverse)
                 r0, r1, r2 = work[_R0 + lane], work[_R1 + lane], work[_R2 + lane]
                 for i in range(3):
                     change = inverse[i, 0] * r0 + inverse[i, 1] * r1 + inverse[i, 2] * r2
-                    place = i * _LANES + lane
-                    work[place] = change if step == 0 else work[place] - change
+                    at = i * _LANES + lane
+                    work[at] = change if step == 0 else work[at] - change
             for lane in range(count, _LANES):
                 for i in range(3):
                     work[i * _LANES + lane] = work[i * _LANES + count - 1]
-            _linearised(given, into, centre, work)
+            _linearised(seen_at, into, centre, work)
         for lane in range(count):
             n, shown = first + lane, 0
             for w in range(views):
@@ -111,17 +115,17 @@ def _tracks(pixel, seen, into, out_of, centre, damping, steps, point, covariance
 
 
 @part
-def _nearest(given, out_of, centre, work):
+def _nearest(seen_at, out_of, centre, work):
     """Normal equations of the points nearest to all rays."""
     for i in range(_N00, work.size):
         work[i] = 0.0
-    for w in range(given.shape[0]):
+    for w in range(seen_at.shape[0]):
         m00, m01, m02 = out_of[w, 0, 0], out_of[w, 0, 1], out_of[w, 0, 2]
         m10, m11, m12 = out_of[w, 1, 0], out_of[w, 1, 1], out_of[w, 1, 2]
         m20, m21, m22 = out_of[w, 2, 0], out_of[w, 2, 1], out_of[w, 2, 2]
         c0, c1, c2 = centre[w, 0], centre[w, 1], centre[w, 2]
         for i in range(_LANES):
-            u, v, seen = given[w, i], given[w, _LANES + i], given[w, 2 * _LANES + i]
+            u, v, seen = seen_at[w, i], seen_at[w, _LANES + i], seen_at[w, 2 * _LANES + i]
             x, y, z = m00 * u + m01 * v + m02, m10 * u + m11 * v + m12, m20 * u + m21 * v + m22
             share = seen / (x * x + y * y + z * z)
             a00, a01, a02 = seen - share * x * x, -share * x * y, -share * x * z
@@ -138,23 +142,23 @@ def _nearest(given, out_of, centre, work):
 
 
 @part
-def _linearised(given, into, centre, work):
+def _linearised(seen_at, into, centre, work):
     """Normal equations of a Gauss-Newton step from the points; the sums of squared residuals [px^2], and whether the
     points lie in front of all views."""
     for i in range(_N00, work.size):
         work[i] = 1.0 if i >= _FRONT else 0.0
-    for w in range(given.shape[0]):
+    for w in range(seen_at.shape[0]):
         p00, p01, p02 = into[w, 0, 0], into[w, 0, 1], into[w, 0, 2]
         p10, p11, p12 = into[w, 1, 0], into[w, 1, 1], into[w, 1, 2]
         p20, p21, p22 = into[w, 2, 0], into[w, 2, 1], into[w, 2, 2]
         c0, c1, c2 = centre[w, 0], centre[w, 1], centre[w, 2]
         for i in range(_LANES):
-            x, y, z, seen = work[_X + i] - c0, work[_Y + i] - c1, work[_Z + i] - c2, given[w, 2 * _LANES + i]
+            x, y, z, seen = work[_X + i] - c0, work[_Y + i] - c1, work[_Z + i] - c2, seen_at[w, 2 * _LANES + i]
             depth = p20 * x + p21 * y + p22 * z
             work[_FRONT + i] = work[_FRONT + i] if depth > 0 or seen == 0 else 0.0
             over = 1 / depth if abs(depth) > 1e-9 else 1e9
             u, v = (p00 * x + p01 * y + p02 * z) * over, (p10 * x + p11 * y + p12 * z) * over
-            du, dv, over = seen * (u - given[w, i]), seen * (v - given[w, _LANES + i]), seen * over
+            du, dv, over = seen * (u - seen_at[w, i]), seen * (v - seen_at[w, _LANES + i]), seen * over
             a0, a1, a2 = (p00 - u * p20) * over, (p01 - u * p21) * over, (p02 - u * p22) * over
             b0, b1, b2 = (p10 - v * p20) * over, (p11 - v * p21) * over, (p12 - v * p22) * over
             work[_SQUARES + i] += du * du + dv * dv

@@ -114,39 +114,39 @@ class Memory:
         self._builder, self._data, self._size = builder, data, 8 if isinstance(real, ir.DoubleType) else 4
         self._vector = ir.VectorType(real, _BYTES // self._size)
 
-    def _at(self, place: Any, offset: int) -> Any:
-        place = _INDEX(place) if isinstance(place, int) else place
-        return self._builder.gep(self._data, [self._builder.add(place, _INDEX(offset)) if offset else place])
+    def _at(self, index: Any, offset: int) -> Any:
+        index = _INDEX(index) if isinstance(index, int) else index
+        return self._builder.gep(self._data, [self._builder.add(index, _INDEX(offset)) if offset else index])
 
     def _lanes(self, value: Any) -> Lanes:
         return Lanes(self._builder, value, self._flags)
 
-    def load(self, place: Any, offset: int = 0) -> Lanes:
+    def load(self, index: Any, offset: int = 0) -> Lanes:
         """The vector from ``place + offset`` on."""
-        value = self._builder.load(self._builder.bitcast(self._at(place, offset), self._vector.as_pointer()))
+        value = self._builder.load(self._builder.bitcast(self._at(index, offset), self._vector.as_pointer()))
         value.align = self._size
         return self._lanes(value)
 
-    def store(self, value: Lanes, place: Any, offset: int = 0) -> None:
+    def store(self, value: Lanes, index: Any, offset: int = 0) -> None:
         """Write a vector from ``place + offset`` on."""
-        at = self._builder.bitcast(self._at(place, offset), self._vector.as_pointer())
+        at = self._builder.bitcast(self._at(index, offset), self._vector.as_pointer())
         self._builder.store(value.value, at).align = self._size
 
-    def one(self, place: Any, offset: int = 0) -> Lanes:
+    def one(self, index: Any, offset: int = 0) -> Lanes:
         """A single number, in all places of a vector."""
         none, first = ir.Constant(self._vector, ir.Undefined), ir.IntType(32)(0)
-        filled = self._builder.insert_element(none, self._builder.load(self._at(place, offset)), first)
+        filled = self._builder.insert_element(none, self._builder.load(self._at(index, offset)), first)
         places = ir.Constant(ir.VectorType(ir.IntType(32), self._vector.count), [0] * self._vector.count)
         return self._lanes(self._builder.shuffle_vector(filled, none, places))
 
-    def whole(self, place: Any) -> Any:
+    def whole(self, index: Any) -> Any:
         """A number of an array of int64, as a place in another one."""
-        return self._builder.load(self._at(place, 0))
+        return self._builder.load(self._at(index, 0))
 
-    def put(self, value: Lanes, place: Any, offset: int = 0) -> None:
+    def put(self, value: Lanes, index: Any, offset: int = 0) -> None:
         """Write the first number of a vector."""
         first = self._builder.extract_element(value.value, ir.IntType(32)(0))
-        self._builder.store(first, self._at(place, offset))
+        self._builder.store(first, self._at(index, offset))
 
 
 class Code:
@@ -165,13 +165,13 @@ class Code:
         with cgutils.for_range_slice(self._builder, _INDEX(0), end, _INDEX(step), inc=True) as (i, _):
             yield i
 
-    def times(self, place: Any, factor: int) -> Any:
+    def times(self, index: Any, factor: int) -> Any:
         """A product of integers."""
-        return self._builder.mul(place, _INDEX(factor)) if factor else _INDEX(0)
+        return self._builder.mul(index, _INDEX(factor)) if factor else _INDEX(0)
 
-    def plus(self, place: Any, more: Any) -> Any:
+    def plus(self, index: Any, more: Any) -> Any:
         """A sum of integers."""
-        return self._builder.add(place, more)
+        return self._builder.add(index, more)
 
     def when(self, condition: Any) -> Any:
         """A context whose code runs where the argument ``condition`` is True."""
@@ -215,13 +215,13 @@ def vectors(function: Callable[..., None], *, joined: bool = True) -> Any:
         lanes = _BYTES // (real.bitwidth // 8)
 
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            given = [
+            wrapped = [
                 Memory(builder, context.make_array(kind)(context, builder, value).data, flags)
                 if isinstance(kind, types.Array)
                 else value
                 for kind, value in zip(signature.args, values, strict=True)
             ]
-            function(Code(builder, lanes), *given)
+            function(Code(builder, lanes), *wrapped)
             return context.get_dummy_value()
 
         return types.void(*arguments), generate

@@ -96,7 +96,13 @@ class PosteriorExtension(Extension):
         Running.of(torch.where(packed.any(1, keepdim=True), started, packed), self._config.posterior).require()
 
     def of_frame(
-        self, frame: FrameInput, own: Sequence[Tensor], given: Any, before: Sequence[FrameExtension], *, dense: bool
+        self,
+        frame: FrameInput,
+        network_variances: Sequence[Tensor],
+        argument: Any,
+        before: Sequence[FrameExtension],
+        *,
+        dense: bool,
     ) -> FrameExtension:
         """It needs whole maps: with a subset of pixels it does nothing."""
         of_anchors = [one for one in before if isinstance(one, AnchorFrame)]

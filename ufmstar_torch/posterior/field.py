@@ -41,8 +41,8 @@ def solve(diagonal: Tensor, right: Tensor, down: Tensor, columns: Tensor, cols: 
     A = torch.diag_embed(diagonal)
     for step, link in ((1, right[:, : n - 1]), (cols, down[:, : n - cols])):
         ends = torch.nn.functional.pad(link, (0, step)) + torch.nn.functional.pad(link, (step, 0))
-        beside = torch.diag_embed(link, step) + torch.diag_embed(link, -step)
-        A = A + torch.diag_embed(ends) - beside
+        off_diagonal = torch.diag_embed(link, step) + torch.diag_embed(link, -step)
+        A = A + torch.diag_embed(ends) - off_diagonal
     L = torch.linalg.cholesky(A)
     return Solved(torch.cholesky_solve(columns, L), torch.cholesky_inverse(L).diagonal(dim1=1, dim2=2))
 
@@ -101,7 +101,7 @@ class Field:
     variance: Tensor
 
     @classmethod
-    def given(cls, prior: Prior, observed: Observed, weight: Tensor) -> Field:
+    def conditioned(cls, prior: Prior, observed: Observed, weight: Tensor) -> Field:
         """Condition the prior on the observations with the precisions ``weight`` [B, N]."""
         weighted = weight[..., None] * observed.features
         left = observed.value - (observed.features * prior.mean[:, None]).sum(-1)

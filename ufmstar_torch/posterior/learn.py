@@ -69,7 +69,7 @@ def _of_discs(
     held = _discs(scene, running.frames) & scene.valid
     rest = scene.valid & ~held
     held = held & (rest.sum(1, keepdim=True) >= LEAST_REST)
-    field = Field.given(scene.prior, scene.observed, weight * rest)
+    field = Field.conditioned(scene.prior, scene.observed, weight * rest)
     mean, variance = field.at(scene.observed.node, scene.observed.features)
     away = torch.gather(away_from(scene, rest), 1, scene.observed.node)
     error, b = scene.observed.value - mean, field.coefficients
@@ -80,14 +80,17 @@ def _of_discs(
     around, scale, steep = (torch.gather(x, 1, scene.observed.node) for x in nodes)
     factor, more_wrong = inlier_factor(running, away), wrong_factor(scene.config, away, scale)
     unseen = away * running.ratio("unseen")[:, None]
-    own = scale * (factor * (variance + scene.noise + unseen) + steep)
+    inlier_variance = scale * (factor * (variance + scene.noise + unseen) + steep)
     p, wide = wrong(running, more_wrong), elsewhere_variance(scene.config, around, unseen)
-    z2 = error.square() / own - (error + offset).square() / (scene.noise + wide)
-    elsewhere = torch.sigmoid(p.logit() + ((own / (scene.noise + wide)).log() + z2) / 2)
-    stated = second_moments(scene.config, own, p, offset, wide)[0]
+    z2 = error.square() / inlier_variance - (error + offset).square() / (scene.noise + wide)
+    elsewhere = torch.sigmoid(p.logit() + ((inlier_variance / (scene.noise + wide)).log() + z2) / 2)
+    stated = second_moments(scene.config, inlier_variance, p, offset, wide)[0]
     return _of_pairs(scene, held, torch.stack([error, variance, away, scene.noise]), running) | {
         "wrong": (total(area * elsewhere, 1), total(area * more_wrong, 1)),
-        "inlier": (total(area * (1 - elsewhere) * factor * error.square() / own, 1), total(area * (1 - elsewhere), 1)),
+        "inlier": (
+            total(area * (1 - elsewhere) * factor * error.square() / inlier_variance, 1),
+            total(area * (1 - elsewhere), 1),
+        ),
         "calibration": (total(area * error.square() / stated, 1), total(area, 1)),
     }
 

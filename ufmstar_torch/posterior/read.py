@@ -42,14 +42,14 @@ def read(
     d = torch.where(valid, depth, torch.ones_like(depth)).double()
     logs = d.log()
     v, u = ((torch.arange(n, dtype=d.dtype, device=d.device) + 0.5) / n for n in (height, width))
-    (top, below), (left, beside) = _between(v, rows), _between(u, cols)
+    (top, below), (left, across) = _between(v, rows), _between(u, cols)
     total = torch.zeros_like(d)
     sums = torch.zeros(5, *d.shape, dtype=d.dtype, device=d.device)
     for row, by_row in ((top, 1 - below), ((top + 1).clamp_max(rows - 1), below)):
-        for column, by_column in ((left, 1 - beside), ((left + 1).clamp_max(cols - 1), beside)):
+        for column, by_column in ((left, 1 - across), ((left + 1).clamp_max(cols - 1), across)):
             at = nodes[:, (row[:, None] * cols + column).flatten()].view(b, height, width, 6)
-            alike = 1 / (1 + ((logs - at[..., 0]) / config.edge_contrast).square())
-            weight = by_row[:, None] * by_column * alike
+            likeness = 1 / (1 + ((logs - at[..., 0]) / config.edge_contrast).square())
+            weight = by_row[:, None] * by_column * likeness
             total = total + weight
             sums = sums + weight * at[..., 1:].permute(3, 0, 1, 2)
     offset, variance, inlier, p, unseen = sums / total

@@ -60,8 +60,8 @@ class Scene:
 
     def counted(self, values: Tensor) -> Tensor:
         """[B, N] values, summed over the anchors of the same cell."""
-        kept = torch.where(self.valid, values, torch.zeros_like(values))
-        nodes = torch.zeros_like(self.grid.log_depth).scatter_add(1, self.observed.node, kept)
+        masked = torch.where(self.valid, values, torch.zeros_like(values))
+        nodes = torch.zeros_like(self.grid.log_depth).scatter_add(1, self.observed.node, masked)
         return torch.gather(nodes, 1, self.observed.node)
 
     def believed(self) -> Tensor:
@@ -125,7 +125,7 @@ def _loosened(scene: Scene, field: Field) -> Prior:
 
 
 def _with_weights(scene: Scene, weight: Tensor) -> tuple[Field, LeftOut]:
-    field = Field.given(scene.prior, scene.observed, weight)
+    field = Field.conditioned(scene.prior, scene.observed, weight)
     mean, variance = field.at(scene.observed.node, scene.observed.features)
     left = (1 - weight * variance).clamp_min(LEAST_LEFT)
     return field, LeftOut((scene.observed.value - mean) / left, variance / left + scene.noise)
@@ -202,9 +202,9 @@ def second_moments(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Variances over the squared depth: in total, and of y's ``variance`` alone. With the probability p, which the
     total contains, the local correction ``offset`` does not hold and y has the variance ``wide``."""
-    own, q = variance.clamp_max(config.widest), (-offset).clamp_max(LARGEST).exp()
+    inlier_variance, q = variance.clamp_max(config.widest), (-offset).clamp_max(LARGEST).exp()
     tail = q.square() * (2 * wide).exp() - 2 * q * (wide / 2).exp() + 1
-    inlier = (2 * own).exp() - 2 * (own / 2).exp() + 1
+    inlier = (2 * inlier_variance).exp() - 2 * (inlier_variance / 2).exp() + 1
     return (1 - p) * inlier + p * tail, inlier
 
 

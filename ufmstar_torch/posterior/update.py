@@ -124,7 +124,7 @@ def update(
         The statistics up to this frame, and the posterior. A stream without a usable anchor learns nothing; its
         coefficients drift.
     """
-    given = anchors is not None
+    has_anchors = anchors is not None
     anchors = anchors if anchors is not None and anchors.valid.shape[1] else _none(frame)
     running, grid = Running.of(packed, config), Grid.of(frame, config)
     scene = Scene.of(grid, frame, anchors, running)
@@ -132,8 +132,8 @@ def update(
     away = away_from(scene, anchors.valid & (weight * config.weak_sigma**2 >= 1))
     some = anchors.valid.any(1)
     drifted = torch.where(frame.valid.flatten(1).any(1)[:, None], running.drifted(grid.mean), packed)
-    kept = torch.where(some[:, None], learnt(scene, field, weight, left_out, running).packed(), drifted)
-    now = Running.of(kept, config)
+    memory = torch.where(some[:, None], learnt(scene, field, weight, left_out, running).packed(), drifted)
+    now = Running.of(memory, config)
     features, b = grid.features(), field.coefficients
     mean, variance = field.at(torch.arange(features.shape[1], device=b.device).expand_as(away), features)
     offset = mean - (features * b[:, None]).sum(-1)
@@ -147,12 +147,12 @@ def update(
     nodes = torch.stack([grid.log_depth, offset, variance, inlier, p, away / config.reach], -1)
     maps = frame.depth, frame.valid, claimed.nan_to_num()
     depth, spread, inlier, outlier = read(*maps, nodes, b, grid.mean, grid.size, config)
-    known = (some | (running.frames > 0) | given)[:, None, None]
+    corrected = (some | (running.frames > 0) | has_anchors)[:, None, None]
     plain = torch.where(frame.valid, frame.depth, torch.nan)
     calibration = torch.where(now.below["calibration"] > 0, now.ratio("calibration"), torch.nan)
-    return kept.to(packed.dtype), Posterior(
-        torch.where(known, depth, plain), torch.where(known, spread, claimed), calibration, now.ratio("unseen"),
-        torch.where(known, outlier, torch.nan), torch.where(known, inlier, claimed),
+    return memory.to(packed.dtype), Posterior(
+        torch.where(corrected, depth, plain), torch.where(corrected, spread, claimed), calibration, now.ratio("unseen"),
+        torch.where(corrected, outlier, torch.nan), torch.where(corrected, inlier, claimed),
     )  # fmt: skip
 
 

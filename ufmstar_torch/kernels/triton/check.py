@@ -39,10 +39,10 @@ def check_values(
     b, height, width = depth.shape
     device = depth.device
     pose, intrinsics = (of_streams(camera, b) for camera in (pose, intrinsics))
-    known = None
+    host_fault = None
     if pose.device.type == intrinsics.device.type == "cpu" != device.type:
         first = pose_fault(pose, rotation_deviation(pose[..., :3, :3]), rotation_tolerance)
-        known = torch.where(first > 0, first, intrinsics_fault(intrinsics, (height, width)))
+        host_fault = torch.where(first > 0, first, intrinsics_fault(intrinsics, (height, width)))
     T, K = (v.to(device, non_blocking=True).contiguous() for v in (pose, intrinsics))
     T_safe, K_safe, deviation = torch.empty_like(T), torch.empty_like(K), T.new_empty(b)
     counts = torch.zeros(2, b, dtype=torch.int64, device=device)
@@ -61,7 +61,7 @@ def check_values(
         nearest=DEPTH_RANGE[0], deepest=DEPTH_RANGE[1], max_depth=float(max_depth), largest=LARGEST, chunk=1024,
     )  # fmt: skip
     return FrameInput(
-        safe, T_safe, K_safe, aleatoric, epistemic, features, valid, fault, deviation, counts[0], counts[1], known
+        safe, T_safe, K_safe, aleatoric, epistemic, features, valid, fault, deviation, counts[0], counts[1], host_fault
     )
 
 
@@ -156,18 +156,18 @@ def _maps(
     inside = i < pixels
     at = b * pixels + i
     z = tl.load(depth + at, mask=inside, other=0.0)
-    given = inside & (z > 0) & (z < float("inf")) & (tl.load(faults + b) == 0)
+    has_depth = inside & (z > 0) & (z < float("inf")) & (tl.load(faults + b) == 0)
     if masked:
-        given = given & (tl.load(mask + at, mask=inside, other=0) != 0)
-    beyond = given & (z > exact(max_depth, z))
-    near = given & ~beyond
+        has_depth = has_depth & (tl.load(mask + at, mask=inside, other=0) != 0)
+    beyond = has_depth & (z > exact(max_depth, z))
+    near = has_depth & ~beyond
     use = near & (z >= exact(nearest, z)) & (z <= exact(deepest, z))
     if a_given:
-        own = tl.load(aleatoric + at, mask=inside, other=0.0)
-        use = use & (own >= 0) & (own <= exact(largest, own))
+        variance = tl.load(aleatoric + at, mask=inside, other=0.0)
+        use = use & (variance >= 0) & (variance <= exact(largest, variance))
     if e_given:
-        own = tl.load(epistemic + at, mask=inside, other=0.0)
-        use = use & (own >= 0) & (own <= exact(largest, own))
+        variance = tl.load(epistemic + at, mask=inside, other=0.0)
+        use = use & (variance >= 0) & (variance <= exact(largest, variance))
     for channel in tl.static_range(channels):
         value = tl.load(features + (b * channels + channel) * pixels + i, mask=inside, other=0.0)
         use = use & (tl.abs(value) <= exact(largest, value))

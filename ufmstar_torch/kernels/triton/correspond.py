@@ -32,13 +32,13 @@ class Candidates:
     Attributes:
         image: [B, 6, N] float64 u, v [px], the projected covariance xx, xy, yy [px^2], z [m].
         index: [B, N] int32 into the mixture.
-        place: [B, N] int32 of a component in the list, -1 = not in view.
+        position: [B, N] int32 of a component in the list, -1 = not in view.
         count: [B] int32.
     """
 
     image: Tensor
     index: Tensor
-    place: Tensor
+    position: Tensor
     count: Tensor
 
     @classmethod
@@ -47,12 +47,12 @@ class Candidates:
         b, n = mixture.weight.shape
         device = mixture.mean.device
         image = torch.empty(b, 6, n, dtype=torch.float64, device=device)
-        index, place = torch.empty(2, b, n, dtype=torch.int32, device=device).unbind(0)
-        return cls(image, index, place, torch.empty(b, dtype=torch.int32, device=device))
+        index, position = torch.empty(2, b, n, dtype=torch.int32, device=device).unbind(0)
+        return cls(image, index, position, torch.empty(b, dtype=torch.int32, device=device))
 
     def tensors(self) -> tuple[Tensor, ...]:
         """As kernels take them."""
-        return self.image, self.index, self.place, self.count
+        return self.image, self.index, self.position, self.count
 
 
 def correspond(
@@ -146,7 +146,7 @@ def _geometry(mixture: GaussianMixture) -> tuple[Tensor, Tensor, Tensor]:
 
 @triton.jit
 def _project_listed(
-    mean, covariance, weight, R, t, camera, image, index, place, count, capacity, height, width, b,
+    mean, covariance, weight, R, t, camera, image, index, position, count, capacity, height, width, b,
     turn: tl.constexpr, near_plane: tl.constexpr, widening: tl.constexpr, chunk: tl.constexpr,
 ):  # fmt: skip
     """Candidates of one stream of one mixture; with ``turn`` it is moved by R and t first."""
@@ -170,7 +170,7 @@ def _project_listed(
         seen = there & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
         p, q, r, s = fx / z, -fx * x / (z * z), fy / z, -fy * y / (z * z)  # J = [[p, 0, q], [0, r, s]]
         at = n + tl.cumsum(seen.to(tl.int32), 0) - 1
-        tl.store(place + k, tl.where(seen, at, -1), mask=first + lane < capacity)
+        tl.store(position + k, tl.where(seen, at, -1), mask=first + lane < capacity)
         tl.store(index + b * capacity + at, (first + lane).to(tl.int32), mask=seen)
         out = image + 6 * b * capacity + at
         tl.store(out, u, mask=seen)
@@ -186,20 +186,20 @@ def _project_listed(
 @triton.jit
 def _project(
     mean_k, covariance_k, weight_k, R, t, mean_c, covariance_c, weight_c, camera,
-    image_k, index_k, place_k, count_k, image_c, index_c, place_c, count_c, many_k, many_c, height, width,
+    image_k, index_k, position_k, count_k, image_c, index_c, position_c, count_c, many_k, many_c, height, width,
     near_plane: tl.constexpr, widening: tl.constexpr, chunk: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(0).to(tl.int64)
     R, t, camera = R + 9 * b, t + 3 * b, camera + 9 * b
     if tl.program_id(1) == 0:
         _project_listed(
-            mean_k, covariance_k, weight_k, R, t, camera, image_k, index_k, place_k, count_k, many_k, height, width, b,
-            True, near_plane, widening, chunk,
+            mean_k, covariance_k, weight_k, R, t, camera, image_k, index_k, position_k, count_k, many_k, height, width,
+            b, True, near_plane, widening, chunk,
         )  # fmt: skip
     else:
         _project_listed(
-            mean_c, covariance_c, weight_c, R, t, camera, image_c, index_c, place_c, count_c, many_c, height, width, b,
-            False, near_plane, widening, chunk,
+            mean_c, covariance_c, weight_c, R, t, camera, image_c, index_c, position_c, count_c, many_c, height, width,
+            b, False, near_plane, widening, chunk,
         )  # fmt: skip
 
 

@@ -45,10 +45,10 @@ def fuse(
     flags = pad(pairs.match, (0, 0, 0, words * WORD - c)).mT.reshape(b, k, words, WORD).to(torch.int64)
     bits = (flags << torch.arange(WORD, device=device)).sum(-1)
     index = torch.arange(c, dtype=torch.int32, device=device).repeat(b, 1)
-    place = torch.arange(k, dtype=torch.int32, device=device).repeat(b, 1)
+    position = torch.arange(k, dtype=torch.int32, device=device).repeat(b, 1)
     count = torch.full((b,), c, dtype=torch.int32, device=device)
     still = torch.eye(3, dtype=torch.float64, device=device).repeat(b, 1, 1), index.new_zeros(b, 3, dtype=torch.float64)
-    return fuse_bits(mixture, current, still, (bits, index, place, count), config, pairs)
+    return fuse_bits(mixture, current, still, (bits, index, position, count), config, pairs)
 
 
 def fuse_bits(
@@ -71,8 +71,8 @@ def fuse_bits(
     """
     b, k = mixture.weight.shape
     out = GaussianMixture(**{name: torch.empty_like(value.contiguous()) for name, value in mixture.tensors().items()})
-    bits, index, place, count = matches
-    given = pairs is not None and pairs.distance is not None
+    bits, index, position, count = matches
+    has_distance = pairs is not None and pairs.distance is not None
     weighted = pairs is not None and config.overlap_weighted
     nothing = current.weight
     overlap = pairs.overlap.contiguous() if pairs is not None and weighted else nothing
@@ -81,20 +81,20 @@ def fuse_bits(
     launch(
         _fuse, (triton.cdiv(k, _LANES), b),
         *(v.contiguous() for v in mixture.tensors().values()), *(v.contiguous() for v in current.tensors().values()),
-        *motion, bits, index, place, count, overlap, distance, *out.tensors().values(),
+        *motion, bits, index, position, count, overlap, distance, *out.tensors().values(),
         k, current.capacity, bits.shape[2], epsilon=8 * torch.finfo(mixture.covariance.dtype).eps,
-        weighted=weighted, given=given, channels=channels, padded=power_of_two(channels), word=WORD, lanes=_LANES,
-        warps=1,
+        weighted=weighted, has_distance=has_distance, channels=channels, padded=power_of_two(channels), word=WORD,
+        lanes=_LANES, warps=1,
     )  # fmt: skip
     return out
 
 
 def floor_covariance(covariance: Tensor, floor: Tensor) -> Tensor:
     """As :func:`ufmstar_torch.gaussian.floor_covariance` for positive semidefinite float64 tensors."""
-    given = covariance.to(torch.float64).contiguous()
-    lifted = torch.empty_like(given)
-    limits = floor.to(torch.float64).expand(given.shape[:-2]).contiguous()
-    launch(_floor, (triton.cdiv(limits.numel(), 128),), given, limits, lifted, limits.numel(), chunk=128)
+    contiguous = covariance.to(torch.float64).contiguous()
+    lifted = torch.empty_like(contiguous)
+    limits = floor.to(torch.float64).expand(contiguous.shape[:-2]).contiguous()
+    launch(_floor, (triton.cdiv(limits.numel(), 128),), contiguous, limits, lifted, limits.numel(), chunk=128)
     return lifted
 
 
@@ -113,10 +113,10 @@ def _floor(covariance, floor, lifted, count, chunk: tl.constexpr):
 def _fuse(
     mean, covariance, weight, disagreement, count, features,
     mean_c, covariance_c, weight_c, disagreement_c, count_c, features_c,
-    R, t, bits, index_c, place, listed_c, overlap, distances,
+    R, t, bits, index_c, position, listed_c, overlap, distances,
     mean_o, covariance_o, weight_o, disagreement_o, count_o, features_o, many_k, many_c, words,
-    epsilon: tl.constexpr, weighted: tl.constexpr, given: tl.constexpr, channels: tl.constexpr, padded: tl.constexpr,
-    word: tl.constexpr, lanes: tl.constexpr,
+    epsilon: tl.constexpr, weighted: tl.constexpr, has_distance: tl.constexpr, channels: tl.constexpr,
+    padded: tl.constexpr, word: tl.constexpr, lanes: tl.constexpr,
 ):  # fmt: skip
     b = tl.program_id(1).to(tl.int64)
     stored = mean.dtype.element_ty
@@ -140,7 +140,7 @@ def _fuse(
     h = tl.zeros([lanes, padded], tl.float64)
     if channels > 0:
         h = tl.load(features + k[:, None] * channels + f[None, :], mask=in_f, other=0.0).to(tl.float64)
-    at = tl.load(place + k, mask=there, other=-1)
+    at = tl.load(position + k, mask=there, other=-1)
     n = tl.load(listed_c + b)
     for w in range(tl.cdiv(n, word)):
         left = tl.load(bits + (b * many_k + at) * words + w, mask=at >= 0, other=0)
@@ -166,7 +166,7 @@ def _fuse(
                 cx, cy, cz, tl.where(use, c0, 1.0), tl.where(use, c1, 0.0), tl.where(use, c2, 0.0),
                 tl.where(use, c3, 1.0), tl.where(use, c4, 0.0), tl.where(use, c5, 1.0), lam,
             )  # fmt: skip
-            if given:
+            if has_distance:
                 d = tl.load(distances + at_c * many_k + slot, mask=use, other=0.0).to(tl.float64)
             n0, n1, n2, n3, n4, n5 = floored(n0, n1, n2, n3, n4, n5, epsilon * (n0 + n3 + n5))
             # After each match the values take the precision they are stored in.

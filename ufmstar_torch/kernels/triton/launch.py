@@ -16,7 +16,7 @@ def interpreted() -> bool:
 
 
 def launch(
-    kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 4, fused: bool = False, **known: Any
+    kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 4, fused: bool = False, **meta: Any
 ) -> None:
     """Queue a kernel on the current stream of its tensors' device.
 
@@ -27,13 +27,13 @@ def launch(
         warps: of 32 threads, in a program.
         fused: whether a product and a sum may be rounded once. Where a decision hangs on a value they may not, or it
             would differ from the CPU's.
-        known: compile-time constants. Every number that is no integer is one: as an argument it would be float32.
+        meta: compile-time constants. Every number that is no integer is one: as an argument it would be float32.
     """
     if 0 in grid:
         return
     device = next(a.device for a in arguments if isinstance(a, Tensor))
     with torch.cuda.device(device) if device.type == "cuda" else nullcontext():
-        kernel[grid](*arguments, num_warps=warps, enable_fp_fusion=fused, **known)
+        kernel[grid](*arguments, num_warps=warps, enable_fp_fusion=fused, **meta)
 
 
 def power_of_two(n: int) -> int:

@@ -127,9 +127,9 @@ def _prepare(
         behind = (square <= 0) | ((z < 0) & (a > 1e-6 * szz))
         anywhere = a <= 1e-6 * szz
         a = tl.where(behind | anywhere, 1.0, a)
-        beside = _outside(x, z, xx + least, xz, square, a, tl.load(camera), tl.load(camera + 2), width)
-        beside = beside | _outside(y, z, yy + least, yz, square, a, tl.load(camera + 4), tl.load(camera + 5), height)
-        seen = there & (anywhere | ~beside) & ~behind
+        outside = _outside(x, z, xx + least, xz, square, a, tl.load(camera), tl.load(camera + 2), width)
+        outside = outside | _outside(y, z, yy + least, yz, square, a, tl.load(camera + 4), tl.load(camera + 5), height)
+        seen = there & (anywhere | ~outside) & ~behind
 
         at = n + tl.cumsum(seen.to(tl.int32), 0) - 1
         tl.store(index + b * capacity + at, (first + lane).to(tl.int32), mask=seen)

@@ -178,19 +178,19 @@ def geodesic(ax, ay, az, a0, a1, a2, a3, a4, a5, bx, by, bz, b0, b1, b2, b3, b4,
     h00, h10, h20 = _back(l0, l1, l2, l3, l4, l5, v00, v10, v20)
     h01, h11, h21 = _back(l0, l1, l2, l3, l4, l5, v01, v11, v21)
     h02, h12, h22 = _back(l0, l1, l2, l3, l4, l5, v02, v12, v22)
-    own = 1 - lam
-    t0 = lam * (h00 * s0 * h00 + h01 * s1 * h01 + h02 * s2 * h02) + own
+    rest = 1 - lam
+    t0 = lam * (h00 * s0 * h00 + h01 * s1 * h01 + h02 * s2 * h02) + rest
     t1 = lam * (h00 * s0 * h10 + h01 * s1 * h11 + h02 * s2 * h12)
     t2 = lam * (h00 * s0 * h20 + h01 * s1 * h21 + h02 * s2 * h22)
-    t3 = lam * (h10 * s0 * h10 + h11 * s1 * h11 + h12 * s2 * h12) + own
+    t3 = lam * (h10 * s0 * h10 + h11 * s1 * h11 + h12 * s2 * h12) + rest
     t4 = lam * (h10 * s0 * h20 + h11 * s1 * h21 + h12 * s2 * h22)
-    t5 = lam * (h20 * s0 * h20 + h21 * s1 * h21 + h22 * s2 * h22) + own
+    t5 = lam * (h20 * s0 * h20 + h21 * s1 * h21 + h22 * s2 * h22) + rest
     # T L, so that T Sigma T^T = (T L)(T L)^T is symmetric by construction.
     m00, m01, m02 = t0 * l0 + t1 * l1 + t2 * l3, t1 * l2 + t2 * l4, t2 * l5
     m10, m11, m12 = t1 * l0 + t3 * l1 + t4 * l3, t3 * l2 + t4 * l4, t4 * l5
     m20, m21, m22 = t2 * l0 + t4 * l1 + t5 * l3, t4 * l2 + t5 * l4, t5 * l5
     return (
-        own * ax + lam * bx, own * ay + lam * by, own * az + lam * bz,
+        rest * ax + lam * bx, rest * ay + lam * by, rest * az + lam * bz,
         m00 * m00 + m01 * m01 + m02 * m02, m00 * m10 + m01 * m11 + m02 * m12, m00 * m20 + m01 * m21 + m02 * m22,
         m10 * m10 + m11 * m11 + m12 * m12, m10 * m20 + m11 * m21 + m12 * m22, m20 * m20 + m21 * m21 + m22 * m22,
         distance,

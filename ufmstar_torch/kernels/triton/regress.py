@@ -177,9 +177,9 @@ def _regress(
     camera, index = camera + 9 * b, index + b * capacity
     means, fields = means + 3 * b * capacity, fields + 7 * b * capacity
     if subset:
-        place = tl.program_id(0) * (side * side) + lane
-        inside = place < chosen
-        target = b * chosen + place
+        position = tl.program_id(0) * (side * side) + lane
+        inside = position < chosen
+        target = b * chosen + position
         source = tl.load(pixels + target, mask=inside, other=0).to(tl.int64)
         v, u = source // width, source % width
         source += b * height * width
@@ -252,21 +252,21 @@ def _regress(
     nan = float("nan")
     value = total / evidence
     if stepped:
-        known = seen / evidence
+        measured_share = seen / evidence
         if mode == 1:
             size = relative * tl.load(depth + source, mask=ok, other=0.0)
-            value += tl.maximum(1 - known, 0.0) * (size * size)
+            value += tl.maximum(1 - measured_share, 0.0) * (size * size)
         if mode == 2:
-            value = tl.where(known < half, nan, value)
-        tl.store(measured + target, tl.where(ok, known, nan), mask=inside)
+            value = tl.where(measured_share < half, nan, value)
+        tl.store(measured + target, tl.where(ok, measured_share, nan), mask=inside)
         tl.atomic_add(counts + 6 * streams + b, tl.sum(ok.to(tl.int32), 0))
-        tl.atomic_add(counts + 7 * streams + b, tl.sum((ok & (known < half)).to(tl.int32), 0))
+        tl.atomic_add(counts + 7 * streams + b, tl.sum((ok & (measured_share < half)).to(tl.int32), 0))
         value = tl.where(ok, value, nan)
         if alpha < 1.0:
             now = value.to(memory.dtype.element_ty)
-            kept = mixed(tl.load(before + target, mask=inside, other=0.0), now, alpha)
-            tl.store(memory + target, kept, mask=inside)
-            value = tl.where(now != now, now, kept).to(real)
+            averaged = mixed(tl.load(before + target, mask=inside, other=0.0), now, alpha)
+            tl.store(memory + target, averaged, mask=inside)
+            value = tl.where(now != now, now, averaged).to(real)
     tl.store(out + target, tl.where(ok, value, nan), mask=inside)
     if channels > 0:
         values = tl.where(ok[:, None], sums / evidence[:, None], nan)

@@ -30,7 +30,7 @@ class Rows:
         whole: [B H, M, 3] int32.
         count: [B H] int32.
         owner: [B H, W] int32, which of the row's starts a pixel belongs to, -1 = none (int16 where it holds W).
-        place: [B H, W] int32, the finished segment of every start, -1 = too sparse; likewise.
+        finished_index: [B H, W] int32, the finished segment of every start, -1 = too sparse; likewise.
     """
 
     camera: Tensor
@@ -38,24 +38,24 @@ class Rows:
     whole: Tensor
     count: Tensor
     owner: Tensor
-    place: Tensor
+    finished_index: Tensor
 
 
-def scanlines(given: SegmentInput) -> Rows:
+def scanlines(inputs: SegmentInput) -> Rows:
     """Cut every row into segments (``segment_scanline.scanlines``), in two launches."""
-    b, height, width = given.depth.shape
-    device, limits = given.depth.device, given.config
-    most, rows = given.segments_per_row, b * height
+    b, height, width = inputs.depth.shape
+    device, limits = inputs.depth.device, inputs.config
+    most, rows = inputs.segments_per_row, b * height
 
     def whole(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
         return torch.empty(*shape, dtype=dtype, device=device)
 
-    camera, depth = given.intrinsics.to(torch.float64).contiguous(), given.depth.contiguous()
-    lengths2 = torch.empty(b, given.depth_bins, dtype=torch.float64, device=device)
+    camera, depth = inputs.intrinsics.to(torch.float64).contiguous(), inputs.depth.contiguous()
+    lengths2 = torch.empty(b, inputs.depth_bins, dtype=torch.float64, device=device)
     bins = torch.empty(b, height, width, dtype=torch.int16, device=device)
     launch(
         _bins, (triton.cdiv(height * width, 1024), b), depth, camera, lengths2, bins, height, width,
-        number=given.depth_bins, shortest=float(limits.min_gaussian_length),
+        number=inputs.depth_bins, shortest=float(limits.min_gaussian_length),
         longest=float(limits.frame_max_scale * limits.min_gaussian_length), chunk=1024,
     )  # fmt: skip
     narrow = torch.int16 if width < 2**15 else torch.int32
@@ -67,13 +67,13 @@ def scanlines(given: SegmentInput) -> Rows:
     lanes = min(power_of_two(rows), 256) if interpreted() else 32  # the interpreter takes as long for one as for many
     launch(
         _scanline, (triton.cdiv(rows, lanes),), depth, camera, lengths2, bins,
-        found.moments, found.whole, found.count, found.owner, found.place, rows, height, width,
+        found.moments, found.whole, found.count, found.owner, found.finished_index, rows, height, width,
         most,
         scale=float(limits.adaptive_thresh_scale), reference=float(limits.reference_focal),
         scaled=limits.fixed_slope, noise_floor=float(limits.noise_floor), noise_thresh=float(limits.noise_thresh),
         line_thresh=float(limits.line_thresh), max_depth=float(limits.depth_limit), gap=limits.occlusion_gap,
         n_check=limits.n_check, sparse=limits.sparse, max_open=limits.max_open, places=power_of_two(limits.max_open),
-        number=given.depth_bins, lanes=lanes, warps=1,
+        number=inputs.depth_bins, lanes=lanes, warps=1,
     )  # fmt: skip
     return found
 
@@ -110,8 +110,8 @@ def _bins(
 
 @triton.jit
 def _finish(
-    done, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole, place, count, r,
-    most, width, sparse: tl.constexpr,
+    done, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole, finished_index, count,
+    r, most, width, sparse: tl.constexpr,
 ):  # fmt: skip
     """Write the segments of the mask ``done`` [R, Q], one a row; returns the new number of the rows' segments."""
     keep = done & (n > sparse)
@@ -130,13 +130,13 @@ def _finish(
     tl.store(out, n, mask=keep)
     tl.store(out + 1, u_left, mask=keep)
     tl.store(out + 2, u_right, mask=keep)
-    tl.store(place + r[:, None] * width + born, tl.where(keep, count[:, None], -1), mask=done)
+    tl.store(finished_index + r[:, None] * width + born, tl.where(keep, count[:, None], -1), mask=done)
     return count + tl.sum(keep.to(tl.int32), 1)
 
 
 @triton.jit
 def _scanline(
-    depth, camera, lengths2, bins, moments, whole, counts, owner, place, rows, height, width, most,
+    depth, camera, lengths2, bins, moments, whole, counts, owner, finished_index, rows, height, width, most,
     scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr, noise_floor: tl.constexpr,
     noise_thresh: tl.constexpr, line_thresh: tl.constexpr, max_depth: tl.constexpr, gap: tl.constexpr,
     n_check: tl.constexpr, sparse: tl.constexpr, max_open: tl.constexpr, places: tl.constexpr,
@@ -172,14 +172,14 @@ def _scanline(
         t = slope * z * z
         tau_z = tl.minimum(tl.maximum(6.0 * t, exact(noise_floor, t)), exact(noise_thresh, t))[:, None]
         tau_x = tl.minimum(tl.maximum(t, exact(noise_floor, t)), exact(line_thresh, t))[:, None]
-        x, z, taken = x[:, None], z[:, None], use[:, None]
+        x, z, used = x[:, None], z[:, None], use[:, None]
 
         near = (n > 0) & (u - u_right <= gap) & (w2 < length2)
         close = (tl.abs(z - z_right) < tau_z) & (tl.abs(x - x_right) < tau_x)
         flat = dx == 0
         line = z_left + dz * (x - x_left) / tl.where(flat, 1.0, dx)
         straight = (tl.abs(line - z) < tau_z) & ~flat
-        fits = near & ((close & (n <= n_check)) | (straight & (n > n_check))) & taken
+        fits = near & ((close & (n <= n_check)) | (straight & (n > n_check))) & used
         newest = tl.max(tl.where(fits, born, -1), 1)
         start = use & (newest < 0)
         # A new segment takes a free place, or that of the oldest one, which is finished.
@@ -189,7 +189,7 @@ def _scanline(
         if tl.max(tl.max(pushed.to(tl.int32), 1), 0) > 0:
             count = _finish(
                 pushed, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole,
-                place, count, r, most, width, sparse,
+                finished_index, count, r, most, width, sparse,
             )  # fmt: skip
         target = opened | (fits & (born == newest[:, None]))
         n, u_left, reach = tl.where(opened, 0, n), tl.where(opened, u, u_left), tl.where(opened, length2, reach)
@@ -214,7 +214,7 @@ def _scanline(
         last = (n > 0) & (born == newest[:, None])
         count = _finish(
             last, n, u_left, u_right, reach, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole,
-            place, count, r, most, width, sparse,
+            finished_index, count, r, most, width, sparse,
         )  # fmt: skip
         n = tl.where(last, 0, n)
     tl.store(counts + r, count, mask=real_row)

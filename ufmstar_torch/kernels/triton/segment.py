@@ -40,49 +40,49 @@ class Floor:
     epsilon: float
 
 
-def segment(given: SegmentInput) -> tuple[GaussianMixture, Tensor]:
+def segment(inputs: SegmentInput) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.segment.segment`, float64 inside, with its capacity on an accelerator."""
-    mixture, read_labels = fit(given)
+    mixture, read_labels = fit(inputs)
     return mixture, read_labels()
 
 
-def fit(given: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMixture, Callable[[], Tensor]]:
+def fit(inputs: SegmentInput, *, floor: Floor | None = None) -> tuple[GaussianMixture, Callable[[], Tensor]]:
     """The Gaussians of B depth maps.
 
     Args:
-        given: checked.
+        inputs: checked.
         floor: of the covariances; the mixture is float64 then. None = none, in the depth's dtype.
 
     Returns:
         The mixture [B, C], and a function that writes and returns the labels [B, H, W] int64.
     """
-    b, height, _ = given.depth.shape
-    device = given.depth.device
-    most = given.segments_per_row
+    b, height, _ = inputs.depth.shape
+    device = inputs.depth.device
+    most = inputs.segments_per_row
     total = most * height
-    capacity = min(total, most_kept(given))
-    channels = 0 if given.features is None else given.features.shape[1]
-    rows = scanlines(given)
-    dtype = given.depth.dtype if floor is None else torch.float64
+    capacity = min(total, most_kept(inputs))
+    channels = 0 if inputs.features is None else inputs.features.shape[1]
+    rows = scanlines(inputs)
+    dtype = inputs.depth.dtype if floor is None else torch.float64
     mixture = GaussianMixture.empty(b, capacity, features=channels, dtype=dtype, device=device)
     member = torch.empty(b * height, most, dtype=torch.int32, device=device)
     slot_of = torch.empty(b, total, dtype=torch.int32, device=device)
-    limits = given.config
+    limits = inputs.config
     lanes = power_of_two(2 * most)
     launch(
         _join, (b,),
         rows.camera, rows.moments, rows.whole, rows.count,
         mixture.mean, mixture.covariance, mixture.weight, mixture.count, member, slot_of, height, most, capacity, total,
-        rounded=given.depth.dtype == torch.float32, scale=float(limits.adaptive_thresh_scale),
+        rounded=inputs.depth.dtype == torch.float32, scale=float(limits.adaptive_thresh_scale),
         reference=float(limits.reference_focal), scaled=limits.fixed_slope, noise_floor=float(limits.noise_floor),
         angle2=float(limits.angle_cosine) ** 2, min_pixels=limits.min_pixels, min_rows=limits.min_rows,
         prune=_PRUNE[limits.prune], lifted=floor is not None,
         near_plane=floor.near_plane if floor else 0.0, epsilon=floor.epsilon if floor else 0.0,
         pixel_variance=PIXEL_VARIANCE, lanes=lanes, warps=max(1, min(8, lanes // 32)),
     )  # fmt: skip
-    read_labels = partial(_labelled, rows, member, slot_of, given.depth.shape)
-    if given.features is not None:
-        _average(given.features, read_labels(), mixture)
+    read_labels = partial(_labelled, rows, member, slot_of, inputs.depth.shape)
+    if inputs.features is not None:
+        _average(inputs.features, read_labels(), mixture)
     return mixture, read_labels
 
 
@@ -91,8 +91,8 @@ def _labelled(rows: Rows, member: Tensor, slot_of: Tensor, shape: torch.Size) ->
     b, height, width = shape
     out = torch.empty(b, height, width, dtype=torch.int64, device=member.device)
     launch(
-        _label, (triton.cdiv(height * width, 1024), b), rows.owner, rows.place, member, slot_of, out, height, width,
-        member.shape[1], slot_of.shape[1], chunk=1024,
+        _label, (triton.cdiv(height * width, 1024), b), rows.owner, rows.finished_index, member, slot_of, out, height,
+        width, member.shape[1], slot_of.shape[1], chunk=1024,
     )  # fmt: skip
     return out
 
@@ -107,13 +107,13 @@ def _average(features: Tensor, slots: Tensor, mixture: GaussianMixture) -> None:
 
 
 @triton.jit
-def _label(owner, place, member, slot_of, out, height, width, most, total, chunk: tl.constexpr):
+def _label(owner, finished_index, member, slot_of, out, height, width, most, total, chunk: tl.constexpr):
     b = tl.program_id(1).to(tl.int64)
     i = tl.program_id(0) * chunk + tl.arange(0, chunk)
     inside = i < height * width
     row = b * height + i // width
     start = tl.load(owner + b * height * width + i, mask=inside, other=-1)
-    piece = tl.load(place + row * width + start, mask=inside & (start >= 0), other=-1)
+    piece = tl.load(finished_index + row * width + start, mask=inside & (start >= 0), other=-1)
     gaussian = tl.load(member + row * most + piece, mask=piece >= 0, other=0)
     slot = tl.load(slot_of + b * total + gaussian, mask=piece >= 0, other=-1)
     tl.store(out + b * height * width + i, slot, mask=inside)
@@ -130,8 +130,8 @@ def _feature_means(features, slots, weight, out, pixels, capacity, channels, chu
             sums = tl.zeros([chunk], tl.float64)
             for first in range(0, pixels, chunk):
                 i = first + tl.arange(0, chunk)
-                own = tl.load(slots + b * pixels + i, mask=i < pixels, other=-1) == k
-                value = tl.load(features + (b * channels + channel) * pixels + i, mask=own, other=0.0)
+                labelled = tl.load(slots + b * pixels + i, mask=i < pixels, other=-1) == k
+                value = tl.load(features + (b * channels + channel) * pixels + i, mask=labelled, other=0.0)
                 sums += value.to(tl.float64)
             tl.store(out + (b * capacity + k) * channels + channel, tl.sum(sums, 0) / n)
 
@@ -172,7 +172,7 @@ def _join(
     n = tl.zeros([lanes], tl.int32)
     merged, u_left, u_right, since, last = n, n, n, n, n
     born = n - 1  # a lane without a Gaussian
-    created, kept = 0, 0
+    created, retained = 0, 0
     ahead = _loaded(moments, whole, b * height * most)
     for v in range(height):
         row = b * height + v
@@ -233,18 +233,18 @@ def _join(
                 last = tl.where(join, v, last)
                 tl.store(member + row * most + j, oldest)
             else:
-                own = lane == tl.min(tl.where(born < 0, lane, lanes), 0)
-                mx, my, mz = tl.where(own, hx, mx), tl.where(own, hy, my), tl.where(own, hz, mz)
-                sxx, sxy, sxz = tl.where(own, hxx, sxx), tl.where(own, ry * hxz, sxy), tl.where(own, hxz, sxz)
-                syy, syz = tl.where(own, ry * ry * hzz, syy), tl.where(own, ry * hzz, syz)
-                szz = tl.where(own, hzz, szz)
-                lx, ly, lz = tl.where(own, hlx, lx), tl.where(own, hly, ly), tl.where(own, hlz, lz)
-                ox, oy, oz = tl.where(own, 0.0, ox), tl.where(own, 0.0, oy), tl.where(own, 0.0, oz)
-                px, py, pz = tl.where(own, 0.0, px), tl.where(own, 0.0, py), tl.where(own, 0.0, pz)
-                p2, reach = tl.where(own, 0.0, p2), tl.where(own, h_reach, reach)
-                n, merged = tl.where(own, hn, n), tl.where(own, 1, merged)
-                u_left, u_right = tl.where(own, h_left, u_left), tl.where(own, h_right, u_right)
-                since, last, born = tl.where(own, v, since), tl.where(own, v, last), tl.where(own, created, born)
+                free = lane == tl.min(tl.where(born < 0, lane, lanes), 0)
+                mx, my, mz = tl.where(free, hx, mx), tl.where(free, hy, my), tl.where(free, hz, mz)
+                sxx, sxy, sxz = tl.where(free, hxx, sxx), tl.where(free, ry * hxz, sxy), tl.where(free, hxz, sxz)
+                syy, syz = tl.where(free, ry * ry * hzz, syy), tl.where(free, ry * hzz, syz)
+                szz = tl.where(free, hzz, szz)
+                lx, ly, lz = tl.where(free, hlx, lx), tl.where(free, hly, ly), tl.where(free, hlz, lz)
+                ox, oy, oz = tl.where(free, 0.0, ox), tl.where(free, 0.0, oy), tl.where(free, 0.0, oz)
+                px, py, pz = tl.where(free, 0.0, px), tl.where(free, 0.0, py), tl.where(free, 0.0, pz)
+                p2, reach = tl.where(free, 0.0, p2), tl.where(free, h_reach, reach)
+                n, merged = tl.where(free, hn, n), tl.where(free, 1, merged)
+                u_left, u_right = tl.where(free, h_left, u_left), tl.where(free, h_right, u_right)
+                since, last, born = tl.where(free, v, since), tl.where(free, v, last), tl.where(free, created, born)
                 tl.store(member + row * most + j, created)
                 created += 1
         # Gaussians that the row did not extend have ended; after the last row all have, in the order of their creation.
@@ -262,9 +262,9 @@ def _join(
             for _ in range(tl.sum(keep.to(tl.int32), 0)):
                 next_born = tl.min(tl.where(left, born, 2147483647), 0)
                 mine = left & (born == next_born)
-                slot = tl.where(mine, kept, slot)
+                slot = tl.where(mine, retained, slot)
                 left = left & ~mine
-                kept += 1
+                retained += 1
             tl.store(slot_of + b * total + born, slot, mask=gone)
             out = b * capacity + slot
             ratio = tl.where(n > 1, n - 1, 1).to(tl.float64)
