@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -25,6 +26,9 @@ _OUTSIDE, _WIDE = 0.1, 10.0
 # before it, which also leads so many depths away. Relative change of most depths while the pose stays: .07 to .5 within
 # 8 frames of the moving cameras of recordings.
 _ZOOM, _JUMP, _AWAY, _CHANGE = 1.2, 10.0, 2.0, 0.1
+# Of a batch whose streams are the frames of one video: streams, calls that continue the last one, and the distance
+# between successive frames over the step of the first stream. 1/B where frames are even.
+_BATCH, _CONTINUED, _SUCCESSIVE = 3, 3, 0.5
 # Of the depth maps every so many rows are looked at.
 _ROWS = 8
 # On an accelerator reading the counts waits for it: every so many frames, and not while a graph is recorded.
@@ -41,7 +45,8 @@ _CAUSES = (
 class _Track:
     """The frames of a stream without a fault so far."""
 
-    T: list[list[float]]  # the last pose
+    first: list[list[float]]  # pose,
+    T: list[list[float]]  # and the last one
     focal: tuple[float, float]  # last fx / W and fy / H
     total: float  # sum of the last depth map's rows
     place: list[float]  # of the last frame with anchors that moved, and how many did,
@@ -72,6 +77,9 @@ class _Track:
             if sudden and step > _AWAY * _mean(depth, total):
                 text = f"the camera jumped by {step:.3g} m, after steps of at most {self.largest:.3g} m. Another "
                 yield "jump", text + "recording, or a map that was moved, begins with reset()"
+            if self.steps >= _FRAMES and self.first == T:
+                text = f"the pose is exactly the first one again, {self.steps} poses later. Another recording begins "
+                yield "again", text + "with reset()"
             self.steps, self.largest = self.steps + 1, max(self.largest, step)
         self.T, self.focal, self.total = T, focal, total
 
@@ -122,7 +130,7 @@ class StreamWarnings:
         if streams is not None:
             self._tracks = {b: track for b, track in self._tracks.items() if b not in streams}
             return
-        self._calls = 0
+        self._calls = self._continued = 0
         self._said = set[tuple[int, str]]()
         self._tracks = {}
 
@@ -137,7 +145,7 @@ class StreamWarnings:
             return
         for b, kind, text in (
             *_left_out(frame, statistics, frames, config),
-            *(_wide(frame) if self._calls % EVERY in (0, 1) else ()),
+            *(_spreads(frame) if self._calls % EVERY in (0, 1) else ()),
             *_alone(statistics, frames),
             *self._tracked(frame, statistics),
         ):
@@ -151,6 +159,7 @@ class StreamWarnings:
         poses, cameras = frame.T_world_cam.tolist(), frame.intrinsics.tolist()
         used = None if statistics.anchors_used is None else statistics.anchors_used.tolist()
         height, width = frame.size
+        yield from self._one_video(poses)
         for b, fault in enumerate(statistics.fault.tolist()):
             if fault or not pixels[b]:
                 continue
@@ -158,11 +167,24 @@ class StreamWarnings:
             if text := doubtful_centre(cameras[b], frame.size):
                 yield b, "centre", text
             if (track := self._tracks.get(b)) is None:
-                self._tracks[b] = track = _Track(T, focal, sums[b], _position(T))
+                self._tracks[b] = track = _Track(T, T, focal, sums[b], _position(T))
             else:
                 yield from ((b, *said) for said in track.follow(T, focal, rows[b], sums[b]))
             if used is not None and (text := track.anchored(used[b], _mean(rows[b], sums[b]))):
                 yield b, "anchors", text
+
+    def _one_video(self, poses: list[list[list[float]]]) -> Iterator[tuple[int, str, str]]:
+        """A warning where batch after batch the first stream goes on where the last one was."""
+        if len(poses) < _BATCH or len(self._tracks) < len(poses):
+            return
+        before = [_position(self._tracks[b].T) for b in range(len(poses))]
+        path = [before[-1], *(_position(T) for T in poses)]
+        longest = max(math.dist(*pair) for pair in pairwise(path))
+        continues = longest < _SUCCESSIVE * math.dist(path[1], before[0])
+        self._continued = self._continued + 1 if continues else max(self._continued - 1, 0)
+        if self._continued == _CONTINUED:
+            text = f"the {len(poses)} streams of a batch look like successive frames of one video. Views are compared "
+            yield 0, "batch", text + "within a stream alone: give one frame at a time"
 
 
 def _left_out(
@@ -189,17 +211,25 @@ def _left_out(
             yield b, "empty", text + ": nothing is compared between views"
 
 
-def _wide(frame: FrameInput) -> Iterator[tuple[int, str, str]]:
+def _spreads(frame: FrameInput) -> Iterator[tuple[int, str, str]]:
+    """Warnings of variances that are no variance in m^2, or 0 everywhere between the members of an ensemble."""
+    pixels = frame.valid.sum((1, 2))
     for name, variance in (("aleatoric", frame.aleatoric), ("epistemic", frame.epistemic)):
         if variance is None:
             continue
         wide = frame.valid & (variance.detach() > (_WIDE * frame.depth).square())
-        shares = wide.sum((1, 2)) / frame.valid.sum((1, 2)).clamp_min(1)
+        shares = wide.sum((1, 2)) / pixels.clamp_min(1)
         for b in (b for b, share in enumerate(shares.tolist()) if share > 0.5):
             text = (
                 f"the standard deviation that {name} states is over {_WIDE:g} times the depth at most pixels: is it a "
             )
             yield b, name, text + "variance in m^2?"
+    if frame.epistemic is None:
+        return
+    spread = (frame.valid & (frame.epistemic.detach() > 0)).any(2).any(1) | (pixels == 0)
+    for b in (b for b, some in enumerate(spread.tolist()) if not some):
+        text = "epistemic is 0 at every pixel: are the members of the ensemble copies of one network, or does the "
+        yield b, "copies", text + "network have no dropout in eval mode?"
 
 
 def hardly_compared(alone: int, components: int, frames: int) -> str:
