@@ -109,6 +109,9 @@ SPOILT = {
     "a second recording from the same origin": (
         lambda i, d, T: (d, WALK[(i % 12)], K, {}), "the pose is exactly the first one again, 11 poses later"
     ),
+    "two cameras in turn": (
+        lambda i, d, T: (d, rigid(T[:3, :3], T[:3, 3] + [1.5 * (i % 2), 0, 0]), K, {}), "go back and forth between two"
+    ),
     "an ensemble of copies": (lambda i, d, T: (d, T, K, {"epistemic": 0 * d}), "copies of one network"),
     "another camera": (
         lambda i, d, T: (d, T, K @ np.diag([1 + 0.5 * (i % 2), 1, 1]), {}),

@@ -26,6 +26,8 @@ _OUTSIDE, _WIDE = 0.1, 10.0
 # before it, which also leads so many depths away. Relative change of most depths while the pose stays: .07 to .5 within
 # 8 frames of the moving cameras of recordings.
 _ZOOM, _JUMP, _AWAY, _CHANGE = 1.2, 10.0, 2.0, 0.1
+# Frames in a row that lie so many times nearer to the frame before the last one than to the last one.
+_ALTERNATING, _NEARER = 6, 5.0
 # Of a batch whose streams are the frames of one video: streams, calls that continue the last one, and the distance
 # between successive frames over the step of the first stream. 1/B where frames are even.
 _BATCH, _CONTINUED, _SUCCESSIVE = 3, 3, 0.5
@@ -54,6 +56,8 @@ class _Track:
     used: int = 0  # with how many anchors
     steps: int = 0  # poses that differ from the one before,
     largest: float = 0.0  # by at most [m]
+    before: list[float] | None = None  # position before the last one,
+    alternating: int = 0  # and how many of the last frames were beside the one before
     same: int = 0  # the last of them, with one depth map
     still: int = 0  # last frames with one pose,
     depth: Tensor | None = None  # and the depth map of the first of them
@@ -73,6 +77,7 @@ class _Track:
             self.still, self.same = 0, self.same + 1 if total == self.total else 0
             if self.same == _FRAMES:
                 yield "depth", f"the depth map was the same in {_FRAMES + 1} frames of a moving camera: is it updated?"
+            yield from self._alternate(T, step)
             sudden = self.steps >= _FRAMES and step > _JUMP * self.largest
             if sudden and step > _AWAY * _mean(depth, total):
                 text = f"the camera jumped by {step:.3g} m, after steps of at most {self.largest:.3g} m. Another "
@@ -81,7 +86,15 @@ class _Track:
                 text = f"the pose is exactly the first one again, {self.steps} poses later. Another recording begins "
                 yield "again", text + "with reset()"
             self.steps, self.largest = self.steps + 1, max(self.largest, step)
+        self.before = _position(self.T)
         self.T, self.focal, self.total = T, focal, total
+
+    def _alternate(self, T: list[list[float]], step: float) -> Iterator[tuple[str, str]]:
+        returned = self.before is not None and _NEARER * math.dist(_position(T), self.before) < step
+        self.alternating = self.alternating + 1 if returned else 0
+        if self.alternating == _ALTERNATING:
+            text = "the poses go back and forth between two places: every camera is a stream of its own (a batch)"
+            yield "alternating", text
 
     def _stay(self, depth: Tensor) -> Iterator[tuple[str, str]]:
         self.still += 1
