@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import io
 import json
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 from zipfile import ZIP_STORED, BadZipFile, ZipFile
@@ -20,6 +23,7 @@ from ufmstar_torch.models.outputs import METRIC, OutputSpec, PlainSpec, ProgramS
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction, infer
 from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
+from ufmstar_torch.stream_warnings import LOGGER
 
 # Files of a torch.export archive: those of a word or a number, and tensors as raw bytes.
 _TEXTS = ("archive_format", "archive_version", "byteorder", "version", "serialization_id")
@@ -82,6 +86,24 @@ def refuse_relative(network: object) -> None:
         )
 
 
+def _warn_of_training(network: Callable[..., Any]) -> None:
+    """Warn of a function that uses a module in training mode: UncertainDepth sets modules to eval mode, which it cannot
+    do with those that a function refers to."""
+    if isinstance(network, nn.Module):
+        return
+    function = network.func if isinstance(network, functools.partial) else network
+    used = [getattr(function, "__self__", None)]
+    if inspect.isfunction(function):
+        with suppress(ValueError):  # a variable that is not yet assigned
+            closure = inspect.getclosurevars(function)
+            used += [*closure.nonlocals.values(), *closure.globals.values()]
+    for module in (one for one in used if isinstance(one, nn.Module) and one.training):
+        LOGGER.warning(
+            "the function given as network uses a %s in training mode, whose normalisation changes with every image: "
+            "call its eval()", type(module).__name__,
+        )  # fmt: skip
+
+
 def wrap_network(
     network: Callable[..., Any],
     output: str | int | None = None,
@@ -115,6 +137,8 @@ def wrap_network(
         preprocess: what its input needs; None: images in [0, 1] at their own size. Of a model of ``transformers``, also
             its image processor; None: the pipeline's.
 
+    A function that uses a module in training mode is warned of (logger ``ufmstar_torch``).
+
     Raises:
         ValueError: ``inverse``, a value out of range, MiDaS, or a relative model of ``transformers``.
         TypeError: ``network`` cannot be called, or does not estimate depth; ``preprocess`` is something else.
@@ -122,6 +146,7 @@ def wrap_network(
     if isinstance(network, type) or not callable(network):
         raise TypeError(f"network must be an nn.Module or a function, got {_described(network)}")
     refuse_relative(network)
+    _warn_of_training(network)
     if of_transformers(network):
         if (
             inverse

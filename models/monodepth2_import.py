@@ -47,7 +47,7 @@ class Imported:
 
     loaded: tuple[str, ...]  # keys of the network that were filled
     skipped: Mapping[str, str]  # keys of the files that were not used, with the reason
-    kept: tuple[str, ...]  # keys of the network that stayed as they were: of a metric network its head
+    unchanged: tuple[str, ...]  # keys of the network that stayed as they were: of a metric network its head
 
 
 def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_path: str | Path) -> Imported:
@@ -80,12 +80,12 @@ def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_pa
             skipped[key] = "coarser disparities are not used" if disparity else "disparity is not metric depth"
         else:
             loaded[target] = value
-    kept = tuple(key for key in expected if key.startswith("head.") and not disparity)
+    head = tuple(key for key in expected if key.startswith("head.") and not disparity)
     uncounted = [key for key in expected if key.endswith("num_batches_tracked")]  # old files lack it, nothing reads it
-    unchanged = {key: expected[key] for key in (*kept, *uncounted)}
-    fill(network, unchanged | loaded, f"{encoder_path} with {depth_path}")
+    remaining = {key: expected[key] for key in (*head, *uncounted)}
+    fill(network, remaining | loaded, f"{encoder_path} with {depth_path}")
     _to_imagenet_colours(network)
-    return Imported(tuple(sorted(loaded)), skipped, tuple(sorted(kept)))
+    return Imported(tuple(sorted(loaded)), skipped, tuple(sorted(head)))
 
 
 @dataclass(frozen=True)

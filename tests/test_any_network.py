@@ -10,6 +10,7 @@ import struct
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -390,3 +391,23 @@ def test_midas_is_refused_and_can_be_aligned():
             wrap(kind())
     aligned = AlignedNetwork(kind(), Alignment("inverse", 0.5, 0.1))
     assert float(aligned(torch.ones(1, 3, 8, 8)).depth[0, 0, 0]) == pytest.approx(1 / 1.1)
+
+
+def test_a_function_of_a_network_in_training_mode_is_named(caplog):
+    network = nn.Sequential(nn.Conv2d(3, 1, 1), nn.BatchNorm2d(1))
+
+    def function(x):
+        return network(x).exp()
+
+    for wrapped in (lambda x: network(x), network.forward, partial(network.forward), function):
+        network.train()
+        caplog.clear()
+        wrap_network(wrapped)
+        assert ["uses a Sequential in training mode" in text for text in caplog.messages] == [True]
+        network.eval()
+        wrap_network(wrapped)
+        assert len(caplog.messages) == 1
+    network.train()
+    UncertainDepth(wrap_network(network))
+    assert not network.training, "a module is set to eval mode"
+    assert len(caplog.messages) == 1

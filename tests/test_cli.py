@@ -119,6 +119,7 @@ MISTAKES = {
     "live: camera": (f"ufmstar live 0 {NETWORK}", "0 needs --trajectory FILE"),
     "live: folder": (f"ufmstar live images --follow --intrinsics 1 1 1 1 {NETWORK}", "images needs --trajectory FILE"),
     "live: overwrite": (f"ufmstar live - --overwrite {NETWORK}", "--overwrite goes with --out"),
+    "live: trajectory": (f"ufmstar live - --trajectory t.txt {NETWORK}", "--trajectory does not go with -: each line"),
     "live: drive": (f"ufmstar live - --drive 3 {NETWORK}", "--drive goes with recordings, not with -"),
     "live: speed": (f"ufmstar live tour:3 --speed 0 {NETWORK}", "--speed must be positive"),
     "live: intrinsics": (f"ufmstar live /nowhere --intrinsics 1 2 {NETWORK}", "--intrinsics must be a file"),

@@ -215,6 +215,18 @@ def test_the_module_and_the_step_are_read_at_once():
         assert len((ROOT / "ufmstar_torch" / name).read_text().splitlines()) < most, name
 
 
+def test_names_are_nouns_of_what_they_hold():
+    """Participles and pronouns say nothing of a value."""
+    vague = {"given", "kept", "own", "place", "known", "beside", "taken", "said", "look", "alike"}
+    found = []
+    for path in sources():
+        for node in ast.walk(tree(path)):
+            name = {ast.arg: "arg", ast.FunctionDef: "name", ast.Name: "id"}.get(type(node), "")
+            if getattr(node, name, "").strip("_") in vague:
+                found.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert found == []
+
+
 def test_no_utility_modules_no_blanket_excepts():
     for path in sources():
         assert path.stem not in ("utils", "helpers", "common", "misc"), path

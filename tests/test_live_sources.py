@@ -25,6 +25,7 @@ from ufmstar_torch import cli
 from ufmstar_torch.eval.run import rerun_log
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.live import PoseFile, growing_folder, json_lines, replay
+from ufmstar_torch.eval.tour import export_tour
 
 __all__ = ["stand_in"]
 
@@ -300,3 +301,11 @@ def test_a_viewer_shows_the_results_on_this_computer_alone(ufmstar, stand_in, mo
     assert len(depths) == len(images) == len(stand_in.logged("plots/latency_ms")) == int(count)
     assert images[0].words[0].shape == (64, 96, 3)
     assert depths[0].words[0].dtype == np.uint16
+
+
+def test_poses_that_contradict_the_images_of_a_recording_are_named(ufmstar, tmp_path, caplog):
+    path = export_tour(open_sequence("tour:41?frames=12&size=120x160"), tmp_path / "walk")
+    for poses, named in (((), 0), (("--poses", "opengl"), 1)):
+        caplog.clear()
+        assert ufmstar(path, "--speed", "100", *poses)[0] == 0
+        assert sum(text.startswith(f"{path}: poses disagree with the images") for text in caplog.messages) == named

@@ -106,6 +106,13 @@ SPOILT = {
     "another recording": (
         lambda i, d, T: (d, rigid(T[:3, :3], T[:3, 3] + [30.0 * (i > 10), 0, 0]), K, {}), "the camera jumped by 30.1 m"
     ),
+    "a second recording from the same origin": (
+        lambda i, d, T: (d, WALK[(i % 12)], K, {}), "the pose is exactly the first one again, 11 poses later"
+    ),
+    "two cameras in turn": (
+        lambda i, d, T: (d, rigid(T[:3, :3], T[:3, 3] + [1.5 * (i % 2), 0, 0]), K, {}), "go back and forth between two"
+    ),
+    "an ensemble of copies": (lambda i, d, T: (d, T, K, {"epistemic": 0 * d}), "copies of one network"),
     "another camera": (
         lambda i, d, T: (d, T, K @ np.diag([1 + 0.5 * (i % 2), 1, 1]), {}),
         "the focal length changed from frame to frame .*every camera is a stream of its own",
@@ -122,6 +129,18 @@ def test_what_frames_show_is_named_once(caplog, mistake):
         depth, pose, camera, options = change(i, scenes.render(T, K, H, W), T)
         ufm(depth[None], pose, camera, **{name: value[None] for name, value in options.items()})
     assert len([text for text in caplog.messages if re.search(words, text)]) == 1, caplog.messages
+
+
+def test_frames_of_one_video_given_as_a_batch_are_named(caplog):
+    walk = [scenes.look([0.05 * i, 0.01 * i, -0.02 * i], 0.02 * i) for i in range(16)]
+    rig = [[scenes.look([0.05 * i, 0.3 * camera, 0], 0.02 * i) for camera in range(4)] for i in range(8)]
+    for batches, named in (([walk[i : i + 4] for i in range(0, 16, 4)], 1), (rig, 0)):
+        caplog.clear()
+        ufm = UfMStar(CONFIG)
+        for poses in batches:
+            ufm(torch.tensor(np.stack([scenes.render(T, K, H, W) for T in poses])), torch.tensor(np.stack(poses)), K)
+        found = [text for text in caplog.messages if "4 streams of a batch look like successive frames" in text]
+        assert len(found) == named
 
 
 def test_a_stream_that_is_reset_may_begin_elsewhere(caplog):

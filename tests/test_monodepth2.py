@@ -138,11 +138,11 @@ def test_published_weights_are_taken(tmp_path: Path) -> None:
     decoder = published_decoder(network.encoder.channels, SMALL)
     report = load_monodepth2(network, *write_published(tmp_path, classifier_weights(), decoder))
     assert len(report.loaded) == 120 + 20
-    assert report.kept == ("head.bias", "head.weight")
+    assert report.unchanged == ("head.bias", "head.weight")
     assert len(report.skipped) == 2 + 8
     assert report.skipped["decoder.10.conv.weight"] == "disparity is not metric depth"
     assert report.skipped["encoder.fc.weight"] == "the classifier is not used"
-    assert all(torch.equal(network.state_dict()[key], before[key]) for key in report.kept)
+    assert all(torch.equal(network.state_dict()[key], before[key]) for key in report.unchanged)
 
 
 def test_published_weights_predict_metric_depth(tmp_path: Path) -> None:

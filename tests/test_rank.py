@@ -112,6 +112,9 @@ def test_a_sequence_twice_is_refused_and_wrong_poses_are_named(ufmstar, tmp_path
     assert not caplog.messages
     assert ufmstar("rank", path, *words, "--overwrite", "--poses", "opengl")[0] == 0
     assert any(text.startswith(f"{path}: poses disagree with the images") for text in caplog.messages)
+    caplog.clear()
+    assert ufmstar("rank", path, *words, "--overwrite", "--pose-scale", "0.1")[0] == 0
+    assert any(f"{path}: depth is 10 times that of tracked corners" in text for text in caplog.messages)
 
 
 def test_a_ranking_that_fails_is_no_earlier_one(ufmstar, tmp_path, weights, monkeypatch):

@@ -24,6 +24,8 @@ from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
+from ufmstar_torch.eval.tour import export_tour
 from ufmstar_torch.models import Preprocess
 
 
@@ -205,6 +207,27 @@ def test_maps_of_another_size_get_their_intrinsics(scene, tmp_path):
     assert summary["uncertainty"]["mean_sigma"] > 0.2
     alone = summary["network_alone"]
     assert alone["nll"] == pytest.approx(0.5 * np.log(2 * np.pi * 0.04), abs=1e-6)
+
+
+def test_the_variance_of_a_run_is_not_a_networks(path, tmp_path):
+    run(own_depth_job(path), tmp_path / "first")
+    with pytest.raises(ValueError, match="is the output of a run, whose variance contains M"):
+        folder_source(open_sequence(path), tmp_path / "first", variance=tmp_path / "first" / "frames")
+
+
+@pytest.mark.parametrize("shown", [1.0, 0.75])
+def test_maps_of_the_middle_of_the_images_are_named(tmp_path, shown):
+    path = export_tour(open_sequence("tour:41?frames=12&size=120x160"), tmp_path / "walk")
+    sequence = open_sequence(path)
+    for frame in (sequence[i] for i in range(len(sequence))):
+        (height, width), K = frame.depth.shape, frame.intrinsics.copy()
+        K[:2, :2] /= shown
+        maps = resample_nearest(frame.depth, frame.intrinsics, K, (height, width))
+        write_depth_png(tmp_path / "maps" / f"{frame.name}.png", maps, 1000, scale_text="0.001")
+    summary = run(job_of(sequence, folder_source(sequence, tmp_path / "maps")), tmp_path / "out")
+    named = [text for text in summary["warnings"] if "only the middle of the image (--map-intrinsics)" in text]
+    assert len(named) == (shown < 1)
+    assert (summary["depth_fit"]["ratio"] == pytest.approx(1, abs=0.05)) == (shown == 1)
 
 
 def test_maps_that_were_cropped_need_their_intrinsics(path, tmp_path):

@@ -13,8 +13,10 @@ from training_data import PLAIN, TINY
 
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
+from ufmstar_torch.eval.tour import export_tour
 from ufmstar_torch.train import SampleDataset, SequenceFrames, tour_frames
-from ufmstar_torch.train.data_config import Part
+from ufmstar_torch.train.data import sources
+from ufmstar_torch.train.data_config import DataConfig, Part
 from ufmstar_torch.train.sequence_data import open_rgbd
 from ufmstar_torch.train.tour_data import digest, tour_file
 
@@ -69,6 +71,15 @@ def test_a_broken_image_of_a_sequence_is_named_or_skipped(tmp_path):
     dataset = SampleDataset(frames, PLAIN, on_bad_file="skip")
     assert torch.equal(dataset[2]["image"], dataset[3]["image"])
     assert dataset.bad_files() == ("walk/9",)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.2])
+def test_depth_in_another_unit_than_the_poses_is_named(tmp_path, caplog, scale):
+    path = export_tour(open_sequence("tour:41?frames=12&size=120x160"), tmp_path / "walk")
+    for file in (path / "depth").iterdir():
+        np.save(file, scale * np.load(file))
+    sources(DataConfig(kind="sequences", paths=(str(path),)))
+    assert ["depth looks too small: times 5" in text for text in caplog.messages] == [True] * (scale != 1)
 
 
 def test_images_and_depth_without_poses(tmp_path):

@@ -104,7 +104,7 @@ class TrainOptions:
     resume: bool = False
     overwrite: bool = False
     threads: int | None = None
-    own: BackboneOptions = field(default_factory=BackboneOptions)
+    backbone_options: BackboneOptions = field(default_factory=BackboneOptions)
     changes: RecipeOptions = field(default_factory=RecipeOptions)
     source: DataOptions = field(default_factory=DataOptions)
     session: SessionOptions = field(default_factory=SessionOptions)
@@ -121,7 +121,7 @@ class TrainOptions:
     def job(self) -> Job:
         """The training that the options mean. Raises ValueError: an option is missing, options contradict each other,
         or a value is impossible."""
-        d, s, chosen = self.source, self.session, self.own
+        d, s, chosen = self.source, self.session, self.backbone_options
         if self.preset is not None and chosen.backbone is not None:
             raise ValueError("--preset and --backbone contradict each other")
         recipe = None if chosen.backbone is not None else self.recipe()

@@ -10,15 +10,19 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
+from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences.nyu import PARTS
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.stream_warnings import LOGGER
 from ufmstar_torch.train.augment import Augmentation
 from ufmstar_torch.train.batches import EpochBatches
 from ufmstar_torch.train.data_config import DataConfig, Part
 from ufmstar_torch.train.samples import Sample, SampleDataset, clips
 from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
 from ufmstar_torch.train.tour_data import tour_frames
+
+CHECKED = 3  # sequences whose depth, poses and images are checked: a mistake in units is made in all
 
 
 class DepthDataModule(LightningDataModule):
@@ -140,4 +144,7 @@ def _sequences(c: DataConfig) -> tuple[SequenceFrames, SequenceFrames]:
                 f"DataConfig.part {part} and validation_part {held_back} share {len(both)} frames of {sequence.name}"
             )
     others = [open_rgbd(path) for path in c.validation_paths] or opened
+    for sequence in opened[:CHECKED]:
+        for problem in check_sequence(sequence).problems:
+            LOGGER.warning("%s: %s (ufmstar data check)", sequence.name, problem)
     return SequenceFrames(opened, part), SequenceFrames(others, held_back)

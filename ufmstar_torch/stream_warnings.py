@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput, doubtful_centre
 from ufmstar_torch.output import FrameStatistics
 
-# Frames and components before anything is said of views, and the share of components seen in one view alone from which
+# Frames and components before views are judged, and the share of components seen in one view alone from which
 # on it is. On rendered tours, at 1/10 of their frames too, right input stays below .7; poses in millimetres reach .99.
 _FRAMES, _COMPONENTS, _ALONE = 8, 20, 0.9
 # Frames, each moved by a share of the depth, in which less than one anchor a frame was used.
@@ -25,6 +26,11 @@ _OUTSIDE, _WIDE = 0.1, 10.0
 # before it, which also leads so many depths away. Relative change of most depths while the pose stays: .07 to .5 within
 # 8 frames of the moving cameras of recordings.
 _ZOOM, _JUMP, _AWAY, _CHANGE = 1.2, 10.0, 2.0, 0.1
+# Frames in a row that lie so many times nearer to the frame before the last one than to the last one.
+_ALTERNATING, _NEARER = 6, 5.0
+# Of a batch whose streams are the frames of one video: streams, calls that continue the last one, and the distance
+# between successive frames over the step of the first stream. 1/B where frames are even.
+_BATCH, _CONTINUED, _SUCCESSIVE = 3, 3, 0.5
 # Of the depth maps every so many rows are looked at.
 _ROWS = 8
 # On an accelerator reading the counts waits for it: every so many frames, and not while a graph is recorded.
@@ -41,14 +47,17 @@ _CAUSES = (
 class _Track:
     """The frames of a stream without a fault so far."""
 
-    T: list[list[float]]  # the last pose
+    first: list[list[float]]  # pose,
+    T: list[list[float]]  # and the last one
     focal: tuple[float, float]  # last fx / W and fy / H
     total: float  # sum of the last depth map's rows
-    place: list[float]  # of the last frame with anchors that moved, and how many did,
+    anchored_at: list[float]  # position in the last frame with anchors that moved, and how many did,
     moving: int = 0
     used: int = 0  # with how many anchors
     steps: int = 0  # poses that differ from the one before,
     largest: float = 0.0  # by at most [m]
+    before: list[float] | None = None  # position before the last one,
+    alternating: int = 0  # and how many of the last frames were beside the one before
     same: int = 0  # the last of them, with one depth map
     still: int = 0  # last frames with one pose,
     depth: Tensor | None = None  # and the depth map of the first of them
@@ -68,12 +77,24 @@ class _Track:
             self.still, self.same = 0, self.same + 1 if total == self.total else 0
             if self.same == _FRAMES:
                 yield "depth", f"the depth map was the same in {_FRAMES + 1} frames of a moving camera: is it updated?"
+            yield from self._alternate(T, step)
             sudden = self.steps >= _FRAMES and step > _JUMP * self.largest
             if sudden and step > _AWAY * _mean(depth, total):
                 text = f"the camera jumped by {step:.3g} m, after steps of at most {self.largest:.3g} m. Another "
                 yield "jump", text + "recording, or a map that was moved, begins with reset()"
+            if self.steps >= _FRAMES and self.first == T:
+                text = f"the pose is exactly the first one again, {self.steps} poses later. Another recording begins "
+                yield "again", text + "with reset()"
             self.steps, self.largest = self.steps + 1, max(self.largest, step)
+        self.before = _position(self.T)
         self.T, self.focal, self.total = T, focal, total
+
+    def _alternate(self, T: list[list[float]], step: float) -> Iterator[tuple[str, str]]:
+        returned = self.before is not None and _NEARER * math.dist(_position(T), self.before) < step
+        self.alternating = self.alternating + 1 if returned else 0
+        if self.alternating == _ALTERNATING:
+            text = "the poses go back and forth between two places: every camera is a stream of its own (a batch)"
+            yield "alternating", text
 
     def _stay(self, depth: Tensor) -> Iterator[tuple[str, str]]:
         self.still += 1
@@ -88,9 +109,9 @@ class _Track:
 
     def anchored(self, used: int, depth: float) -> str:
         """Count the anchors used in a frame of this mean depth [m]; a warning where moving frames have hardly any."""
-        if math.dist(position := _position(self.T), self.place) < _MOVED * depth:
+        if math.dist(position := _position(self.T), self.anchored_at) < _MOVED * depth:
             return ""
-        self.place, self.moving, self.used = position, self.moving + 1, self.used + used
+        self.anchored_at, self.moving, self.used = position, self.moving + 1, self.used + used
         if self.moving < _MOVED_FRAMES or self.used >= self.moving:
             return ""
         return (
@@ -118,12 +139,12 @@ class StreamWarnings:
         self.reset()
 
     def reset(self, streams: Sequence[int] | None = None) -> None:
-        """Forget what was said; of some ``streams`` only what was seen."""
+        """Forget all warnings; with ``streams`` only what these streams showed."""
         if streams is not None:
             self._tracks = {b: track for b, track in self._tracks.items() if b not in streams}
             return
-        self._calls = 0
-        self._said = set[tuple[int, str]]()
+        self._calls = self._continued = 0
+        self._named = set[tuple[int, str]]()
         self._tracks = {}
 
     def after_frame(
@@ -137,12 +158,12 @@ class StreamWarnings:
             return
         for b, kind, text in (
             *_left_out(frame, statistics, frames, config),
-            *(_wide(frame) if self._calls % EVERY in (0, 1) else ()),
+            *(_spreads(frame) if self._calls % EVERY in (0, 1) else ()),
             *_alone(statistics, frames),
             *self._tracked(frame, statistics),
         ):
-            if (b, kind) not in self._said:
-                self._said.add((b, kind))
+            if (b, kind) not in self._named:
+                self._named.add((b, kind))
                 LOGGER.warning("stream %d: %s (said once)", b, text)
 
     def _tracked(self, frame: FrameInput, statistics: FrameStatistics) -> Iterator[tuple[int, str, str]]:
@@ -151,6 +172,7 @@ class StreamWarnings:
         poses, cameras = frame.T_world_cam.tolist(), frame.intrinsics.tolist()
         used = None if statistics.anchors_used is None else statistics.anchors_used.tolist()
         height, width = frame.size
+        yield from self._one_video(poses)
         for b, fault in enumerate(statistics.fault.tolist()):
             if fault or not pixels[b]:
                 continue
@@ -158,11 +180,24 @@ class StreamWarnings:
             if text := doubtful_centre(cameras[b], frame.size):
                 yield b, "centre", text
             if (track := self._tracks.get(b)) is None:
-                self._tracks[b] = track = _Track(T, focal, sums[b], _position(T))
+                self._tracks[b] = track = _Track(T, T, focal, sums[b], _position(T))
             else:
                 yield from ((b, *warning) for warning in track.follow(T, focal, rows[b], sums[b]))
             if used is not None and (text := track.anchored(used[b], _mean(rows[b], sums[b]))):
                 yield b, "anchors", text
+
+    def _one_video(self, poses: list[list[list[float]]]) -> Iterator[tuple[int, str, str]]:
+        """A warning where batch after batch the first stream goes on where the last one was."""
+        if len(poses) < _BATCH or len(self._tracks) < len(poses):
+            return
+        before = [_position(self._tracks[b].T) for b in range(len(poses))]
+        path = [before[-1], *(_position(T) for T in poses)]
+        longest = max(math.dist(*pair) for pair in pairwise(path))
+        continues = longest < _SUCCESSIVE * math.dist(path[1], before[0])
+        self._continued = self._continued + 1 if continues else max(self._continued - 1, 0)
+        if self._continued == _CONTINUED:
+            text = f"the {len(poses)} streams of a batch look like successive frames of one video. Views are compared "
+            yield 0, "batch", text + "within a stream alone: give one frame at a time"
 
 
 def _left_out(
@@ -189,17 +224,25 @@ def _left_out(
             yield b, "empty", text + ": nothing is compared between views"
 
 
-def _wide(frame: FrameInput) -> Iterator[tuple[int, str, str]]:
+def _spreads(frame: FrameInput) -> Iterator[tuple[int, str, str]]:
+    """Warnings of variances that are no variance in m^2, or 0 everywhere between the members of an ensemble."""
+    pixels = frame.valid.sum((1, 2))
     for name, variance in (("aleatoric", frame.aleatoric), ("epistemic", frame.epistemic)):
         if variance is None:
             continue
         wide = frame.valid & (variance.detach() > (_WIDE * frame.depth).square())
-        shares = wide.sum((1, 2)) / frame.valid.sum((1, 2)).clamp_min(1)
+        shares = wide.sum((1, 2)) / pixels.clamp_min(1)
         for b in (b for b, share in enumerate(shares.tolist()) if share > 0.5):
             text = (
                 f"the standard deviation that {name} states is over {_WIDE:g} times the depth at most pixels: is it a "
             )
             yield b, name, text + "variance in m^2?"
+    if frame.epistemic is None:
+        return
+    spread = (frame.valid & (frame.epistemic.detach() > 0)).any(2).any(1) | (pixels == 0)
+    for b in (b for b, some in enumerate(spread.tolist()) if not some):
+        text = "epistemic is 0 at every pixel: are the members of the ensemble copies of one network, or does the "
+        yield b, "copies", text + "network have no dropout in eval mode?"
 
 
 def hardly_compared(alone: int, components: int, frames: int) -> str:

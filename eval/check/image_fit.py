@@ -208,6 +208,17 @@ def _epipolar_offsets(
     return np.where(ahead, distance, np.inf), along, np.where(ahead, rho, np.nan)
 
 
+def depth_at_pixels(
+    depth: np.ndarray, valid: np.ndarray, K_map: np.ndarray, K_image: np.ndarray, pixel: np.ndarray
+) -> np.ndarray:
+    """[N] the depth of a map [H, W] at pixels [N, 2] of the image to which it belongs; 0 where it has none."""
+    u, v, _ = np.rint(K_map @ np.linalg.inv(K_image) @ np.vstack([pixel.T, np.ones(len(pixel))])).astype(int)
+    height, width = depth.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    v, u = np.where(inside, v, 0), np.where(inside, u, 0)
+    return np.where(inside & valid[v, u], depth[v, u], 0.0)
+
+
 def depth_fit(
     sequence: FrameSequence,
     corners: Iterable[FollowedCorners],

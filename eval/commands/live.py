@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ufmstar_torch.eval.check.image_fit import image_fit, track_corners
 from ufmstar_torch.eval.commands.depth import NetworkOptions, UfMOptions
 from ufmstar_torch.eval.commands.options import MachineOptions, option, positional, reader, usage_errors
 from ufmstar_torch.eval.commands.terminal import Bars
@@ -36,6 +37,7 @@ from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.live import LiveDepth, LiveResult, LiveStatistics
 from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.pipeline import UncertainDepth
+from ufmstar_torch.stream_warnings import LOGGER
 
 _STANDARD_INPUT, _SUMMARY = "-", "realtime.json"
 # Options for opening that are also valid for a source that is no recording.
@@ -93,6 +95,8 @@ class LiveOptions(MachineOptions):
             raise ValueError("--scale-from goes with ufmstar run, which sees the whole recording")
         if self.recorded:
             return
+        if self.source == _STANDARD_INPUT and self.opening.trajectory is not None:
+            raise ValueError("--trajectory does not go with -: each line has its pose")
         if wrong := sorted(self.opening.changed().keys() - set(_OF_LIVE)):
             raise ValueError(f"--{wrong[0].replace('_', '-')} goes with recordings, not with {self.source}")
         if self.source != _STANDARD_INPUT and (self.opening.trajectory is None or not self.opening.intrinsics):
@@ -183,6 +187,8 @@ def _events(options: LiveOptions) -> Iterator[LiveEvent]:
         sequence = open_sequence(options.source, **opening.changed())
         if not sequence.posed:
             raise ValueError(f"{options.source} has no poses; ufmstar poses computes them")
+        if (fit := image_fit(sequence, track_corners(sequence))) is not None and fit.problem:
+            LOGGER.warning("%s: %s", options.source, fit.problem)
         return sources.replay(sequence, options.speed)
     scale = 1.0 if opening.pose_scale is None else opening.pose_scale
     if options.source == _STANDARD_INPUT:

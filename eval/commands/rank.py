@@ -13,6 +13,7 @@ from ufmstar_torch.eval.commands.run import StreamOptions, job_from
 from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.progress import ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
+from ufmstar_torch.eval.run.depth_check import DepthCheck
 from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
 from ufmstar_torch.eval.run.machine import share_threads
@@ -98,11 +99,13 @@ def _scores(options: RankOptions) -> ImageScores:
             source, scores.sequence = job.source, path
             if job.image_fit is not None and job.image_fit.problem:
                 LOGGER.warning("%s: %s", path, job.image_fit.problem)
-            stream = FrameStream(job.sequence, job.indices, [job.row(Checkpoint())])
+            stream, check = FrameStream(job.sequence, job.indices, [job.row(Checkpoint())]), DepthCheck(job)
             try:
-                stream.drive([scores, ProgressSink(bars.show)], stop=stop)
+                stream.drive([scores, check, ProgressSink(bars.show)], stop=stop)
             except Stopped:
                 raise KeyboardInterrupt from None
+            if (fit := check.fit()) is not None and fit.problem:
+                LOGGER.warning("%s: %s", path, fit.problem)
     return scores
 
 

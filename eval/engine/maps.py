@@ -87,6 +87,10 @@ def folder_source(
         ValueError: no maps, maps that fit no frame, or a first map with another aspect ratio than the images.
     """
     run = own_output(Path(folder))
+    if variance is not None and own_output(Path(variance)) is not None:
+        raise ValueError(
+            f"{variance} is the output of a run, whose variance contains M: --variance takes what the network states"
+        )
     chosen = range(len(sequence)) if indices is None else indices
     selected = [name for index in chosen if (name := sequence.names[index]) not in (run.skipped if run else ())]
     if not selected:

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ufmstar_torch.eval.check.image_fit import DepthFit, depth_fit
+from ufmstar_torch.eval.check.depth_image_fit import image_at_map, part_of_image
+from ufmstar_torch.eval.check.image_fit import DepthFit, depth_at_pixels, depth_fit
 from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM
+from ufmstar_torch.eval.engine.maps import MapSource
 from ufmstar_torch.eval.run.files import to_json, write_json_atomic
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.machine import hardware, versions
@@ -23,6 +25,7 @@ from ufmstar_torch.stream_warnings import hardly_compared
 
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
 Records = Sequence[Mapping[str, Any]]
+_MAPS = 12  # depth maps that are compared with their images
 STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "save")
 
 
@@ -62,7 +65,7 @@ def write_summary(
         "machine": hardware(),
     }
     depth = None if job.image_fit is None or job.image_fit.problem else _depth_fit(folder, done)
-    summary |= {"image_fit": job.image_fit, "depth_fit": depth, "warnings": _warnings(job, depth, done)}
+    summary |= {"image_fit": job.image_fit, "depth_fit": depth, "warnings": _warnings(folder, depth, done)}
     plain: dict[str, Any] = to_json(summary)
     write_json_atomic(folder.path / "summary.json", plain)
     return plain
@@ -75,22 +78,38 @@ def _depth_fit(folder: RunFolder, done: Records) -> DepthFit | None:
     def depth_at(index: int, pixel: np.ndarray) -> np.ndarray | None:
         if index not in records:
             return None
-        record = records[index]
-        stored = read_frame(frame_file(folder.path, record["name"]))
-        to_map = pinhole(*record["intrinsics"]) @ np.linalg.inv(sequence.intrinsics_of(sequence.entries[index]))
-        u, v, _ = np.rint(to_map @ np.vstack([pixel.T, np.ones(len(pixel))])).astype(int)
-        height, width = stored["depth"].shape
-        inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-        v, u = np.where(inside, v, 0), np.where(inside, u, 0)
-        return np.where(inside & stored["valid"][v, u], stored["depth"][v, u], 0.0)
+        stored, K = _stored(folder, records[index]), pinhole(*records[index]["intrinsics"])
+        return depth_at_pixels(
+            stored["depth"], stored["valid"], K, sequence.intrinsics_of(sequence.entries[index]), pixel
+        )
 
     return depth_fit(sequence, folder.job.corners, depth_at)
 
 
-def _warnings(job: RunJob, depth: DepthFit | None, done: Records) -> list[str]:
+def _part_of_image(folder: RunFolder, done: Records) -> str:
+    """A warning where maps from files look as if they showed a part of their images."""
+    job, source, shown = folder.job, folder.job.source, list[tuple[np.ndarray, np.ndarray]]()
+    if not isinstance(source, MapSource) or source.is_truth or not done:
+        return ""
+    for record in (done[i] for i in np.unique(np.linspace(0, len(done) - 1, _MAPS).astype(int))):
+        frame, stored = job.sequence[record["index"]], _stored(folder, record)
+        if frame.image is not None:
+            depth, K_map = np.where(stored["valid"], stored["depth"], 0.0), pinhole(*record["intrinsics"])
+            shown.append((image_at_map(frame.image, frame.intrinsics, K_map, depth.shape), depth))
+    return part_of_image(shown) if shown else ""
+
+
+def _stored(folder: RunFolder, record: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The arrays of a finished frame."""
+    return read_frame(frame_file(folder.path, record["name"]))
+
+
+def _warnings(folder: RunFolder, depth: DepthFit | None, done: Records) -> list[str]:
     """Likely mistakes in the run's input, one line each."""
+    job = folder.job
     fits = [fit.problem for fit in (job.image_fit, depth) if fit is not None]
     without_depth = len(job.sequence.without_depth) == len(job.sequence)
+    fits.append(_part_of_image(folder, done))
     if done:
         fits.append(hardly_compared(done[-1]["single_view"], done[-1]["components"], len(done)))
         if without_depth and job.sequence.layout == "generic" and (depth is None or depth.problem):

@@ -1,0 +1,34 @@
+"""The depth of a stream beside that of corners tracked in its images, for commands that write no frames."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ufmstar_torch.eval.check.image_fit import DepthFit, depth_at_pixels, depth_fit
+from ufmstar_torch.eval.engine.judge import UFM
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink
+from ufmstar_torch.eval.run.job import RunJob
+
+
+class DepthCheck(FrameSink):
+    """Keeps the depth maps of the few frames in which tracked corners of a job begin."""
+
+    def __init__(self, job: RunJob) -> None:
+        self._job, self._first = job, {one.first for one in job.corners}
+        self._maps: dict[int, tuple[np.ndarray, ...]] = {}
+
+    def take(self, result: FrameResult) -> None:
+        """Keep the map of such a frame."""
+        row = result.rows.get(UFM)
+        if row is not None and result.frame is not None and result.index in self._first:
+            self._maps[result.index] = row.depth.numpy(), row.valid.numpy(), row.intrinsics, result.frame.intrinsics
+
+    def fit(self) -> DepthFit | None:
+        """The comparison; None with too little motion, or of poses that contradict the images."""
+        if self._job.image_fit is None or self._job.image_fit.problem:
+            return None
+
+        def depth_at(index: int, pixel: np.ndarray) -> np.ndarray | None:
+            return depth_at_pixels(*self._maps[index], pixel) if index in self._maps else None
+
+        return depth_fit(self._job.sequence, self._job.corners, depth_at)
