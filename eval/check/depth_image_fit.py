@@ -19,8 +19,8 @@ _POINTS_PER_FRAME = 1000
 _ZOOMS = np.arange(0.86, 1.141, 0.02)
 _SHIFT, _SHIFT_STEP = 0.0375, 0.0047
 # Predicted maps are blurred. Right ones of four networks on 16 recordings and tours, with so many edges and so much
-# contrast, had a quality of at least .55; those of the middle 3/4 of the image at most .3, but for one, and zooms of .86
-# to .92.
+# contrast, had a quality of at least .55; those of the middle 3/4 of the image at most .3, but for one, and zooms of
+# .86 to .92.
 _PART, _PART_EDGES, _PART_CONTRAST, _PART_ZOOM = 0.35, 3000, 0.05, 0.06
 
 

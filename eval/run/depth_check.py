@@ -15,7 +15,7 @@ class DepthCheck(FrameSink):
 
     def __init__(self, job: RunJob) -> None:
         self._job, self._first = job, {one.first for one in job.corners}
-        self._maps: dict[int, tuple[np.ndarray, ...]] = {}
+        self._maps: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def take(self, result: FrameResult) -> None:
         """Keep the map of such a frame."""
