@@ -136,7 +136,7 @@ REFUSED = {
     "a class as network": (lambda: UncertainDepth(nn.ReLU), TypeError, "the class ReLU: give an instance"),
     "no network": (lambda: UncertainDepth([]), ValueError, "networks must hold at least one"),
     "no networks for an image": (
-        lambda: UncertainDepth(None)(IMAGE, POSE, K), ValueError, "no networks: give the predictions to update"
+        lambda: UncertainDepth(None)(IMAGE, POSE, K), ValueError, "no networks: pass predictions to update"
     ),
     "an unknown mode": (lambda: model(IMAGE, mode="all"), ValueError, "mode must be 'alternate' or 'full'"),
     "all of one network": (lambda: model(IMAGE, mode="full"), ValueError, "mode 'full' needs several networks"),

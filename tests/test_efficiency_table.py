@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from ufmstar_torch.eval.bench.energy import CPU, GPU, NOT_MEASURABLE
+from ufmstar_torch.eval.bench.energy import CPU, GPU
 from ufmstar_torch.eval.bench.measure import overhead_percent
-from ufmstar_torch.eval.report.efficiency import efficiency_tables, megabytes
+from ufmstar_torch.eval.report.efficiency import NOT_MEASURABLE, efficiency_tables, megabytes
 from ufmstar_torch.eval.report.table import latex, markdown
 
 

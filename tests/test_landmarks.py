@@ -266,7 +266,7 @@ def test_its_state_continues_and_errors_change_nothing(tour):
         {"image": image[None].expand(2, -1, -1, -1)},
     ]
     for change in wrong:
-        with pytest.raises(ValueError, match=r"image must|floating-point image|pose|valid|give none|each of the 2"):
+        with pytest.raises(ValueError, match=r"image must|floating-point image|pose|valid|pass none|each of the 2"):
             model(**{"image": image[None], "pose": T, "intrinsics": K, **change})
         after = model.state_dict()
         assert all(torch.equal(after[name], value) for name, value in saved.items())

@@ -132,8 +132,8 @@ def test_what_frames_show_is_named_once(caplog, mistake):
 
 
 def test_frames_of_one_video_given_as_a_batch_are_named(caplog):
-    walk = [scenes.look([0.05 * i, 0.01 * i, -0.02 * i], 0.02 * i) for i in range(16)]
-    rig = [[scenes.look([0.05 * i, 0.3 * camera, 0], 0.02 * i) for camera in range(4)] for i in range(8)]
+    walk = [scenes.camera_pose([0.05 * i, 0.01 * i, -0.02 * i], 0.02 * i) for i in range(16)]
+    rig = [[scenes.camera_pose([0.05 * i, 0.3 * camera, 0], 0.02 * i) for camera in range(4)] for i in range(8)]
     for batches, named in (([walk[i : i + 4] for i in range(0, 16, 4)], 1), (rig, 0)):
         caplog.clear()
         ufm = UfMStar(CONFIG)

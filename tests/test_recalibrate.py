@@ -16,7 +16,7 @@ from tiny_suite import write_network, write_rooms
 from ufmstar_torch import Recalibration, UfMStar, UfMStarConfig, cli
 from ufmstar_torch.eval.metrics.ranking import SpearmanCorrelation
 from ufmstar_torch.eval.metrics.recalibration import figures, fit
-from ufmstar_torch.recalibrate import stored_next_to
+from ufmstar_torch.recalibrate import recalibration_path
 
 MAP = Recalibration((0.01, 0.1, 1.0), (0.2, 0.2, 4.0))
 
@@ -168,7 +168,7 @@ def test_run_uses_the_map_beside_the_weights(evaluated, tmp_path, capsys):
     rooms, weights, out = evaluated
     words = ["run", str(rooms / "cedar"), "--model", "trained", "--weights", str(weights), "--no-video", "--no-sheet"]
     assert cli.main([*words, "--out", str(tmp_path / "plain")]) == 0
-    file = stored_next_to(weights)
+    file = recalibration_path(weights)
     assert cli.main(["recalibrate", str(out), "--row", "UfM*-DepthOnly", "--to", str(file)]) == 0
     try:
         assert cli.main([*words, "--out", str(tmp_path / "mapped")]) == 0

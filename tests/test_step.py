@@ -278,7 +278,7 @@ def test_the_check_agrees_with_the_reference(compiled_backend, dtype):
             found = getattr(fast, name)
             if value is None:
                 assert found is None
-            elif found is not None or name != "known_fault":  # GPUs: only with cameras on the host
+            elif found is not None or name != "host_fault":  # GPUs: only with cameras on the host
                 assert found.dtype == value.dtype, name
                 torch.testing.assert_close(found, value, rtol=1e-14, atol=1e-14, equal_nan=True)
         assert set(range(10)) == set(slow.fault.tolist())

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 GPU, CPU = "gpu", "cpu"
-NOT_MEASURABLE = "not measurable here"
 NO_ZEUS = "zeus, which reads the meters, is not installed: pip install 'ufmstar-torch[energy]'"
 NO_GPU = "nothing runs on a GPU"
 _NO_METER = {

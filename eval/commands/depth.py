@@ -17,7 +17,7 @@ from ufmstar_torch.eval.methods.setting import DEFAULTS, PAPER, started
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.recalibrate import Recalibration, stored_next_to
+from ufmstar_torch.recalibrate import Recalibration, recalibration_path
 from ufmstar_torch.stateful import flat
 
 PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
@@ -165,9 +165,9 @@ class UfMOptions:
             ValueError: the file is no recalibration, or was fitted with other settings or to another network.
         """
         name = self.recalibration
-        if name == "none" or (name is None and not (weights and stored_next_to(weights[0]).is_file())):
+        if name == "none" or (name is None and not (weights and recalibration_path(weights[0]).is_file())):
             return None
-        file = stored_next_to(weights[0]) if name is None else Path(name)
+        file = recalibration_path(weights[0]) if name is None else Path(name)
         try:
             recalibration = Recalibration.from_json(file)
             recalibration.require(config, ", ".join(one["name"] for one in source.identity.get("files", ())))

@@ -20,7 +20,7 @@ from ufmstar_torch.eval.reconstruct.reconstruct import (
     require_pycolmap,
     scale_model,
 )  # fmt: skip
-from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.files import write_atomic, write_bytes_atomic, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError, output_folder
 from ufmstar_torch.eval.run.machine import available_cores
 from ufmstar_torch.eval.sequences.frame import parse_slice
@@ -152,7 +152,7 @@ def _reconstruct(options: PosesOptions, images: list[Any], size: tuple[int, int]
         names = [entry.name for entry in keyframes]
         if keyframes and keyframes[0].timestamp is not None:
             lines = "".join(f"{entry.timestamp:.9f} images/{entry.name}.jpg\n" for entry in keyframes)
-            write_atomic(out / "rgb.txt", lambda file: file.write(lines.encode()))
+            write_bytes_atomic(out / "rgb.txt", lines.encode())
         K, threads = None if lens is None else lens.K, options.threads or available_cores()
         models = reconstruct(out, names, K, threads=threads, say=bars.say)
     opening = Options(fps=options.fps, max_pose_gap=options.max_pose_gap)

@@ -14,7 +14,7 @@ from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 from ufmstar_torch.eval.engine.progress import ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.run.depth_check import DepthCheck
-from ufmstar_torch.eval.run.files import write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.files import write_bytes_atomic, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind, output_folder
 from ufmstar_torch.eval.run.machine import share_threads
 from ufmstar_torch.eval.run.panels import contact_sheet
@@ -121,7 +121,7 @@ def _write(options: RankOptions, scores: ImageScores) -> int:
     lines = [{"rank": n, **scores.images[i].line} for n, i in enumerate(chosen, start=1)]
     lines += [{"rank": None, **scores.images[i].line} for i in rest]
     table = pd.DataFrame(lines, dtype=object).map(csv_text).to_csv(index=False, lineterminator="\n")
-    write_atomic(out / SCORES, lambda file: file.write(table.encode()))
+    write_bytes_atomic(out / SCORES, table.encode())
     files = [SCORES]
     if panels := scores.panels():
         contact_sheet(panels, out / SHEET, title=f"the least and the most certain of {len(lines)} images")

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.report.means import MIN_SEQUENCES
 from ufmstar_torch.eval.report.names import row_labels
 from ufmstar_torch.eval.report.pictures import Picture
 from ufmstar_torch.eval.report.table import Table
-from ufmstar_torch.eval.run.files import write_atomic
+from ufmstar_torch.eval.run.files import write_bytes_atomic
 
 PAGE = "report.html"
 TEMPLATES = Path(__file__).parent / "templates"
@@ -61,7 +61,7 @@ def write_page(
         made=json.dumps(made, indent=1, ensure_ascii=False, default=str),
     )
     path = results.out / PAGE
-    write_atomic(path, lambda file: file.write(text.encode()))
+    write_bytes_atomic(path, text.encode())
     return path
 
 

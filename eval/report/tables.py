@@ -35,7 +35,7 @@ from ufmstar_torch.eval.report.names import (
 )
 from ufmstar_torch.eval.report.paper import paper_table_of
 from ufmstar_torch.eval.report.table import Cell, Table, csv_text, frame_of, latex, mark_best, markdown, table_csv
-from ufmstar_torch.eval.run.files import write_atomic
+from ufmstar_torch.eval.run.files import write_bytes_atomic
 from ufmstar_torch.eval.suite.record import Record
 
 OURS, PAPER = "Ours", "Paper"
@@ -227,5 +227,5 @@ def write_tidy(results: Results) -> Path:
 
 
 def _write_text(path: Path, text: str) -> Path:
-    write_atomic(path, lambda file: file.write(text.encode()))
+    write_bytes_atomic(path, text.encode())
     return path

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
-from ufmstar_torch.eval.run.files import write_atomic
+from ufmstar_torch.eval.run.files import write_atomic, write_bytes_atomic
 from ufmstar_torch.mixture import GaussianMixture
 
 # Lower limit of the standard deviation of an axis [m], because files store its logarithm and viewers divide by it.
@@ -97,4 +97,4 @@ def write_ply(path: Path, vertices: NDArray[Any], comment: str) -> None:
     lines = ["ply", "format binary_little_endian 1.0", f"comment {comment}", f"element vertex {len(vertices)}"]
     lines += [f"property {_TYPES[vertices.dtype[name].str]} {name}" for name in vertices.dtype.names or ()]
     content = "\n".join([*lines, "end_header", ""]).encode("ascii")
-    write_atomic(path, lambda file: file.write(content + vertices.tobytes()))
+    write_bytes_atomic(path, content + vertices.tobytes())

@@ -23,7 +23,7 @@ import torch
 from ufmstar_torch.eval.engine.judge import UFM
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
-from ufmstar_torch.eval.run.files import to_json, write_atomic
+from ufmstar_torch.eval.run.files import to_json, write_atomic, write_bytes_atomic
 from ufmstar_torch.eval.run.folder import FolderError, FolderKind
 from ufmstar_torch.eval.run.frame_record import frame_arrays, frame_record
 from ufmstar_torch.eval.run.job import Checkpoint, RunJob
@@ -63,7 +63,7 @@ class RunFolder(FrameSink):
         self.metrics = job.metrics(self.checkpoint)
         (self.path / FRAMES).mkdir(exist_ok=True)
         lines = b"".join(_line(record) for record in self.records)
-        write_atomic(self.path / RECORDS, lambda file: file.write(lines))
+        write_bytes_atomic(self.path / RECORDS, lines)
         self._stored, self._stored_at, self._saving = self.checkpoint, monotonic(), 0.0
 
     def __enter__(self) -> RunFolder:
