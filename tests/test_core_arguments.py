@@ -133,7 +133,7 @@ REFUSED = {
     "a number among networks": (lambda: UncertainDepth([3], CONFIG), TypeError, "function, got int$"),
     "a file as network": (lambda: UncertainDepth("w.pth"), TypeError, "got str 'w.pth': load it, as load_network"),
     "weights as network": (lambda: UncertainDepth({"w": 1}), TypeError, "weights need their network"),
-    "a class as network": (lambda: UncertainDepth(nn.ReLU), TypeError, "the class ReLU: give an instance"),
+    "a class as network": (lambda: UncertainDepth(nn.ReLU), TypeError, "the class ReLU: pass an instance"),
     "no network": (lambda: UncertainDepth([]), ValueError, "networks must hold at least one"),
     "no networks for an image": (
         lambda: UncertainDepth(None)(IMAGE, POSE, K), ValueError, "no networks: pass predictions to update"

@@ -241,7 +241,7 @@ def test_a_recording_that_fails_leaves_the_one_before(stand_in, finished, monkey
     assert not list(export.glob(".rrd*"))
 
 
-def test_a_run_without_a_frame_is_not_exported(finished, tmp_path, capfd):
+def test_a_run_without_a_frame_is_not_exported(tmp_path, capfd, finished):
     line = {"name": "a", "state": "skipped", "reason": "no pose"}
     (tmp_path / "frames.jsonl").write_text(json.dumps(line) + "\n")
     assert cli.main(["export", str(tmp_path), "--to", "depth"]) == 2

@@ -108,7 +108,7 @@ def test_other_files_are_refused(tmp_path):
         LandmarkMap.read(tmp_path / "none.csv")
 
 
-def test_words_and_files_become_sources(file, tmp_path):
+def test_words_and_files_become_sources(file):
     assert isinstance(landmark_source("corners"), LandmarkTracker)
     assert isinstance(landmark_source(file), LandmarkMap)
     loaded = LandmarkMap.read(file)

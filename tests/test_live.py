@@ -326,7 +326,7 @@ def test_impossible_settings_are_refused(model, tmp_path):
         LiveDepth(model, print, state=tmp_path / "nowhere" / "state.pt")
 
 
-def test_the_state_goes_on_where_it_ended(model, network, tmp_path):
+def test_the_state_goes_on_where_it_ended(model, tmp_path):
     with LiveDepth(model, lambda _: None, K, state=tmp_path / "state.pt", save_every=0) as live:
         for n in range(3):
             show(live, n, x=n / 100)

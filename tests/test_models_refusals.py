@@ -107,7 +107,7 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: OutputSpec("metric", focal=0.0), "focal"),
     (lambda: wrap_network(Linear(), inverse=True), "declared 'inverse', but UfM"),
     (lambda: wrap_network("weights.pth"), "network .*got str 'weights.pth': load it, as load_network"),
-    (lambda: wrap_network(nn.ReLU), r"got the class ReLU: give an instance, ReLU\(...\)"),
+    (lambda: wrap_network(nn.ReLU), r"got the class ReLU: pass an instance, ReLU\(...\)"),
     (lambda: wrap_network(nn.ReLU().state_dict()), "weights need their network"),
     (lambda: wrap_network([nn.ReLU()]), "several networks are a list of wrapped ones"),
     (lambda: wrap_network(nn.ReLU(), preprocess=(224, 224)), "preprocess must be a Preprocess"),

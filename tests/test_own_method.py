@@ -54,7 +54,7 @@ def test_eval_and_report_show_them(walk, tmp_path, capfd):
     assert settings["plugin"] == [PLUGIN]
 
 
-def test_the_reader_is_everywhere(walk, tmp_path, capfd):
+def test_the_reader_is_everywhere(walk, tmp_path):
     path, scene = walk
     sequence = open_sequence(path, plugin=[PLUGIN])
     assert sequence.layout == "npz"

@@ -117,7 +117,7 @@ def test_a_sequence_twice_is_refused_and_wrong_poses_are_named(ufmstar, tmp_path
     assert any(f"{path}: depth is 10 times that of tracked corners" in text for text in caplog.messages)
 
 
-def test_a_ranking_that_fails_is_no_earlier_one(ufmstar, tmp_path, weights, monkeypatch):
+def test_a_ranking_that_fails_is_no_earlier_one(ufmstar, tmp_path, monkeypatch):
     """A disk that is full at the last file leaves no rank.json with a ranking."""
     words = ("rank", TOURS[0], "--depth", "self", "--measured", "0", "--out", tmp_path / "out")
 

@@ -61,7 +61,7 @@ from ufmstar_torch.eval.report.text import summary
 from ufmstar_torch.eval.report.write import write_report
 from ufmstar_torch.eval.suite.record import ResultsError
 
-ALONE, UFM, UFM_100K, UFM_STAR = ENSEMBLE
+ALONE, UFM, _, UFM_STAR = ENSEMBLE
 SECOND = "records/scannet/x/Ensemble.json"
 T_4 = 2.7764451051977934  # 97.5 % quantile of Student's t with 4 degrees of freedom, from a table
 

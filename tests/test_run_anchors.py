@@ -128,7 +128,7 @@ def test_a_standing_camera_is_plain_ufm_star_and_the_summary_says_so(tour, tmp_p
         np.testing.assert_array_equal(on["variance"], off["variance"])
 
 
-def test_what_was_learnt_stays_where_anchors_end(tour, finished, tmp_path):
+def test_what_was_learnt_stays_where_anchors_end(tour, tmp_path):
     blind = with_entries(tour, lambda i, e: dataclasses.replace(e, load_image=None) if i >= 6 else e)
     summary = run(map_job(blind), tmp_path / "out")
     before, *rest = records(tmp_path / "out")[5:]

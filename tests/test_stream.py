@@ -194,7 +194,7 @@ def test_a_state_taken_at_any_frame_gives_the_same_bits(tour):
         assert all(torch.equal(value, states[-1][key][name]) for key in last for name, value in last[key].items())
 
 
-def test_the_state_of_another_estimator_is_refused(tour):
+def test_the_state_of_another_estimator_is_refused():
     gaussians = RowRunner("row", own_depth(), Gaussians(UfMStarConfig(), CPU))
     with pytest.raises(RuntimeError, match=r"Unexpected key.*mean"):
         RowRunner("row", own_depth(), Alone()).load_state(gaussians.state())

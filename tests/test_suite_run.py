@@ -92,7 +92,7 @@ def test_missing_rows_are_judged_beside_their_references():
     assert with_references(rows[4:], rows) == [rows[4]]
 
 
-def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path, whole):
+def test_a_broken_sequence_is_told_and_the_rest_goes_on(tmp_path, whole, rooms):
     root = write_rooms(tmp_path / "own")
     (root / "birch" / "poses.txt").write_text("not a pose\n")
     job = job_on(root, tmp_path / "out")

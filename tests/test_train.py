@@ -137,7 +137,7 @@ def test_bfloat16_trains_and_its_loss_is_in_single_precision(frames, tmp_path):
     assert losses[0] == pytest.approx(losses[1], rel=0.05)
 
 
-def test_the_factors_of_a_batch_ensemble_do_not_decay(frames, tmp_path):
+def test_the_factors_of_a_batch_ensemble_do_not_decay():
     recipe = with_network(RECIPE, method="batch_ensemble", members=2)
     module = TrainingModule(build_network(recipe.network), recipe, 10)
     groups = module.configure_optimizers()["optimizer"].param_groups

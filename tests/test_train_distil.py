@@ -167,7 +167,7 @@ def test_clips_are_whole_and_every_frame_is_in_one_batch(room):
     np.testing.assert_array_equal(room.load(3).T_world_cam, room.sequences[0][3].T_world_cam)
 
 
-def test_what_cannot_be_clips_is_refused(room, tmp_path, monkeypatch):
+def test_what_cannot_be_clips_is_refused(room):
     with pytest.raises(ValueError, match="no 17 frames with known poses"):
         clips(room, 17)
     unposed = SequenceFrames([replace(coded(), posed=False)])

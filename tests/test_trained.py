@@ -79,7 +79,7 @@ def test_what_was_saved_is_loaded_bit_for_bit(tmp_path, image, method, lazy):
     assert stored.info == {"command": "ufmstar train", "nll": 0.25}
 
 
-def test_training_goes_on_from_a_file(tmp_path, image):
+def test_training_goes_on_from_a_file(tmp_path):
     spec = spec_of("batch_ensemble")
     networks = make_networks(spec)
     save_trained(tmp_path / "n.safetensors", networks, spec)
